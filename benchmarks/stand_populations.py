@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.chain import read_electronics
-from cpunet.jobs.simulation.stand_plan import Side, StandPlan
+from cpunet.electronics.stand_plan import Side, StandPlan
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.shifted import Shift
 
 FEP = Window("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")
@@ -39,9 +40,8 @@ def main() -> None:
         plan = StandPlan.of(
             read_electronics("legend200"),
             read_detector("icpc"),
-            (FEP,),
-            (arguments.events,),
-            kind="shifted",
+            {FEP: arguments.events},
+            shift=Shift.of(["default"]),
             seed=seed,
         )
         here = [events_of(side) for side in (plan.sim, plan.data)]

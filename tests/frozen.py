@@ -75,7 +75,7 @@ LANES: list[dict[str, list[str]]] = [
     },
     {
         "shifted": [
-            f"stand --preset ornl --kind shifted {FEW} --seed 4 --out shifted-stand",
+            f"stand --preset ornl --shift default {FEW} --seed 4 --out shifted-stand",
             *train_and_validate("shifted-stand", "shifted"),
         ],
         "calibrate": [

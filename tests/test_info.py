@@ -305,12 +305,6 @@ def test_hits_are_compared_with_a_crystal(tmp_path):
     assert inside == told["fits"]["inside_percent"]
 
 
-def test_other_folders_are_named(tmp_path):
-    (tmp_path / "stand.json").write_text("")
-    with pytest.raises(CpunetError, match=r"a stand, .* no folder of this program"):
-        info(tmp_path)
-
-
 def test_traces_that_are_no_numbers(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
     assert info(tmp_path / "pulses.npy", read=DT).values["n_not_finite"] == 30

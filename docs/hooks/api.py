@@ -42,6 +42,10 @@ order in which data flow.
 
 ::: cpunet.Simulation
 
+::: cpunet.make_stand
+
+::: cpunet.Stand
+
 ::: cpunet.info
 
 ::: cpunet.load

@@ -30,14 +30,17 @@ __all__ = [
     "Report",
     "Run",
     "Simulation",
+    "Stand",
     "Translation",
     "__version__",
     "calibrate",
     "check",
     "compare",
+    "demo",
     "import_weights",
     "info",
     "load",
+    "make_stand",
     "open_pulses",
     "response",
     "simulate",
@@ -49,7 +52,9 @@ __all__ = [
 
 if TYPE_CHECKING:
     from cpunet.calls.calibrations import CalibratedRun, calibrate
+    from cpunet.demonstration import demo
     from cpunet.electronics.flattening import subtract_tails
+    from cpunet.electronics.stand import Stand, make_stand
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
     from cpunet.pulses.container import Pulses
@@ -74,10 +79,12 @@ if TYPE_CHECKING:
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
     "calls.calibrations": ("CalibratedRun", "calibrate"),
+    "demonstration": ("demo",),
     "electronics.flattening": ("subtract_tails",),
+    "electronics.stand": ("Stand", "make_stand"),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
-    "jobs.simulation.hit_sources": ("HitFile",),
+    "simulation.hit_sources": ("HitFile",),
     "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),

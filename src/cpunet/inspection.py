@@ -23,11 +23,12 @@ from cpunet.tables import Lines, aligned, text_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from cpunet.electronics.stand import Stand
     from cpunet.recipes.schema import Recipe
     from cpunet.training.run import Run
     from cpunet.validation.report import Report
 
-    Loaded: TypeAlias = Run | Report | PulseFile
+    Loaded: TypeAlias = Run | Report | Stand | PulseFile
 
 _DPI = 150
 _LOOKED_AT, _REMAINS_BLOCK = 256, 4096  # traces read at a time
@@ -166,11 +167,11 @@ def load(path: str | Path) -> Loaded:
     Parameters
     ----------
     path
-        Folder of a run or report, or a file of pulses.
+        Folder of a run, report or stand, or a file of pulses.
 
     Returns
     -------
-    Run, Report or PulseFile
+    Run, Report, Stand or PulseFile
 
     Raises
     ------
@@ -190,10 +191,13 @@ def load(path: str | Path) -> Loaded:
         from cpunet.validation.report import Report
 
         return Report.load(path)
-    stand = "a stand, whose sim.lh5 and data.lh5 can be opened; "
+    if (path / "stand.json").is_file():
+        from cpunet.electronics.stand import Stand
+
+        return Stand.load(path)
     raise CpunetError(
-        f"{path}: {stand if (path / 'stand.json').is_file() else ''}no folder of this program",
-        f"give the folder of a run, which holds {INFO}, or of a report, or a file",
+        f"{path}: no folder of this program",
+        f"give the folder of a run, which holds {INFO}, of a report or stand, or a file",
     )
 
 
@@ -229,8 +233,9 @@ def _folder(path: str | Path) -> InfoResult:
     found = load(path)
     if isinstance(found, Run):
         return InfoResult(str(path), found.summary())
-    verdicts = getattr(found, "verdicts", ())
-    return InfoResult(str(path), [("report", str(path)), *(("", text) for text in verdicts)])
+    if verdicts := getattr(found, "verdicts", None):
+        return InfoResult(str(path), [("report", str(path)), *(("", v) for v in verdicts)])
+    return InfoResult(str(path), [("", str(found))])
 
 
 def _detector(detector: Detector, path: str) -> InfoResult:

@@ -49,14 +49,17 @@ C = TypeVar("C", bound=Config)
 
 
 def read_settings(
-    kind: type[C], name: str | Path | None = None, set_: Set = (), folder: Path | None = None
+    kind: type[C],
+    name: str | Path | C | None = None,
+    set_: Set = (),
+    folder: Path | None = None,
 ) -> C:
     """Read settings by name or from a file, and override single values.
 
     Parameters
     ----------
     name
-        Name of a YAML file in `folder`, or a path. None has only the values of `set_`.
+        Name of a YAML file in `folder`, a path, or settings. None: the values of `set_` alone.
     set_
         See `key_values`. Keys of parts are joined by dots, as in ``training.batch_size``.
 
@@ -65,8 +68,11 @@ def read_settings(
     CpunetError
         If the file cannot be read, or a key or value is not allowed.
     """
-    source = "settings" if name is None else str(name)
-    values = {} if name is None else read_values(name, folder)
+    if name is None or isinstance(name, str | Path):
+        source = "settings" if name is None else str(name)
+        values = {} if name is None else read_values(name, folder)
+    else:
+        source, values = "settings", name.model_dump(exclude_unset=True)
     for key, value in key_values(set_).items():
         *parents, last = key.split(".")
         node = values

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import cpunet
 from cpunet.simulation.geometry_readers import read_detector
 
 # Pulses of the peak, on each side: as few as a fit takes, and enough for a small error.
@@ -29,20 +30,12 @@ PLAIN = (
 
 def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
     """A small stand; made by the package's own job, in this process."""
-    from cpunet.electronics.chain import Electronics, read_electronics
-    from cpunet.jobs.simulation.stand import make_stand
-    from cpunet.recipes import load_recipe
-    from cpunet.simulation.energy_windows import energy_windows
-    from cpunet.simulation.shifted import Shift
-
-    make_stand(
-        Electronics.model_validate(read_electronics("legend200").model_dump() | readout),
-        read_detector("ppc"),
-        tuple(energy_windows("FEP,DEP", load_recipe("fast").peaks, 0.5)),
-        (full_energy, 60),
+    cpunet.make_stand(
         out,
-        kind="shifted",
-        shift=Shift(temperature_K=3),
+        detector="ppc",
+        events={"FEP": full_energy, "DEP": 60},
+        shift={"temperature_K": 3},
+        settings=readout,
         seed=3,
     )
     return out

@@ -25,9 +25,8 @@ COMMANDS = {
     "stand": [
         ("--preset D/my.yaml", "D"),
         ("--preset ornl --detector D/my.yaml", "D"),
-        ("--preset ornl --crystal D/my.yaml", "D"),
         ("--preset ornl --settings D/my.yaml", "D"),
-        ("--preset ornl --kind shifted --shift bias_V=20 --shift D/my.yaml", "D"),
+        ("--preset ornl --shift bias_V=20 --shift D/my.yaml", "D"),
     ],
     "check": [
         (TRAINING, "D/data.lh5"),

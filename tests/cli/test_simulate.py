@@ -73,15 +73,18 @@ def test_moved_and_mirrored_hits_give_the_same_pulse(command, hits: Path, tmp_pa
 
 
 def test_a_diode_of_legend_with_its_crystal(command, hits: Path, reference_data, tmp_path):
-    diode, out = (
-        reference_data / "legend-metadata" / "diodes" / "P99000A.yaml",
+    metadata, out, diode = (
+        reference_data / "legend-metadata",
         tmp_path / "a.lh5",
+        "P99000A.yaml",
     )
-    words = ["--set", "temperature_K=85", "--set", "bias_V=3300", "--set", "grid_mm=0.5"]
-    words += ["--set", "impurity_scale=depletion", "--hits", hits, "--out", out]
-    alone = Path(shutil.copy(diode, tmp_path / "alone.yaml"))
-    assert "give --set impurity_z0" in command("simulate", "--detector", alone, *words).err
-    outcome = command("simulate", "--detector", diode, *words)
+    shutil.copy(metadata / "diodes" / diode, tmp_path / diode)
+    words = ["--detector", tmp_path / diode, "--hits", hits, "--out", out]
+    for value in ("temperature_K=85", "bias_V=3300", "grid_mm=0.5", "impurity_scale=depletion"):
+        words += ["--set", value]
+    assert "give --set impurity_z0" in command("simulate", *words).err
+    shutil.copy(metadata / "crystals" / "V99000.yaml", tmp_path / "P99000.yaml")
+    outcome = command("simulate", *words)
     assert outcome.code == 0
     assert "so that it depletes at the measured 3000 V" in outcome.err
     with h5py.File(out) as file:

@@ -98,7 +98,7 @@ def test_what_passes_is_measured_by_adding_remains_to_traces_without():
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (2500, 1)), 0, 1)
     steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(2500, 2614.5))
-    traces = read_out(steps, read_electronics("ornl").disturbed(1.0), seed=2)
+    traces = read_out(steps, read_electronics("ornl", {"earlier_pulses.rate_kHz": 1}), seed=2)
     raw = Pulses.of(traces.waveforms, dt_ns=16, energy_kev=traces.energy_kev)
     prepared = prepare(raw, RECIPE.preparation, "measured")
     cuts = fit_cuts(prepared, RECIPE.cuts)

@@ -26,7 +26,8 @@ def traces_of(
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (N, 1)), 0, 1)
     energy = rng.choice([1592.5, 2103.5, 2614.5], N)
-    chain = read_electronics(preset).disturbed(rate_khz, pile_up_khz)
+    rates = {"earlier_pulses.rate_kHz": rate_khz, "pile_up.rate_kHz": pile_up_khz}
+    chain = read_electronics(preset, rates)
     if broad:
         energy = np.exp(rng.uniform(np.log(100), np.log(2614), N))
         chain = chain.model_copy(update={"other_pulses_kev": tuple(np.quantile(energy, at))})

@@ -67,7 +67,7 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
         ("diffusion_constant=cold", "diffusion_constant"),
         ("diffusion_constant=true", "diffusion_constant: Input should be a number"),
         ("cloud_fwhm_mm=true", "cloud_fwhm_mm: Input should be a number, not true or false"),
-        ("nowhere.yaml", "nowhere.yaml: no such file"),
+        ("nowhere.yaml", "nowhere.yaml: neither a file nor one of default"),
         ("a={", "not YAML"),
     ],
 )

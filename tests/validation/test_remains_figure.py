@@ -19,7 +19,7 @@ def test_slopes_without_remains_are_those_of_empty_baselines():
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (1500, 1)), 0, 1)
     steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(1500, 2614.5))
-    traces = read_out(steps, read_electronics("ornl").disturbed(2.0), seed=2)
+    traces = read_out(steps, read_electronics("ornl", {"earlier_pulses.rate_kHz": 2}), seed=2)
     raw = Pulses.of(traces.waveforms, dt_ns=16, energy_kev=traces.energy_kev)
     remains = Remains.of_traces([raw], load_recipe("fast").preparation)
     slopes = Slopes.of(raw, remains)

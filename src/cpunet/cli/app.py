@@ -19,11 +19,15 @@ from cpunet.translation.options import Adc
 for _options in (Adc, FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 
-_SHORT = {"settings": "set", "settings_file": "settings"}
+_SHORT = {"electronics": "preset", "settings": "set", "settings_file": "settings"}
 
 
 # Where the function of a command is, and what it does.
 COMMANDS = {
+    "demo": (
+        "cpunet.demonstration:demo",
+        "Simulate, digitise, train, translate and validate on a stand with a known answer.",
+    ),
     "check": (
         "cpunet.training.check:check",
         "Say whether simulated and measured pulses can be compared, and what to do if not.",
@@ -40,6 +44,10 @@ COMMANDS = {
     "simulate": (
         "cpunet.simulation.simulate:simulate",
         "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
+    ),
+    "stand": (
+        "cpunet.electronics.stand:make_stand",
+        "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
     ),
     "train": (
         "cpunet.training.train:train",

@@ -14,12 +14,10 @@ from cpunet.cli.app import app as commands
 from cpunet.cli.app import run, with_options
 from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
-from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
-from cpunet.cli.stand import stand
 from cpunet.cli.tune import tune
 from cpunet.installation import other_package
 
@@ -58,8 +56,6 @@ def _options(version: Version = False, debug: Debug = False) -> None:
 
 
 for command in (
-    demo,
-    stand,
     calibrate,
     tune,
     export,

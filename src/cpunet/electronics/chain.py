@@ -16,6 +16,7 @@ from cpunet.settings import (
     NonNegative,
     Positive,
     Samples,
+    Set,
     names,
     read_settings,
 )
@@ -243,41 +244,6 @@ class Electronics(Config):
             raise ValueError(f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate")
         return self
 
-    def disturbed(
-        self,
-        rate_khz: float | None = None,
-        pile_up_khz: float | None = None,
-        hum: Hum | None = None,
-        wander: Wander | None = None,
-    ) -> Electronics:
-        """Copy of the chain with different rates of other pulses, hum or wandering.
-
-        Parameters
-        ----------
-        rate_khz, pile_up_khz
-            Rates of earlier and of second pulses in kHz. None keeps the chain's own.
-        hum
-            Mains hum. None keeps the chain's own.
-        wander
-            Slow wandering of the baseline. None keeps the chain's own.
-
-        Examples
-        --------
-        >>> from cpunet.electronics.chain import read_electronics
-        >>> read_electronics("ornl").disturbed(rate_khz=3).earlier_pulses.rate_kHz
-        3.0
-        """
-        changes: dict[str, object] = {}
-        if rate_khz is not None:
-            changes["earlier_pulses"] = EarlierPulses(rate_kHz=rate_khz)
-        if pile_up_khz is not None:
-            changes["pile_up"] = PileUp(rate_kHz=pile_up_khz)
-        if hum is not None:
-            changes["hum"] = hum
-        if wander is not None:
-            changes["wander"] = wander
-        return self.model_copy(update=changes)
-
     @property
     def adc_top(self) -> int:
         """Highest ADC count."""
@@ -393,14 +359,16 @@ def electronics_names() -> list[str]:
     return names(_PRESETS)
 
 
-def read_electronics(path: str | Path) -> Electronics:
+def read_electronics(path: str | Path | Electronics, overrides: Set = ()) -> Electronics:
     """Read a readout chain.
 
     Parameters
     ----------
     path
         Name of a preset (see `electronics_names`) or a YAML file with the fields of
-        `Electronics`.
+        `Electronics`. Or a readout chain, for overrides.
+    overrides
+        Values as ``"earlier_pulses.rate_kHz=3"``.
 
     Raises
     ------
@@ -411,5 +379,7 @@ def read_electronics(path: str | Path) -> Electronics:
     --------
     >>> read_electronics("ornl").decays[0].tau_us
     54.6
+    >>> read_electronics("ornl", ["earlier_pulses.rate_kHz=3"]).earlier_pulses.rate_kHz
+    3.0
     """
-    return read_settings(Electronics, path, folder=_PRESETS)
+    return read_settings(Electronics, path, overrides, _PRESETS)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from cpunet.settings import Config, checked, key_values, read_settings, read_values
+from cpunet.settings import Config, checked, key_values, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
+
+_SHIFTS = Path(__file__).parent / "shifts"
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -63,13 +65,8 @@ hole_velocity_low_factor, hole_velocity_high_factor
     self_repulsion: Number | None = None
 
     @classmethod
-    def default(cls) -> Shift:
-        """Default shift of the package."""
-        return read_settings(cls, Path(__file__).with_name("shifted_detector.yaml"))
-
-    @classmethod
-    def of(cls, parts: Iterable[str]) -> Shift:
-        """Combine YAML files and ``"KEY=VALUE"`` strings. Later ones take precedence.
+    def of(cls, parts: Mapping[str, Any] | Iterable[str | Path]) -> Shift:
+        """Combine ``"default"``, YAML files and ``"KEY=VALUE"``. Later ones take precedence.
 
         Raises
         ------
@@ -81,9 +78,11 @@ hole_velocity_low_factor, hole_velocity_high_factor
         >>> Shift.of(["temperature_K=2", "self_repulsion=0.5"]).self_repulsion
         0.5
         """
+        if isinstance(parts, Mapping):
+            return checked(cls, key_values(parts), "shift")
         values: dict[str, Any] = {}
-        for part in parts:
-            values |= key_values([part]) if "=" in part else read_values(part)
+        for part in map(str, parts):
+            values |= key_values([part]) if "=" in part else read_values(part, _SHIFTS)
         return checked(cls, values, "shift")
 
     def detector(self, detector: Detector) -> Detector:

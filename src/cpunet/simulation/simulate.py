@@ -171,9 +171,6 @@ def simulate(
     files = [f for f in (detector, settings_file) if isinstance(f, str | Path)]
     files += [hits.path if isinstance(hits, HitFile) else hits] if hits is not None else []
     refuse_inputs(out, *files)
-    if isinstance(settings_file, SimulationSettings):
-        of_settings = settings_file.model_dump() | of_settings
-        settings_file = None
     physics = read_settings(SimulationSettings, settings_file, of_settings)
     peaks = load_recipe("fast").peaks
     windows = tuple(energy_windows(",".join(peaks), peaks, physics.window_kev))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
@@ -14,7 +14,7 @@ from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.clustering import MERGING_MM, merge_hits
+from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
@@ -26,15 +26,12 @@ from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift
 
-Kind = Literal["matched", "shifted"]
 Labels = npt.NDArray[np.int64]
 
 LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
 OTHER = 3
 # Period of the simulated pulses at the input of the chain; same as that of the library.
 _FINE_NS = 4.0
-# The source, a disc above the crystal.
-_HEIGHT_MM, _RADIUS_MM = 20.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class Side:
         gain = 0.0
         with stage(title, opened.n_events) as bar:
             for hits in opened.blocks:
-                merged = merge_hits(hits, self.detector, MERGING_MM)
+                merged = merge_hits(hits, self.detector, self.settings.cluster_mm)
                 events = simulate_events(fields, merged, self.settings, mode, library=library)
                 kept = events.collected_kev > 0
                 pulses = events.pulses()
@@ -86,7 +83,7 @@ class Side:
         if not gain:
             raise CpunetError(
                 f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
-                "give more with --events"
+                "give more `events`"
             )
 
 
@@ -98,8 +95,8 @@ class StandPlan:
     ----------
     electronics
         Readout chain of the data and of the truth.
-    kind, shift
-        ``"shifted"`` and the deviations of the data's detector, or ``"matched"`` and None.
+    shift
+        Deviations of the data's detector from the simulated one; None for the same detector.
     sim, data
         The two sides.
     seed
@@ -109,7 +106,6 @@ class StandPlan:
     """
 
     electronics: Electronics
-    kind: Kind
     shift: Shift | None
     sim: Side
     data: Side
@@ -121,15 +117,13 @@ class StandPlan:
         cls,
         electronics: Electronics,
         detector: Detector,
-        windows: tuple[Window, ...],
-        events: tuple[int, ...],
+        events: Mapping[Window, int],
         *,
-        kind: Kind = "matched",
         shift: Shift | None = None,
         settings: SimulationSettings | None = None,
         seed: int = 0,
     ) -> Self:
-        """Plan a stand, see `cpunet.jobs.simulation.stand.make_stand`.
+        """Plan a stand, see `cpunet.make_stand`.
 
         Raises
         ------
@@ -137,20 +131,22 @@ class StandPlan:
             If a window has no events, the chain's period is not a multiple of that of the
             pulses, the settings have another period, or the shifted detector is not valid.
         """
-        for window, number in zip(windows, events, strict=True):
+        for window, number in events.items():
             if number < 1:
-                raise CpunetError(f"--events {window.name}={number}: give at least 1 event")
+                raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
         settings = _finely_sampled(settings or SimulationSettings(), electronics)
-        if kind == "shifted":
-            shift = shift or Shift.default()
-        elif shift is not None:
-            raise CpunetError("--shift: a matched stand has none; give --kind shifted")
         # seeds of the events of both sides and of the readout
         sim_seed, data_seed, readout_seed = map(
             int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
         )
         sim_hits, data_hits = (
-            GammaSource(windows, events, _HEIGHT_MM, _RADIUS_MM, s)
+            GammaSource(
+                tuple(events),
+                tuple(events.values()),
+                settings.source_height_mm,
+                settings.source_radius_mm,
+                s,
+            )
             for s in (sim_seed, data_seed)
         )
         sim = Side(detector, settings, sim_hits)
@@ -159,7 +155,7 @@ class StandPlan:
             settings if shift is None else shift.settings(settings),
             data_hits,
         )
-        return cls(electronics, kind, shift, sim, data, seed, readout_seed)
+        return cls(electronics, shift, sim, data, seed, readout_seed)
 
     def provenance(self) -> dict[str, Any]:
         """Provenance for ``stand.json``."""
@@ -172,7 +168,6 @@ class StandPlan:
             for name, side in (("sim", self.sim), ("data", self.data))
         }
         return {
-            "kind": self.kind,
             "shift": None if self.shift is None else self.shift.model_dump(mode="json"),
             "seed": self.seed,
             "electronics": self.electronics.model_dump(mode="json"),

@@ -4,39 +4,37 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 
 import cpunet
-from cpunet.electronics.chain import Electronics
+from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import respond
+from cpunet.electronics.growing_archive import GrowingArchive
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
+from cpunet.electronics.stand_plan import LABELS, OTHER, Labels, Side, StandPlan
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.growing_archive import GrowingArchive
-from cpunet.jobs.simulation.stand_plan import (
-    LABELS,
-    OTHER,
-    Kind,
-    Labels,
-    Side,
-    StandPlan,
-)
-from cpunet.outputs import FolderKind, folder_written_aside
+from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
-from cpunet.simulation.clustering import MERGING_MM
-from cpunet.simulation.energy_windows import Window
+from cpunet.recipes import load_recipe
+from cpunet.settings import Set, checked, read_json, read_settings
+from cpunet.simulation.energy_windows import wanted_events
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
 from cpunet.simulation.hit_readers.hit_table import hit_columns
 from cpunet.simulation.library_lookup import Library
-from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.settings import SimulationSettings, split_overrides
 from cpunet.simulation.shifted import Shift
+from cpunet.tables import counted
 
 MARKER = "stand.json"
 STAND = FolderKind(
@@ -58,104 +56,187 @@ OF_DATA = {
 }
 
 
-@dataclass
-class StandSummary:
-    """Content of a stand: pulses by line for each side, and disturbed traces."""
+@dataclass(repr=False)
+class Stand:
+    """A virtual test stand: two sides of independent events, and the truth.
 
+    Parameters
+    ----------
+    folder
+        Folder of its files.
+    electronics
+        Readout chain of the data and of the truth.
+    n_sim, n_data
+        Numbers of pulses of each side.
+    sim_lines, data_lines
+        The same by line.
+    flags
+        Numbers of disturbed traces by disturbance.
+    """
+
+    folder: Path
+    electronics: Electronics
     n_sim: int = 0
     n_data: int = 0
     sim_lines: Counter[str] = field(default_factory=Counter)
     data_lines: Counter[str] = field(default_factory=Counter)
     flags: Counter[str] = field(default_factory=Counter)
 
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """Open the folder of a stand.
+
+        Raises
+        ------
+        CpunetError
+            If it is none, or cannot be read.
+        """
+        path = Path(folder) / MARKER
+        told = read_json(path, "give the folder of a stand, or make one with cpunet stand")
+        try:
+            counts = {**told["counts"]}
+            electronics = checked(Electronics, told["electronics"], str(path))
+        except (KeyError, TypeError) as error:
+            raise CpunetError(f"{path}: damaged; make the stand again") from error
+        return cls(Path(folder), electronics, **counts)
+
+    @property
+    def sim(self) -> PulseFile:
+        """The simulated pulses."""
+        return PulseFile(self.folder / "sim.lh5")
+
+    @property
+    def data(self) -> PulseFile:
+        """The raw traces."""
+        return PulseFile(self.folder / "data.lh5")
+
+    @property
+    def truth(self) -> Path:
+        """The file of noise-free responses of the simulated pulses."""
+        return self.folder / "truth.npz"
+
+    @property
+    def counts(self) -> dict[str, Any]:
+        """Numbers of pulses, by line, and of disturbed traces."""
+        return {
+            "n_sim": self.n_sim,
+            "n_data": self.n_data,
+            "sim_lines": self.sim_lines,
+            "data_lines": self.data_lines,
+            "flags": self.flags,
+        }
+
+    def __repr__(self) -> str:
+        return f"<Stand {self.folder}: {self.n_sim} simulated, {self.n_data} measured>"
+
+    def __str__(self) -> str:
+        sim, data, flags = map(counted, (self.sim_lines, self.data_lines, self.flags))
+        return (
+            f"{self.folder}: sim.lh5: {self.n_sim} pulses ({sim}), with truth.npz\n"
+            f"{self.folder}: data.lh5: {self.n_data} traces ({data}); {flags or 'undisturbed'}"
+        )
+
 
 def make_stand(
-    electronics: Electronics,
-    detector: Detector,
-    windows: tuple[Window, ...],
-    events: tuple[int, ...],
-    out: Path,
+    out: str | Path,
     *,
-    kind: Kind = "matched",
-    shift: Shift | None = None,
-    settings: SimulationSettings | None = None,
+    electronics: str | Path | Electronics = "legend200",
+    detector: str | Path | Detector = "icpc",
+    events: str | Mapping[str, int] = "FEP=4000,SEP=1500,DEP=1500",
+    shift: Sequence[str] | Mapping[str, Any] = (),
+    settings: Set = (),
+    settings_file: str | Path | SimulationSettings | None = None,
     seed: int = 0,
     force: bool = False,
-) -> StandSummary:
-    """Make a stand of two independent sets of Tl-208 events.
+) -> Stand:
+    """Make a test stand: simulated pulses, raw traces of other events, and the truth.
 
     The folder contains ``sim.lh5`` (``geds/sim``: means of the ideal pulses over the
     digitiser's period; ``geds/hits``: their hits; the attribute ``simulation`` of the
-    former: detector and settings, as in files of `cpunet.simulation.simulate`),
-    ``data.lh5`` (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the
-    noise-free trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after
-    ``n_pre`` samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped
-    included), ``data_labels.npz`` (``label``, ``flag``: 1 decaying
-    baseline, 2 pile-up, 4 saturated; ``remains_kev``, ``n_piled``, ``piled_kev``,
-    ``piled_ns``, see `cpunet.electronics.readout`) and ``stand.json``, its provenance.
+    former: detector and settings, as in files of `cpunet.simulate`), ``data.lh5``
+    (``geds/raw``: raw traces of other events), ``truth.npz`` (``response``: the noise-free
+    trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after ``n_pre``
+    samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped included),
+    ``data_labels.npz`` (``label``, ``flag``: 1 decaying baseline, 2 pile-up, 4 saturated;
+    ``remains_kev``, ``n_piled``, ``piled_kev``, ``piled_ns``, see
+    `cpunet.electronics.readout`) and ``stand.json``, its provenance.
 
     Parameters
     ----------
-    electronics
-        Readout chain of the data and of the truth.
-    detector
-        Simulated detector. In a ``"shifted"`` stand that of the data differs by `shift`; the
-        truth is still the response of the chain to the simulated pulses.
-    windows, events
-        Windows of deposited energy, and the number of events in each, per side.
     out
-        Output folder; it appears when it is complete.
-    kind
-        ``"matched"`` or ``"shifted"``.
+        Folder to make; it appears when it is complete.
+    electronics
+        Readout of the data and of the truth: ornl, legend200, ringing, or a YAML file.
+    detector
+        icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.
+    events
+        Events of each peak or range (keV), for sim and data each.
     shift
-        Deviations in a ``"shifted"`` stand; `Shift.default` if None.
+        By what the data's detector differs from the simulated one: default, temperature_K=1.5,
+        or a YAML file of keys (repeatable). The truth is the response to the simulated pulses.
     settings
-        Settings of the simulated pulses, without the period; those of the data differ by the
-        shift.
+        Override a value of the detector, of the settings or of the readout: bias_V=3500,
+        earlier_pulses.rate_kHz=3 (repeatable).
+    settings_file
+        YAML file of settings of the simulation, without the period.
     seed
         Seed of all random numbers; the sides are independent.
     force
-        See `cpunet.train`.
+        Replace an existing stand.
 
     Raises
     ------
     CpunetError
         If the folder exists, a window has no events, the chain cannot follow the pulses,
         or more than half of the traces saturate.
+
+    Examples
+    --------
+    cpunet stand --preset legend200 --out stand
+
+    cpunet stand --preset ornl --set earlier_pulses.rate_kHz=3 --out busy
+
+    cpunet stand --preset ornl --shift default --shift bias_V=20 --out stand2
     """
+    shifts = [] if isinstance(shift, Mapping) else [*shift]
+    given = (electronics, detector, settings_file, *shifts)
+    refuse_inputs(Path(out), *(f for f in given if isinstance(f, str | Path)))
+    of_detector, of_settings = split_overrides(settings)
+    readout = Electronics.model_fields.keys() - {"name"}
+    of_chain = {k: of_detector.pop(k) for k in [*of_detector] if k.split(".")[0] in readout}
+    physics = read_settings(SimulationSettings, settings_file, of_settings)
     plan = StandPlan.of(
-        electronics,
-        detector,
-        windows,
-        events,
-        kind=kind,
-        shift=shift,
-        settings=settings,
+        read_electronics(electronics, of_chain),
+        read_detector(detector, of_detector),
+        wanted_events(events, load_recipe("fast").peaks, physics.window_kev),
+        shift=Shift.of(shift) if shift else None,
+        settings=physics,
         seed=seed,
     )
-    return write_stand(plan, out, force=force)
+    return write_stand(plan, Path(out), force=force)
 
 
-def write_stand(plan: StandPlan, out: Path, *, force: bool = False) -> StandSummary:
+def write_stand(plan: StandPlan, out: Path, *, force: bool = False) -> Stand:
     """Make a planned stand, see `make_stand`."""
-    many = sum(plan.sim.source.events) >= _LIBRARY_FROM_EVENTS
-    summary = StandSummary()
+    mode, events = plan.sim.settings.mode, sum(plan.sim.source.events)
+    many = mode == "library" or (mode == "auto" and events >= _LIBRARY_FROM_EVENTS)
+    stand = Stand(out, plan.electronics)
     with folder_written_aside(out, STAND, force=force) as folder:
         library = plan.sim.library() if many else None
-        _write_sim(folder, plan, library, summary)
+        _write_sim(folder, plan, library, stand)
         if many and plan.shift is not None:
             library = plan.data.library()
-        _write_data(folder, plan, library, summary)
-        made = {"cpunet": cpunet.__version__, **plan.provenance(), "counts": vars(summary)}
+        _write_data(folder, plan, library, stand)
+        made = {"cpunet": cpunet.__version__, **plan.provenance(), "counts": stand.counts}
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-    return summary
+    return stand
 
 
 def _write_sim(
     folder: Path,
     plan: StandPlan,
     library: Library | None,
-    summary: StandSummary,
+    stand: Stand,
 ) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
@@ -172,15 +253,15 @@ def _write_sim(
             writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
         label = np.concatenate(labels)
         truth.close(label=label, n_pre=np.array(electronics.n_pre))
-    summary.n_sim = len(label)
-    summary.sim_lines = _by_line(label)
+    stand.n_sim = len(label)
+    stand.sim_lines = _by_line(label)
 
 
 def _write_data(
     folder: Path,
     plan: StandPlan,
     library: Library | None,
-    summary: StandSummary,
+    stand: Stand,
 ) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = plan.electronics
@@ -211,10 +292,10 @@ def _write_data(
                 "ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
             )
     np.savez(folder / "data_labels.npz", label=label, **told)
-    summary.n_data = len(label)
-    summary.data_lines = _by_line(label)
+    stand.n_data = len(label)
+    stand.data_lines = _by_line(label)
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
-        summary.flags[name] = int((flag & bit > 0).sum())
+        stand.flags[name] = int((flag & bit > 0).sum())
 
 
 def _simulated(side: Side, dt_ns: float) -> dict[str, Any]:
@@ -224,7 +305,6 @@ def _simulated(side: Side, dt_ns: float) -> dict[str, Any]:
         "detector": side.detector.model_dump(mode="json"),
         "settings": side.settings.model_dump(mode="json") | {"dt_ns": dt_ns},
         "hits": side.source.provenance(),
-        "cluster_mm": MERGING_MM,
     }
 
 

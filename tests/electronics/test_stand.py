@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from cpunet import load
+from cpunet.electronics import stand_plan
 from cpunet.electronics.chain import read_electronics
+from cpunet.electronics.stand import make_stand, write_stand
+from cpunet.electronics.stand_plan import StandPlan
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation import stand_plan
-from cpunet.jobs.simulation.stand import make_stand, write_stand
-from cpunet.jobs.simulation.stand_plan import StandPlan
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.field_lookup import Maps
@@ -43,8 +44,9 @@ DETECTOR = read_detector(
         "grid_mm=0.25",
     ],
 )
-WINDOWS = (Window("FEP", 2614.0, 2615.0), Window("1000-2000", 1000.0, 2000.0))
-EVENTS = (10, 30)
+EVENTS = {"FEP": 10, "1000-2000": 30}
+SMALL = {"electronics": "ornl", "detector": DETECTOR, "events": EVENTS}
+LIMIT = "cpunet.electronics.stand._LIBRARY_FROM_EVENTS"
 FILES = (".cpunet.json", "data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
 
 
@@ -66,7 +68,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         return build_library(maps, settings.model_copy(update={"library_halvings": 3}))
 
     monkeypatch.setattr(stand_plan, "build_library", build)
-    monkeypatch.setattr("cpunet.jobs.simulation.stand._LIBRARY_FROM_EVENTS", sum(EVENTS))
+    monkeypatch.setattr(LIMIT, sum(EVENTS.values()))
     return built
 
 
@@ -80,8 +82,9 @@ class Dead(GammaSource):
 
 @pytest.mark.parametrize("side", ["sim", "data"])
 def test_a_side_without_any_signal_is_told_in_one_line(tmp_path: Path, side: str) -> None:
-    plan = StandPlan.of(read_electronics("ornl"), DETECTOR, WINDOWS[:1], (2,))
-    dead = replace(getattr(plan, side), source=Dead(WINDOWS[:1], (2,), 20.0, 5.0, 0))
+    window = Window("FEP", 2614.0, 2615.0)
+    plan = StandPlan.of(read_electronics("ornl"), DETECTOR, {window: 2})
+    dead = replace(getattr(plan, side), source=Dead((window,), (2,), 20.0, 5.0, 0))
     with pytest.raises(
         CpunetError, match="none of 2 events gives a signal in small; give more"
     ):
@@ -89,9 +92,11 @@ def test_a_side_without_any_signal_is_told_in_one_line(tmp_path: Path, side: str
     assert list(tmp_path.iterdir()) == []
 
 
-def made(out: Path, seed: int = 0, kind: str = "matched") -> dict[str, npt.NDArray[Any]]:
+def made(out: Path, seed: int = 0, shift: tuple[str, ...] = ()) -> dict[str, npt.NDArray[Any]]:
     """Everything in the files of a stand but where and when it was made."""
-    make_stand(read_electronics("ornl"), DETECTOR, WINDOWS, EVENTS, out, kind=kind, seed=seed)
+    stand = make_stand(out, **SMALL, shift=shift, seed=seed)
+    assert str(load(out)) == str(stand)
+    assert load(out).electronics == read_electronics("ornl")
     assert tuple(sorted(path.name for path in out.iterdir())) == FILES
     content: dict[str, npt.NDArray[Any]] = {}
     for name in ("sim.lh5", "data.lh5"):
@@ -108,17 +113,17 @@ def made(out: Path, seed: int = 0, kind: str = "matched") -> dict[str, npt.NDArr
     return content
 
 
-@pytest.mark.parametrize("kind", ["matched", "shifted"])
+@pytest.mark.parametrize("shift", [(), ("default",)])
 def test_the_same_seed_gives_the_same_stand_and_another_another(
-    tmp_path: Path, kind: str
+    tmp_path: Path, shift: tuple[str, ...]
 ) -> None:
-    first, again = made(tmp_path / "a", 5, kind), made(tmp_path / "b", 5, kind)
+    first, again = made(tmp_path / "a", 5, shift), made(tmp_path / "b", 5, shift)
     assert first.keys() == again.keys()
     for name, values in first.items():
         np.testing.assert_array_equal(values, again[name], err_msg=name)
     told = [(tmp_path / name / "stand.json").read_text() for name in "ab"]
     assert told[0] == told[1]
-    other = made(tmp_path / "c", 6, kind)
+    other = made(tmp_path / "c", 6, shift)
     for name in ("truth.npz/response", "sim.lh5/geds/sim/energy", "data.lh5/geds/raw/energy"):
         assert not np.array_equal(first[name], other[name])
 
@@ -133,16 +138,16 @@ def test_the_sides_are_events_of_their_own(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("kind", "temperatures"), [("matched", [85.0]), ("shifted", [85.0, 87.0])]
+    ("shift", "temperatures"), [((), [85.0]), (("default",), [85.0, 87.0])]
 )
 def test_pulses_of_a_library_are_those_drifted_one_by_one(
-    libraries: list[float], tmp_path: Path, kind: str, temperatures: list[float]
+    libraries: list[float], tmp_path: Path, shift: tuple[str, ...], temperatures: list[float]
 ) -> None:
-    by_library = made(tmp_path / "library", kind=kind)
+    by_library = made(tmp_path / "library", shift=shift)
     assert libraries == temperatures
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cpunet.jobs.simulation.stand._LIBRARY_FROM_EVENTS", sum(EVENTS) + 1)
-        drifted = made(tmp_path / "drifted", kind=kind)
+        patch.setattr(LIMIT, sum(EVENTS.values()) + 1)
+        drifted = made(tmp_path / "drifted", shift=shift)
     assert len(libraries) == len(temperatures)
     values = "waveform/values"
     for name in ("truth.npz/response", f"sim.lh5/geds/sim/{values}"):
@@ -162,7 +167,8 @@ def test_pulses_of_a_library_are_those_drifted_one_by_one(
 def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None:
     settings = SimulationSettings(self_repulsion=0.3, hole_velocity_low_factor=0.95)
     electronics = read_electronics(preset)
-    make_stand(electronics, DETECTOR, WINDOWS, EVENTS, tmp_path / "a", settings=settings)
+    small = SMALL | {"electronics": electronics, "settings_file": settings}
+    make_stand(tmp_path / "a", **small)
     stored = StoredSimulation.read(tmp_path / "a" / "sim.lh5")
     assert stored.detector == DETECTOR
     assert stored.settings == settings.model_copy(update={"dt_ns": electronics.dt_ns})
@@ -179,8 +185,8 @@ def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None
 def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
     shift = Shift(bias_V=20, hole_trapping_per_us=0.5, electron_trapping_per_us=0.5)
     out = tmp_path / "a"
-    stand = (read_electronics("ornl"), DETECTOR, (WINDOWS[0],), (20,), out)
-    make_stand(*stand, kind="shifted", shift=shift)
+    small = SMALL | {"events": "FEP=20"}
+    make_stand(out, **small, shift=shift.model_dump(exclude_unset=True))
     told = json.loads((out / "stand.json").read_text())
     assert Shift.model_validate(told["shift"]) == shift
     assert told["data"]["detector"]["bias_V"] == DETECTOR.bias_V + 20
@@ -196,13 +202,17 @@ def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
 
 
 def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
-    stand = (read_electronics("ornl"), DETECTOR, WINDOWS, EVENTS, tmp_path / "a")
-    with pytest.raises(CpunetError, match="give --kind shifted"):
-        make_stand(*stand, shift=Shift(bias_V=1))
-    with pytest.raises(CpunetError, match="leave dt_ns out"):
-        make_stand(*stand, settings=SimulationSettings(dt_ns=16))
-    with pytest.raises(CpunetError, match="step_ns = 8 does not divide the 4 ns"):
-        make_stand(*stand, settings=SimulationSettings(step_ns=8))
+    for settings, said in (
+        ({"dt_ns": 16}, "leave dt_ns out"),
+        ({"step_ns": 8}, "step_ns = 8 does not divide the 4 ns"),
+        ({"earlier_pulses.rate_kHz": 1e300}, "earlier_pulses.rate_kHz: Input should be less"),
+        ({"bias": 3}, "bias: no such setting"),
+    ):
+        with pytest.raises(CpunetError, match=said):
+            make_stand(tmp_path / "a", **SMALL, settings=settings)
+    with pytest.raises(CpunetError, match="`events` FEP=0: give at least 1 event"):
+        make_stand(tmp_path / "a", events="FEP=0")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -219,7 +229,7 @@ def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_made_again_says_why(
     tmp_path: Path, damage: Callable[[Any], Any], said: str
 ) -> None:
-    make_stand(read_electronics("ornl"), DETECTOR, WINDOWS[:1], (3,), tmp_path / "a")
+    make_stand(tmp_path / "a", **(SMALL | {"events": "FEP=3"}))
     with h5py.File(tmp_path / "a" / "sim.lh5", "r+") as file:
         damage(file)
     with pytest.raises(CpunetError) as raised:

@@ -1,0 +1,63 @@
+"""The whole job on a test stand whose truth is known: stand, training, validation, report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from cpunet.electronics.stand import make_stand
+from cpunet.outputs import refuse_existing
+from cpunet.training.run import Run
+from cpunet.training.train import train
+from cpunet.validation.report import Report
+from cpunet.validation.validate import validate
+
+EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
+GLANCE = ("SEP mean pulse", "SEP current_amplitude", "SEP single pulse")
+QUICK_LOOK = (
+    "This is a quick look: with so few events the response is not well learned, and scores "
+    "scatter by several points. The whole demonstration has more events and all figures."
+)
+
+
+def demo(
+    out: str | Path = "demo", *, quick: bool = False, seed: int = 0, force: bool = False
+) -> Report:
+    """Simulate, digitise, train, translate and validate on a stand with a known answer.
+
+    Parameters
+    ----------
+    out
+        Folder of stand, run and report.
+    quick
+        Few events, the scores and three figures.
+    seed
+        Seed of all random numbers.
+    force
+        Replace an existing demonstration.
+
+    Raises
+    ------
+    CpunetError
+        If a part of it exists, unless `force`, or something else is in its place.
+
+    Examples
+    --------
+    cpunet demo --out demo
+
+    cpunet demo --quick
+    """
+    parts = [Path(out) / part for part in ("stand", "run", "report")]
+    for part in parts:
+        refuse_existing(part, force=force)
+    in_stand, in_run, in_report = parts
+    stand = make_stand(in_stand, events=FEW if quick else EVENTS, seed=seed, force=force)
+    run = train(stand.sim, stand.data, in_run, seed=seed, force=force)
+    assert isinstance(run, Run)  # the stand has one channel
+    report = validate(run, stand.sim, stand.data, truth=stand.truth, seed=seed)
+    assert isinstance(report, Report)
+    if quick:
+        drawn = {name: draw for name, draw in (report.drawn or {}).items() if name in GLANCE}
+        report = replace(report, drawn=drawn, notes=(QUICK_LOOK, *report.notes))
+    report.save(in_report, force=force)
+    return replace(report, folder=in_report)
