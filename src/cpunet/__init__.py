@@ -37,6 +37,7 @@ __all__ = [
     "compare",
     "import_weights",
     "info",
+    "list_recipes",
     "load",
     "open_pulses",
     "response",
@@ -44,6 +45,7 @@ __all__ = [
     "subtract_tails",
     "train",
     "translate",
+    "tune",
     "validate",
 ]
 
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
+    from cpunet.recipes import list_recipes
     from cpunet.simulation.hit_sources import HitFile
     from cpunet.simulation.hits import HitOptions
     from cpunet.simulation.simulate import Simulation, simulate
@@ -69,6 +72,7 @@ if TYPE_CHECKING:
     from cpunet.translation.translator import IREN, REN
     from cpunet.validation.compare import Comparison, compare
     from cpunet.validation.report import Report
+    from cpunet.validation.tune import tune
     from cpunet.validation.validate import validate
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
@@ -81,6 +85,7 @@ _HOMES = {
     "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
+    "recipes": ("list_recipes",),
     "simulation.hits": ("HitOptions",),
     "training.check": ("check",),
     "training.published": ("import_weights",),
@@ -94,6 +99,7 @@ _HOMES = {
     "translation.translator": ("IREN", "REN"),
     "validation.compare": ("Comparison", "compare"),
     "validation.report": ("Report",),
+    "validation.tune": ("tune",),
     "validation.validate": ("validate",),
 }
 

@@ -20,7 +20,6 @@ from cpunet.cli.export import export
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.stand import stand
-from cpunet.cli.tune import tune
 from cpunet.installation import other_package
 
 log = logging.getLogger(__name__)
@@ -61,7 +60,6 @@ for command in (
     demo,
     stand,
     calibrate,
-    tune,
     export,
 ):
     app.command()(command)
