@@ -24,7 +24,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
-from cpunet.recipes import load_recipe, recipe_names
+from cpunet.recipes import list_recipes, load_recipe
 from cpunet.training.train import train
 from cpunet.translation.translator import RejectionWarning
 from synthetic import decay, phased_edges
@@ -74,7 +74,7 @@ def require_parsed(words: list[str]) -> None:
         command = command.commands[name]
     assert not hasattr(command, "commands"), f"no command {words[:1]}"
     given = command.make_context(name, list(words)).params
-    if given.get("recipe") in recipe_names():
+    if given.get("recipe") in list_recipes():
         load_recipe(given["recipe"], given.get("set_values") or ())
 
 

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.recipes import load_recipe, recipe_names
+from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked
 
 
 def test_the_recipes_that_come_with_the_package():
-    assert recipe_names() == ["cpunet", "fast", "paper"]
-    for name in recipe_names():
+    assert list_recipes() == ["cpunet", "fast", "paper"]
+    for name in list_recipes():
         recipe = load_recipe(name)
         assert recipe.name == name
         assert recipe.preparation.length == 800
@@ -47,7 +47,7 @@ def test_the_recipe_that_matches_a_response():
 
 
 def test_all_recipes_see_the_same_pulses():
-    fast, *others = (load_recipe(name) for name in recipe_names())
+    fast, *others = (load_recipe(name) for name in list_recipes())
     for other in others:
         assert (other.peaks, other.preparation) == (fast.peaks, fast.preparation)
         assert (other.cuts, other.scores) == (fast.cuts, fast.scores)
@@ -88,7 +88,7 @@ def test_the_papers_numbers():
 
 
 def test_what_is_written_is_read_back():
-    for name in recipe_names():
+    for name in list_recipes():
         recipe = load_recipe(name)
         text = yaml.safe_dump(recipe.model_dump(mode="json"))
         assert checked(Recipe, yaml.safe_load(text), "copy") == recipe

@@ -39,6 +39,7 @@ __all__ = [
     "demo",
     "import_weights",
     "info",
+    "list_recipes",
     "load",
     "make_stand",
     "open_pulses",
@@ -47,6 +48,7 @@ __all__ = [
     "subtract_tails",
     "train",
     "translate",
+    "tune",
     "validate",
 ]
 
@@ -60,6 +62,7 @@ if TYPE_CHECKING:
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
+    from cpunet.recipes import list_recipes
     from cpunet.simulation.hit_sources import HitFile
     from cpunet.simulation.hits import HitOptions
     from cpunet.simulation.simulate import Simulation, simulate
@@ -74,6 +77,7 @@ if TYPE_CHECKING:
     from cpunet.translation.translator import IREN, REN
     from cpunet.validation.compare import Comparison, compare
     from cpunet.validation.report import Report
+    from cpunet.validation.tune import tune
     from cpunet.validation.validate import validate
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
@@ -88,6 +92,7 @@ _HOMES = {
     "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
+    "recipes": ("list_recipes",),
     "simulation.hits": ("HitOptions",),
     "training.check": ("check",),
     "training.published": ("import_weights",),
@@ -101,6 +106,7 @@ _HOMES = {
     "translation.translator": ("IREN", "REN"),
     "validation.compare": ("Comparison", "compare"),
     "validation.report": ("Report",),
+    "validation.tune": ("tune",),
     "validation.validate": ("validate",),
 }
 

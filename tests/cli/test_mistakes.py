@@ -191,11 +191,6 @@ MISTAKES = {
     ),
     "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
     "option left out": Mistake("validate run --sim sim.lh5", r".*--data.*--help"),
-    "search without its extra": Mistake(
-        "tune --sim sim.lh5 --data data.lh5 --out out",
-        r"tuning needs optuna, which is not installed; pip install .*",
-        without("optuna"),
-    ),
     "export without its extra": Mistake(
         "export run --out out.onnx",
         r"the package onnx is needed for ONNX; pip install .*",

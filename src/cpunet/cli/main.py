@@ -18,7 +18,6 @@ from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
-from cpunet.cli.tune import tune
 from cpunet.installation import other_package
 
 log = logging.getLogger(__name__)
@@ -57,7 +56,6 @@ def _options(version: Version = False, debug: Debug = False) -> None:
 
 for command in (
     calibrate,
-    tune,
     export,
 ):
     app.command()(command)

@@ -11,7 +11,7 @@ from cpunet.settings import Set, names, read_settings
 _FOLDER = Path(__file__).parent
 
 
-def recipe_names() -> list[str]:
+def list_recipes() -> list[str]:
     """Names of the recipes that come with the package."""
     return names(_FOLDER)
 
@@ -22,7 +22,7 @@ def load_recipe(recipe: str | Path | Recipe, settings: Set = ()) -> Recipe:
     Parameters
     ----------
     recipe
-        One of `recipe_names`, a path to a YAML file, or a recipe, which is returned.
+        One of `list_recipes`, a path to a YAML file, or a recipe, which is returned.
     settings
         ``"training.batch_size=16"`` and the like; values are YAML. Or a mapping.
 

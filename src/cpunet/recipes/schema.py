@@ -100,7 +100,7 @@ class ScoreConfig(Config):
 
 
 class SearchConfig(Config):
-    """Values of a setting that ``cpunet tune`` tries.
+    """Values of a setting that `cpunet.tune` tries.
 
     Either a range from ``low`` to ``high``, on a logarithmic scale if ``log``, or one of
     ``choices``.  Values are integers if ``low``, ``high`` and the setting are.

@@ -30,9 +30,10 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
-from cpunet.settings import checked
+from cpunet.settings import Set, checked
 from cpunet.training.checkpoints import differences
 from cpunet.training.devices import resolve_device
 from cpunet.training.fit import Sides, match
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TRIALS = 30
 JOURNAL, BEST, TABLE = "journal.log", "best.yaml", "trials.csv"
 STARTS = 8  # random trials before the first Gaussian process
 SHARE = 0.3  # share of the pulses of each side that is held out
@@ -62,27 +62,29 @@ TUNED = ("generator", "discriminator", "training")
 UNCHANGED, REASON, BEGUN = "unchanged recipe", "reason", "begun with"  # user attributes
 
 
-def tune_recipe(
-    sim: PulseFile,
-    data: PulseFile,
-    out: Path,
-    recipe: Recipe,
+def tune(
+    sim: Source,
+    data: Source,
+    out: str | Path,
     *,
-    trials: int = TRIALS,
+    recipe: str | Path | Recipe = "fast",
+    settings: Set = (),
+    trials: int = 30,
     peak: str = "FEP",
     seed: int = 0,
     device: str = "auto",
+    read: ReadOptions = ReadOptions(),
 ) -> Study:
     """Search for the settings that translate held-out pulses of the training's energies best.
 
     Parameters
     ----------
-    sim, data, peak, device
+    sim, data, peak, device, read
         See `cpunet.train`.
     out
         Folder of the search, a new one or one to continue: ``best.yaml`` (a recipe),
         ``trials.csv``, and ``journal.log`` with all that Optuna knows.
-    recipe
+    recipe, settings
         Recipe with its search space; its own values are the first trial.
     trials
         Total number of trials, including completed and failed ones.
@@ -108,16 +110,18 @@ def tune_recipe(
             "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
+    out, sides = Path(out), (pulse_file(sim, read.sim), pulse_file(data, read.data))
+    recipe = load_recipe(recipe, settings)
     device, space = resolve_device(device), search_space(recipe)
-    refuse_inputs(out, *sim.files, *data.files)
+    refuse_inputs(out, *sides[0].files, *sides[1].files)
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
     selection = parse_selection(peak, recipe.peaks)
-    simulated = load_simulated(sim, recipe, selection)
-    measured = load_measured(data, recipe, selection)
+    simulated = load_simulated(sides[0], recipe, selection)
+    measured = load_measured(sides[1], recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
-    held_out = HeldOut.of(simulated, measured, data, recipe, seed)
+    held_out = HeldOut.of(simulated, measured, sides[1], recipe, seed)
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         study_name="cpunet",
@@ -374,6 +378,6 @@ def _split(side: InputSet, rng: np.random.Generator) -> tuple[Pulses, Pulses]:
     if n < MIN_N:
         raise CpunetError(
             f"{side.path}: {len(pulses)} pulses, of which {n} would be held out, "
-            f"and {MIN_N} are needed; select more energies (--peak) or give more"
+            f"and {MIN_N} are needed; select more energies (`peak`) or give more"
         )
     return pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]

@@ -10,23 +10,22 @@ import numpy as np
 import pytest
 import torch
 
-from cpunet.cli.main import main
 from cpunet.errors import CpunetError
-from cpunet.jobs.tune import (
-    JOURNAL,
-    UNCHANGED,
-    HeldOut,
-    search_space,
-    tune_recipe,
-    value_of,
-    with_values,
-)
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.loading import load_measured, load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import REN
+from cpunet.validation.tune import (
+    JOURNAL,
+    UNCHANGED,
+    HeldOut,
+    search_space,
+    tune,
+    value_of,
+    with_values,
+)
 from synthetic import KEV, SMALL_NETWORK, Files, write_files
 
 SPACE = (
@@ -139,7 +138,7 @@ def test_the_recipes_own_spaces_can_be_searched(name):
 def test_without_optuna_there_is_a_line(files, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[tune\]'"):
-        tune_recipe(*files, tmp_path / "tune", tiny())
+        tune(*files, tmp_path / "tune", recipe=tiny())
     assert not [*tmp_path.iterdir()]
 
 
@@ -174,16 +173,16 @@ def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
     files, scored, tmp_path
 ):
     recipe = load_recipe("fast", [FIT, "training.clip=4"])
-    study = tune_recipe(*files, tmp_path / "tune", recipe, trials=2)
+    study = tune(*files, tmp_path / "tune", recipe=recipe, trials=2)
     assert study.trials[0].user_attrs == {UNCHANGED: True}
     own = {"training.ridge": recipe.training.ridge, "training.clip": "4"}
     assert study.trials[0].params == own
-    tune_recipe(*files, tmp_path / "tune", recipe, trials=10)
+    tune(*files, tmp_path / "tune", recipe=recipe, trials=10)
     assert len(scored.tried) == 10
-    again = tune_recipe(*files, tmp_path / "tune", recipe, trials=10)
+    again = tune(*files, tmp_path / "tune", recipe=recipe, trials=10)
     assert len(scored.tried) == 10
     assert states(again) == ["COMPLETE"] * 10
-    tune_recipe(*files, tmp_path / "other", recipe, trials=4)
+    tune(*files, tmp_path / "other", recipe=recipe, trials=4)
     assert scored.tried[10:] == scored.tried[:4]
 
     with (tmp_path / "tune" / "trials.csv").open() as stream:
@@ -196,7 +195,7 @@ def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
     assert tuned.scores == recipe.scores
 
     with pytest.raises(CpunetError, match="begun with other settings or pulses: "):
-        tune_recipe(*files, tmp_path / "tune", recipe, trials=12, seed=1)
+        tune(*files, tmp_path / "tune", recipe=recipe, trials=12, seed=1)
 
 
 def test_two_processes_share_a_search(files, scored, monkeypatch, tmp_path):
@@ -204,11 +203,11 @@ def test_two_processes_share_a_search(files, scored, monkeypatch, tmp_path):
 
     def joined(changed: Any) -> float:
         monkeypatch.setattr(scored, "score", score)
-        tune_recipe(*files, out, recipe, trials=3)  # while the first trial of another runs
+        tune(*files, out, recipe=recipe, trials=3)  # while the first trial of another runs
         return score(changed)
 
     monkeypatch.setattr(scored, "score", joined)
-    study = tune_recipe(*files, out, recipe, trials=3)
+    study = tune(*files, out, recipe=recipe, trials=3)
     assert states(study) == ["COMPLETE"] * 4
     assert len(set(scored.tried)) == 4
 
@@ -225,8 +224,8 @@ def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
     with monkeypatch.context() as patch:
         patch.setattr(scored, "score", fail)
         with pytest.raises(type(error), match=r"no trial has a score; the first: the|130"):
-            tune_recipe(*files, out, recipe, trials=1)
-    study = tune_recipe(*files, out, recipe, trials=2)
+            tune(*files, out, recipe=recipe, trials=1)
+    study = tune(*files, out, recipe=recipe, trials=2)
     assert states(study) == (
         ["FAIL", "COMPLETE"]
         if isinstance(error, CpunetError)
@@ -237,12 +236,12 @@ def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
 
 def test_a_folder_of_something_else_is_left_alone(files, scored, tmp_path):
     with pytest.raises(CpunetError, match="exists already and holds no search"):
-        tune_recipe(*files, tmp_path, load_recipe("fast", [FIT]))
+        tune(*files, tmp_path, recipe=load_recipe("fast", [FIT]))
     assert not (tmp_path / JOURNAL).exists()
 
 
 @pytest.mark.thorough
-def test_networks_are_searched_on_the_command_line(files, tmp_path, monkeypatch, capsys):
+def test_networks_are_searched(files, tmp_path, monkeypatch):
     pytest.importorskip("optuna")
     forward = PositionalUNet.forward
 
@@ -250,15 +249,6 @@ def test_networks_are_searched_on_the_command_line(files, tmp_path, monkeypatch,
         return pulses + 0.01 * forward(network, pulses, **options)
 
     monkeypatch.setattr(PositionalUNet, "forward", near_the_input)
-    folder = tmp_path / "tune"
-    values = [word for value in TINY for word in ("--set", value)]
-    inputs = ["--sim", files.sim.path, "--data", files.data.path, "--out", folder]
-    words = ["cpunet", "tune", *inputs, "--recipe", "paper", *values, "--trials", 2]
-    monkeypatch.setattr(sys, "argv", [*map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    shown = capsys.readouterr()
-    assert stop.value.code == 0, shown.err
-    assert "best: trial " in shown.out
-    assert "the recipe as it is has" in shown.out
-    assert shown.out.splitlines()[-1] == str(folder / "best.yaml")
+    study = tune(*files, tmp_path / "tune", recipe="paper", settings=TINY, trials=2)
+    assert states(study) == ["COMPLETE"] * 2
+    assert (tmp_path / "tune" / "best.yaml").is_file()
