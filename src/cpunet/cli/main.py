@@ -13,7 +13,6 @@ import cpunet
 from cpunet.cli.app import app as commands
 from cpunet.cli.app import run, with_options
 from cpunet.cli.boundary import ended_with, stop
-from cpunet.cli.calibrate import calibrate
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
@@ -60,7 +59,6 @@ def _options(version: Version = False, debug: Debug = False) -> None:
 for command in (
     demo,
     stand,
-    calibrate,
     tune,
     export,
 ):
