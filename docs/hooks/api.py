@@ -36,6 +36,8 @@ order in which data flow.
 
 ::: cpunet.validate
 
+::: cpunet.compare
+
 ::: cpunet.calibrate
 
 ::: cpunet.simulate
@@ -58,7 +60,11 @@ order in which data flow.
 
 ::: cpunet.Report
 
-::: cpunet.CalibratedRun
+::: cpunet.Comparison
+
+::: cpunet.Calibration
+
+::: cpunet.Plan
 
 ::: cpunet.PulseFile
 

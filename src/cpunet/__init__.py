@@ -2,7 +2,7 @@
 
 Data flow in one direction through its subpackages: ``pulses`` → ``simulation`` →
 ``electronics`` → ``networks`` → ``training`` → ``calibration`` → ``translation`` →
-``validation`` → ``jobs`` → ``calls`` and ``cli``.  See ``docs/design.md``.
+``validation`` → ``jobs`` → ``cli``.  See ``docs/design.md``.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ __all__ = [
     "IREN",
     "REN",
     "Adc",
-    "CalibratedRun",
+    "Calibration",
     "Comparison",
     "CpunetError",
     "FileOptions",
     "HitFile",
     "HitOptions",
+    "Plan",
     "PulseFile",
     "Pulses",
     "ReadOptions",
@@ -53,7 +54,8 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from cpunet.calls.calibrations import CalibratedRun, calibrate
+    from cpunet.calibration.calibrate import calibrate
+    from cpunet.calibration.calibrated_run import Calibration, Plan
     from cpunet.demonstration import demo
     from cpunet.electronics.flattening import subtract_tails
     from cpunet.electronics.stand import Stand, make_stand
@@ -82,7 +84,8 @@ if TYPE_CHECKING:
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
-    "calls.calibrations": ("CalibratedRun", "calibrate"),
+    "calibration.calibrate": ("calibrate",),
+    "calibration.calibrated_run": ("Calibration", "Plan"),
     "demonstration": ("demo",),
     "electronics.flattening": ("subtract_tails",),
     "electronics.stand": ("Stand", "make_stand"),

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration import search
+from cpunet.calibration.inputs import Freedom, known_depletion
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import ROUNDS, Search, _relaxed
 from cpunet.errors import CpunetError
-from cpunet.jobs.calibration.calibration_inputs import Freedom, known_depletion
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import solve
@@ -49,9 +49,9 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("prior", ["impurity=0±0.1", "impurity=-1±0.1", "temperature=200±1"])
 def test_a_prior_beyond_what_can_be_is_refused(prior):
-    with pytest.raises(CpunetError, match=rf"^--prior {prior}: .* give a value between"):
-        Freedom.of("auto", "", [prior])
-    assert Freedom.of("auto", "", ["self_repulsion=0±0.5"]).priors
+    with pytest.raises(CpunetError, match=r"^`prior` .* can be .*; give a value between"):
+        Freedom.of("", "", [prior])
+    assert Freedom.of("", "", ["self_repulsion=0±0.5"]).priors
 
 
 def test_after_the_last_round_nothing_is_simulated(monkeypatch):
@@ -97,14 +97,14 @@ def test_scaled_impurities_keep_their_tilt_and_the_surface_charge(
 
 
 def test_what_is_free_and_what_is_not():
-    freedom = Freedom.of("auto", "cloud,tilt", ["impurity = 1.0 ± 0.05"])
+    freedom = Freedom.of("", "cloud,tilt", ["impurity = 1.0 ± 0.05"])
     names = [nuisance.name for nuisance in freedom.looked_at]
     assert names[:2] == ["temperature_K", "impurity_factor"]
     assert not {"cloud_fwhm_mm", "impurity_tilt_1e10_per_cm4", "li_thickness_mm"} & set(names)
     assert freedom.priors == {"impurity_factor": (1.0, 0.05)}
     with pytest.raises(CpunetError, match=r"impurity_factor can be 0\.001 to 1000"):
-        Freedom.of("auto", "", ["impurity=-1±0.1"])
-    for free, fixed in (("auto", ""), ("auto", "li_thickness"), ("bias", "")):
+        Freedom.of("", "", ["impurity=-1±0.1"])
+    for free, fixed in (("", ""), ("", "li_thickness"), ("bias", "")):
         with pytest.raises(CpunetError, match="li_thickness_mm: it stays as simulated"):
             Freedom.of(free, fixed, ["li_thickness=1±0.1"])
     some = Freedom.of("li_thickness,bias", "bias", [])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
@@ -164,37 +163,6 @@ def test_raw_traces(home, run):
     assert back.counts["translated"] > N // 2
 
 
-def test_words_of_a_calibration(home, run, tmp_path, monkeypatch):
-    given = {}
-
-    def calibrated(self, out, **how):
-        given["job"], given["how"] = self, how
-        run.save(out)
-        content = {"parameters": {}, "notes": [], "profiles": {}, "directions": []}
-        (out / "calibration.json").write_text(json.dumps(content))
-
-    monkeypatch.setattr("cpunet.calls.calibrations.Calibration.run", calibrated)
-    made = cpunet.calibrate(
-        cpunet.HitFile(str(home / "hits.lh5")),
-        home / "raw.lh5",
-        tmp_path / "cal",
-        detector="ppc",
-        free=["temperature", "impurity"],
-        fixed=["impurity"],
-        priors={"depletion_voltage": (np.float64(2100), 5e-05)},
-        events=500,
-        force=True,
-    )
-    job = given["job"]
-    assert job.start.hits.path == home / "hits.lh5"
-    assert job.start.detector.name
-    assert [nuisance.name for nuisance in job.freedom.free] == ["temperature_K"]
-    assert job.freedom.priors == {"depletion_voltage": (2100.0, 5e-05)}
-    assert (job.events, given["how"]["force"]) == (500, True)
-    assert made.physics == {}
-    assert made.simulation == tmp_path / "cal" / "sim.lh5"
-
-
 def damaged(home, run=None) -> Path:
     """A folder whose files of results hold something else."""
     folder = home / "damaged"
@@ -250,11 +218,11 @@ WRONG = {
         "give the folder of a report",
     ),
     "no calibration": (
-        lambda home, _: cpunet.CalibratedRun.load(home / "run"),
+        lambda home, _: cpunet.Calibration.load(home / "run"),
         "no calibrated run",
     ),
     "damaged calibration": (
-        lambda home, run: cpunet.CalibratedRun.load(damaged(home, run)),
+        lambda home, run: cpunet.Calibration.load(damaged(home, run)),
         r"calibration.json: damaged \(no mapping\); calibrate again",
     ),
     "damaged report": (
@@ -266,16 +234,6 @@ WRONG = {
             home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.steps": {1}}
         ),
         r"training.steps: .*\(\{1\}\)",
-    ),
-    "no hits": (
-        lambda home, _: cpunet.calibrate(home / "sim.lh5", home / "raw.lh5", home / "new"),
-        "sim.lh5: ",
-    ),
-    "prior of nothing": (
-        lambda home, _: cpunet.calibrate(
-            home / "sim.lh5", home / "raw.lh5", home / "new", priors={"mood": (1, 2)}
-        ),
-        "mood",
     ),
 }
 

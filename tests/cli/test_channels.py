@@ -101,23 +101,6 @@ def test_check_looks_at_each_channel(command, stand, raw, tmp_path):
     assert pictures[:2] == ["check-ch1.png", "check-ch2.png"]
 
 
-def test_calibrate_takes_one_channel(command, stand, raw, tmp_path):
-    words = [
-        "--sim",
-        stand.sim,
-        "--data",
-        raw,
-        "--data-table",
-        "all",
-        "--out",
-        tmp_path / "run",
-    ]
-    told = command("calibrate", *words)
-    assert told.code == 2
-    assert "--data-table CHANNEL and the --sim or --detector of each" in told.err
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.slow
 def test_info_of_all_tables(command, raw):
     told = command("info", raw, "--table", "all")

@@ -45,10 +45,7 @@ COMMANDS = {
     "calibrate": [
         (TRAINING, "D"),
         (f"{TRAINING} --plan", "D"),
-        ("--hits D/hits.lh5 --detector icpc --data data.lh5", "D/hits.lh5"),
-        ("--sim sim.lh5 --detector D/my.yaml --data data.lh5", "D"),
-        (f"{TRAINING} --settings D/my.yaml", "D/my.yaml"),
-        ("--sim sim.lh5 --detector icpc --crystal D/my.yaml --data data.lh5", "D"),
+        (f"{TRAINING} --recipe D/my.yaml", "D"),
     ],
     "translate": [
         ("RUN D/sim.lh5", "D/sim.lh5"),

@@ -218,7 +218,7 @@ def test_a_dry_run_with_calibrations(place):
     assert jobs["calibrate"] == jobs["ideal_library"] == 3  # physics are those of a period
     assert jobs["event_pulses"] == 3 * 2
     told = " ".join(done.stdout.split())
-    words = "--free=auto --fix=tilt '--prior=depletion_voltage=2100±50' --events=500"
+    words = "--fix=tilt '--prior=depletion_voltage=2100±50' --events=500"
     assert words in told.replace("--prior='depletion", "'--prior=depletion")
     run = "'all results/V01/p03/run/"
     assert f"--detector={run}detector.yaml' --settings={run}settings.yaml' --hits" in told

@@ -17,7 +17,7 @@ def calibration_options(wildcards):
     if len(DATA[wildcards.detector, wildcards.period]) > 1:
         of_data = {}  # merged
     return options(
-        free=words["free"],
+        free=words["free"] or None,
         fix=words["fix"] or None,
         prior=words["prior"],
         events=words["events"],

@@ -20,7 +20,7 @@ HOPELESS = 50.0
 # Advice where a parameter is unexpected, besides the general one.
 ADVICE = {
     "self_repulsion": "it acts within each hit, so hits that are not merged within "
-    "0.2 mm (--cluster-mm), as tracks are long, need more of it"
+    "0.2 mm (cluster_mm), as tracks are long, need more of it"
 }
 # Minimum decrease of chi-square that is reported for a further parameter.
 WORTH_TELLING = 9.0
@@ -86,13 +86,13 @@ def notes(calibrated: Calibrated) -> list[str]:
         nuisance = physics.nuisances[i]
         value, name = values[nuisance.name], nuisance.name
         if vector[n + k] in (parameters.low[n + k], parameters.high[n + k]):
-            found.append(f"{name} is at its bound, {value:g}: --fix it, or free another")
+            found.append(f"{name} is at its bound, {value:g}: fix it, or free another")
         width = parameters.widths[n + k]
         off = (vector[n + k] - parameters.centre[n + k]) / width
         if abs(off) > FAR:
             found.append(
                 f"{name} = {value:.4g} is {abs(off):.1f} errors of its prior from it: give a "
-                "wider --prior if that is possible, or free what else moves pulses so"
+                "wider prior if that is possible, or free what else moves pulses so"
                 + (f"; {ADVICE[name]}" if name in ADVICE else "")
             )
     per = calibrated.chi_square / problem.moments

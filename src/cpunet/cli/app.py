@@ -57,6 +57,10 @@ COMMANDS = {
         "cpunet.translation.translate:translate",
         "Translate pulses with a trained run, keeping the rows and columns of their files.",
     ),
+    "calibrate": (
+        "cpunet.calibration.calibrate:calibrate",
+        "Calibrate the detector and its electronics together.",
+    ),
     "validate": (
         "cpunet.validation.validate:validate",
         "Score a run per peak and write a report.",

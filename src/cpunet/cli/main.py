@@ -13,7 +13,6 @@ import cpunet
 from cpunet.cli.app import app as commands
 from cpunet.cli.app import run, with_options
 from cpunet.cli.boundary import ended_with, stop
-from cpunet.cli.calibrate import calibrate
 from cpunet.cli.environment import share_the_machine
 from cpunet.cli.export import export
 from cpunet.cli.library import library
@@ -54,10 +53,7 @@ def _options(version: Version = False, debug: Debug = False) -> None:
     pass
 
 
-for command in (
-    calibrate,
-    export,
-):
+for command in (export,):
     app.command()(command)
 app.add_typer(library, name="library")
 

@@ -22,11 +22,6 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
-from cpunet.simulation.clustering import MERGING_MM
-from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_sources import HitFile
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulate import simulate
 from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.superposition import solve
 
@@ -57,8 +52,13 @@ class Freedom:
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, free: str, fixed: str, given: Sequence[str]) -> Freedom:
-        """Parse the options of the command line.
+    def of(
+        cls,
+        free: str | Sequence[str] = (),
+        fix: str | Sequence[str] = (),
+        prior: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+    ) -> Freedom:
+        """What is free, from names and priors as users give them.
 
         Raises
         ------
@@ -68,21 +68,22 @@ class Freedom:
 
         Examples
         --------
-        >>> Freedom.of("auto", "tilt", ["temperature=90±0.5"]).priors
+        >>> Freedom.of(fix="tilt", prior=["temperature=90±0.5"]).priors
         {'temperature_K': (90.0, 0.5)}
         """
-        chosen = None if free.strip() == "auto" else _parameters(free)
-        stay = frozenset(nuisance.name for nuisance in _parameters(fixed))
-        if chosen is not None:
-            chosen = tuple(n for n in chosen if n.name not in stay)
-            if not chosen:
-                raise CpunetError(f"--free {free}: all of it is fixed; leave something free")
-        freedom = cls(chosen, stay, dict(_prior(text) for text in given))
-        without_use = freedom.priors.keys() - {DEPLETION, *(n.name for n in freedom.looked_at)}
+        chosen, stay = _parameters(free), frozenset(n.name for n in _parameters(fix))
+        kept = tuple(n for n in chosen if n.name not in stay)
+        if chosen and not kept:
+            names = ", ".join(n.name for n in chosen)
+            raise CpunetError(f"`free`: all of it ({names}) is fixed", "leave something free")
+        given = prior.items() if isinstance(prior, Mapping) else map(_split, prior)
+        priors = dict(_prior(name, *of_name) for name, of_name in given)
+        freedom = cls(kept or None, stay, priors)
+        without_use = priors.keys() - {DEPLETION, *(n.name for n in freedom.looked_at)}
         if without_use:
             raise CpunetError(
-                f"--prior {min(without_use)}: it stays as simulated; name it in --free, or "
-                "leave out its prior"
+                f"`prior` {min(without_use)}: it stays as simulated",
+                "name it in `free`, or leave out its prior",
             )
         return freedom
 
@@ -95,40 +96,6 @@ class Freedom:
         return tuple(
             n for n in NUISANCES if n.name not in self.fixed and n.name != "li_thickness_mm"
         )
-
-
-@dataclass(frozen=True)
-class Start:
-    """Starting point of a calibration: a simulation with its hits, or hits to simulate.
-
-    Parameters
-    ----------
-    sim
-        Output of ``cpunet simulate`` or ``cpunet stand``; None with `hits`.
-    hits
-        Hits of the events to simulate; None with `sim`.
-    detector, settings
-        Detector and settings of the simulation; with `sim`, None for those of its file.
-    cluster_mm
-        Distance in mm below which `hits` are merged.
-    """
-
-    sim: PulseFile | None = None
-    hits: HitFile | None = None
-    detector: Detector | None = None
-    settings: SimulationSettings | None = None
-    cluster_mm: float = MERGING_MM
-
-    def __post_init__(self) -> None:
-        if (self.sim is None) == (self.hits is None):
-            raise CpunetError("give either --sim FILE, with its hits, or --hits FILE")
-        if self.hits is not None and self.detector is None:
-            raise CpunetError("--hits: give the --detector that they lie in")
-
-    @property
-    def files(self) -> tuple[Path | str | None, ...]:
-        """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
-        return (*(self.sim.files if self.sim else ()), self.hits.path if self.hits else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +114,6 @@ class Sides:
         Hits, one event per pulse of the file.
     selection
         Selected energies.
-    temporary
-        File that was simulated only as a starting point, or None.
     """
 
     sim: InputSet
@@ -157,31 +122,12 @@ class Sides:
     physics: Physics
     stored: StoredSimulation
     selection: EnergySelection
-    temporary: Path | None
-
-    def forget(self) -> None:
-        """Remove the file that was simulated only as a starting point."""
-        if self.temporary is not None:
-            self.temporary.unlink()
 
 
 def read_sides(
-    start: Start,
-    data_file: PulseFile,
-    recipe: Recipe,
-    peak: str,
-    events: int,
-    seed: int,
-    folder: Path,
+    sim: PulseFile, data_file: PulseFile, recipe: Recipe, peak: str, events: int, seed: int
 ) -> Sides:
-    """Read and prepare both sides; if hits are given, simulate them first.
-
-    Parameters
-    ----------
-    start, data_file, recipe, peak, events, seed
-        See `cpunet.jobs.calibration.calibrate.Calibration`.
-    folder
-        Folder for pulses that are simulated only as a starting point.
+    """Read and prepare both sides, see `cpunet.calibrate`.
 
     Raises
     ------
@@ -190,10 +136,6 @@ def read_sides(
     """
     selection = parse_selection(peak, recipe.peaks)
     data = load_measured(data_file, recipe, selection)
-    sim, temporary = start.sim, None
-    if sim is None:
-        temporary = folder / "as_simulated.lh5"
-        sim = PulseFile(_simulated(start, temporary, data.dt_ns))
     stored = StoredSimulation.read(sim.path)
     simulated = load_simulated(sim, recipe, selection)
     require_same_sampling(simulated, data)
@@ -202,28 +144,8 @@ def read_sides(
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
     some = replace(simulated, prepared=simulated.prepared[rows])
-    settings = start.settings or stored.settings
-    if not np.isclose(settings.dt_ns, simulated.dt_ns):
-        raise CpunetError(
-            f"--settings: dt_ns = {settings.dt_ns:g}, but the pulses of {sim.path} have "
-            f"{simulated.dt_ns:g}; give that"
-        )
-    physics = Physics(start.detector or stored.detector, settings, ())
-    return Sides(some, data, sim.path, physics, stored, selection, temporary)
-
-
-def _simulated(start: Start, path: Path, dt_ns: float) -> Path:
-    """Simulate the pulses of hits with the given physics."""
-    assert start.hits is not None
-    assert start.detector is not None
-    simulate(
-        path,
-        detector=start.detector,
-        hits=start.hits,
-        settings_file=start.settings or SimulationSettings(dt_ns=dt_ns),
-        settings={"cluster_mm": start.cluster_mm},
-    )
-    return path
+    physics = Physics(stored.detector, stored.settings, ())
+    return Sides(some, data, sim.path, physics, stored, selection)
 
 
 def known_depletion(
@@ -259,28 +181,35 @@ def known_depletion(
     return known
 
 
-def _parameters(text: str) -> tuple[Nuisance, ...]:
-    names = [part for part in text.split(",") if part.strip()]
-    return tuple(dict.fromkeys(named(name) for name in names))
+def _parameters(names: str | Sequence[str]) -> tuple[Nuisance, ...]:
+    texts = [names] if isinstance(names, str) else names
+    parts = [part for text in texts for part in text.split(",") if part.strip()]
+    return tuple(dict.fromkeys(named(name) for name in parts))
 
 
-def _prior(text: str) -> tuple[str, tuple[float, float]]:
+def _split(text: str) -> tuple[str, tuple[float, float]]:
     found = _PRIOR.fullmatch(text)
-    expected = f"--prior {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5"
-    if found is None:
-        raise CpunetError(expected)
     try:
-        value, error = float(found[2]), float(found[3])
+        if found is not None:
+            return found[1], (float(found[2]), float(found[3]))
     except ValueError:
-        raise CpunetError(expected) from None
+        pass
+    raise CpunetError(f"`prior` {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5")
+
+
+def _prior(name: str, value: float, error: float) -> tuple[str, tuple[float, float]]:
+    value, error = float(value), float(error)
     if not (error > 0 and np.isfinite([value, error]).all()):
-        raise CpunetError(expected)
-    if found[1] == DEPLETION:
+        raise CpunetError(
+            f"`prior` {name}={value:g}±{error:g}: expected a value, and an error above 0"
+        )
+    if name == DEPLETION:
         return DEPLETION, (value, error)
-    nuisance = named(found[1])
+    nuisance = named(name)
     if not nuisance.lowest <= value <= nuisance.highest:
         raise CpunetError(
-            f"--prior {text}: {nuisance.name} can be {nuisance.lowest:g} to "
-            f"{nuisance.highest:g}; give a value between"
+            f"`prior` {name}={value:g}: {nuisance.name} can be {nuisance.lowest:g} to "
+            f"{nuisance.highest:g}",
+            "give a value between",
         )
     return nuisance.name, (value, error)

@@ -1,0 +1,322 @@
+"""Calibrate the physics of a simulation on a measurement, and write a run of the result."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+import cpunet
+from cpunet.calibration.calibrated_run import (
+    CALIBRATION,
+    DETECTOR,
+    DPI,
+    SETTINGS,
+    SIM,
+    Calibration,
+    Plan,
+)
+from cpunet.calibration.figures import calibration_figures
+from cpunet.calibration.identifiability import Information
+from cpunet.calibration.inputs import DEPLETION, Freedom, Sides, known_depletion, read_sides
+from cpunet.calibration.nearby import Simulator
+from cpunet.calibration.nuisances import Physics, known_before
+from cpunet.calibration.result import described, hopeless
+from cpunet.calibration.search import Calibrated, Search
+from cpunet.calibration.titles import titled
+from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.measured_remains import drawn_like, measured_remains
+from cpunet.errors import CpunetError
+from cpunet.matrices import one_thread_for_matrices
+from cpunet.memory import keep_freed_memory
+from cpunet.outputs import folder_written_aside, refuse_existing
+from cpunet.progress import stage
+from cpunet.pulses.channels import ALL
+from cpunet.pulses.loading import load_simulated
+from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hit_sources import HitFile
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulate import simulate
+from cpunet.training.chain import train_chain
+from cpunet.training.job import TrainingJob
+from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.run import RUN
+
+log = logging.getLogger(__name__)
+
+# Numbers of pulses per side for which a plan gives the errors.
+PLANNED = (1000, 4000, 40_000)
+
+
+def calibrate(
+    sim: Source,
+    data: Source,
+    out: str | Path | None = None,
+    *,
+    free: Sequence[str] = (),
+    fix: Sequence[str] = (),
+    prior: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+    plan: bool = False,
+    peak: str = "FEP",
+    recipe: str | Path | Recipe = "fast",
+    events: int = 3000,
+    seed: int = 0,
+    read: ReadOptions = ReadOptions(),
+    force: bool = False,
+) -> Calibration | Plan:
+    """Calibrate the detector and its electronics together: temperature, impurities, readout.
+
+    The folder is a run like those of `cpunet.train`, and contains the calibrated
+    ``detector.yaml`` and ``settings.yaml``, ``sim.lh5`` (all events, simulated again with
+    them), ``calibration.json`` and its figures, ``profiles.png``, ``pulls.png`` and
+    ``directions.png``.
+
+    Parameters
+    ----------
+    sim
+        Output of cpunet simulate or stand, with its hits.
+    data
+        Measured pulses.
+    out
+        Run folder to make; may be left out with a plan.
+    free
+        Parameters, as temperature,impurity; by default those that the data tell.
+    fix
+        Parameters that stay as simulated.
+    prior
+        NAME=VALUE±ERROR (or +-) of a parameter or of depletion_voltage (repeatable).
+    plan
+        Only tell what these pulses know of the physics, before any fit.
+    peak
+        Energies to calibrate on: FEP, SEP, DEP or ranges in keV.
+    recipe
+        fast, or a YAML file of your own.
+    events
+        Simulated events, at most, that are drifted again and again.
+    seed
+        Seed of all random numbers.
+    read
+        How the files are read.
+    force
+        Replace existing output.
+
+    Returns
+    -------
+    Calibration or Plan
+        The run, with the calibrated physics; or the expected errors of the physics.
+
+    Raises
+    ------
+    CpunetError
+        If the inputs cannot be used, the detector cannot be simulated with the physics that
+        the data require, or the data are clearly from another detector.
+
+    Examples
+    --------
+    cpunet calibrate --sim sim.lh5 --data raw.lh5 --out run
+
+    cpunet calibrate --sim sim.lh5 --data raw.lh5 --out run --free temperature,impurity \
+--prior depletion_voltage=2100±50
+
+    cpunet calibrate --sim sim.lh5 --data raw.lh5 --plan
+    """
+    if read.data_table == ALL:
+        raise CpunetError(
+            f"`data_table` {ALL}: each channel is a detector with physics of its own",
+            "calibrate one after another, with `data_table` CHANNEL and the `sim` of each",
+        )
+    if out is None and not plan:
+        raise CpunetError("give `out`, the run folder to make, or `plan`")
+    files = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    inputs = [*files[0].files, *files[1].files]
+    inputs += [] if isinstance(recipe, Recipe) else [recipe]
+    if out is not None:
+        refuse_existing(Path(out), *inputs, force=force)
+    settings = load_recipe(recipe)
+    _ = settings.chain  # without one there is nothing to calibrate with a detector
+    job = _Job(*files, settings, Freedom.of(free, fix, prior), peak, events, seed)
+    if plan:
+        planned = job.plan()
+        if out is not None:
+            planned.save(out, force=force)
+        return planned
+    assert out is not None
+    with folder_written_aside(Path(out), RUN, force=force) as folder:
+        job.run(folder, Path(out))
+    return Calibration.load(out)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A calibration to run or to plan, see `calibrate`."""
+
+    sim: PulseFile
+    data: PulseFile
+    recipe: Recipe
+    freedom: Freedom
+    peak: str
+    events: int
+    seed: int
+
+    @one_thread_for_matrices()
+    def run(self, folder: Path, out: Path) -> None:
+        """Calibrate detector and readout together, and write all to a folder, later `out`."""
+        keep_freed_memory()
+        clock, started = time.perf_counter(), datetime.now(UTC)
+        sides = self._sides()
+        with stage("Calibrating") as bar:
+            calibrated = self._search(sides, bar.update).run()
+        self._require_hope(calibrated, sides)
+        content = self._content(calibrated, sides)
+        for note in content["notes"]:
+            log.info(titled(note))
+        _simulate_calibrated(calibrated, sides, folder, self.seed)
+        again = load_simulated(PulseFile(folder / SIM), self.recipe, sides.selection)
+        # not stretched: what is off in the drift is for the physics to explain
+        training = self.recipe.training.model_copy(update={"drift_terms": 0})
+        recipe = self.recipe.model_copy(update={"training": training})
+        job = TrainingJob(
+            recipe, self.peak, self.seed, "cpu", again, sides.data, self.data, folder
+        )
+        run = train_chain(job, calibrated.response)
+        content["seconds"] = round(time.perf_counter() - clock, 1)
+        assert run.fit is not None  # of a chain
+        content["fit"] = run.fit.model_dump(include={"chi_square", "moments", "verdict"})
+        run = run.model_copy(
+            update={
+                "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
+                "started": started.isoformat(timespec="seconds"),
+                "seconds": content["seconds"],
+                "calibration": CALIBRATION,
+            }
+        )
+        (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
+        for name, figure in calibration_figures(content).items():
+            figure.savefig(folder / f"{name}.png", dpi=DPI)
+        run.write(folder)
+
+    @one_thread_for_matrices()
+    def plan(self) -> Plan:
+        """Forecast how well the pulses constrain the physics, before any fit."""
+        sides = self._sides()
+        with stage("Planning") as bar:
+            search = self._search(sides, bar.update)
+            information = search.plan()
+        directions = {
+            str(n): [found.describe() for found in information.for_pulses(n / 2).directions()]
+            for n in PLANNED
+        }
+        return Plan(
+            {
+                "cpunet": cpunet.__version__,
+                "detector": sides.physics.detector.name,
+                "pulses": list(PLANNED),
+                "errors": _errors_by_pulses(
+                    information, search.simulator.physics, search.given
+                ),
+                "directions": directions,
+            }
+        )
+
+    def _sides(self) -> Sides:
+        return read_sides(self.sim, self.data, self.recipe, self.peak, self.events, self.seed)
+
+    def _search(self, sides: Sides, simulated: Callable[[], None]) -> Search:
+        """The search, ready to start."""
+        measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
+        preparation = self.recipe.preparation
+        remains, _ = measured_remains(self.data, preparation)
+        drawn = None
+        if remains is not None and remains.law is not None:
+            drawn = drawn_like(remains, self.data, sides.data, preparation)
+        noise, note = measured_noise(self.data, measured, preparation, remains)
+        if note is not None:
+            log.warning(note)
+        physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors
+        hits = sides.stored.hits[sides.sim.prepared.index]
+        rng = np.random.default_rng(self.seed)
+        free = self.freedom.free
+        return Search(
+            simulator=Simulator(hits, physics, simulated),
+            sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
+            energy_kev=pulses.energy_kev,
+            recipe=self.recipe,
+            given={k: v for k, v in given.items() if k != DEPLETION},
+            known=known_depletion(physics, given.get(DEPLETION)),
+            free=None if free is None else list(range(len(free))),
+        )
+
+    def _require_hope(self, calibrated: Calibrated, sides: Sides) -> None:
+        if hopeless(calibrated):
+            per = calibrated.chi_square / calibrated.problem.moments
+            raise CpunetError(
+                f"{self.data.path}: no physics near those of {sides.physics.detector.name} "
+                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
+                "of another detector, or of other energies (`peak`)?"
+            )
+
+    def _content(self, calibrated: Calibrated, sides: Sides) -> dict[str, Any]:
+        compared = calibrated.problem.bands
+        return {
+            "cpunet": cpunet.__version__,
+            "detector": sides.physics.detector.name,
+            "data": str(self.data.path),
+            "peak": self.peak,
+            "seed": self.seed,
+            "events": {
+                "sim": sum(len(band.sim) for band in compared),
+                "data": sum(len(band.moments.data) for band in compared),
+            },
+            **described(calibrated),
+        }
+
+
+def _simulate_calibrated(calibrated: Calibrated, sides: Sides, folder: Path, seed: int) -> None:
+    """Write the calibrated physics, and all events simulated with it."""
+    parameters = calibrated.problem.parameters
+    detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
+    _write_physics(folder, detector, settings)
+    simulate(
+        folder / SIM,
+        detector=detector,
+        hits=HitFile(sides.sim_path, placed=True),
+        settings_file=settings,
+        seed=seed,
+    )
+
+
+def _write_physics(folder: Path, detector: Detector, settings: SimulationSettings) -> None:
+    for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
+        text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def _errors_by_pulses(
+    information: Information, physics: Physics, given: Mapping[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """Simulated value, prior error and expected errors of each parameter, by name."""
+    found: dict[str, Any] = {}
+    before = known_before(physics, given)
+    of_pulses = {n: information.for_pulses(n / 2) for n in PLANNED}
+    for i, nuisance in enumerate(information.nuisances):
+        nominal = physics.nominal(nuisance)
+        value, error = before[nuisance.name]
+        slope = nuisance.slope(nominal, value)
+        found[nuisance.name] = {
+            "simulated": nominal,
+            "prior": error,
+            "alone": {str(n): float(slope * f.errors([i])[0]) for n, f in of_pulses.items()},
+            "all_free": {str(n): float(slope * f.errors()[i]) for n, f in of_pulses.items()},
+        }
+    return found

@@ -1,0 +1,209 @@
+"""Results of a calibration: a run with its physics, and the plan of one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from pydantic import Field
+
+from cpunet.calibration.titles import titled
+from cpunet.errors import CpunetError
+from cpunet.outputs import FolderKind, folder_written_aside
+from cpunet.settings import read_json, read_settings
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.tables import text_table
+from cpunet.training.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+CALIBRATION, SIM = "calibration.json", "sim.lh5"
+DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
+DPI = 110
+PLAN = FolderKind(
+    name="plan",
+    command="cpunet calibrate --plan",
+    known_by="plan.json",
+    own=r"plan\.json|plan\.png",
+)
+
+
+class Calibration(Run):
+    """A run whose simulation was fitted together with the readout.
+
+    Parameters
+    ----------
+    content
+        Content of ``calibration.json``.
+    """
+
+    content: dict[str, Any] = Field({}, exclude=True, repr=False)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """Open the folder of a calibration.
+
+        Raises
+        ------
+        CpunetError
+            If the folder is not a calibrated run.
+        """
+        run, path = super().load(folder), Path(folder) / CALIBRATION
+        if not path.is_file():
+            raise CpunetError(
+                f"{folder}: no calibrated run (no {CALIBRATION}); open it with "
+                "cpunet.Run.load, or calibrate"
+            )
+        content = read_json(path, "calibrate again")
+        return run.model_copy(update={"content": content})
+
+    @cached_property
+    def physics(self) -> DataFrame:
+        """A row per free parameter: its value, error, simulated value, prior and others."""
+        from pandas import DataFrame
+
+        rows = {
+            name: {k: v for k, v in told.items() if k != "prior"}
+            | {"prior": told["prior"]["value"], "prior_error": told["prior"]["error"]}
+            for name, told in self.content["parameters"].items()
+        }
+        return DataFrame.from_dict(rows, orient="index")
+
+    @property
+    def simulation(self) -> Path:
+        """File of all events, simulated again with the calibrated physics."""
+        return self._folder / SIM
+
+    @cached_property
+    def detector(self) -> Detector:
+        """The calibrated detector."""
+        return read_detector(str(self._folder / DETECTOR))
+
+    @cached_property
+    def settings(self) -> SimulationSettings:
+        """The calibrated settings of the simulation."""
+        return read_settings(SimulationSettings, self._folder / SETTINGS)
+
+    @property
+    def _folder(self) -> Path:
+        assert self.folder is not None  # a calibration always has one
+        return self.folder
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """``pulls``; ``profiles`` and ``directions``, if any parameter was free."""
+        from cpunet.calibration.figures import calibration_figures
+
+        return calibration_figures(self.content)
+
+    def __str__(self) -> str:
+        content = self.content
+        chi, fixed = content["chi_square"], content["fixed"]
+        before, after = (chi[key] / chi["moments"] for key in ("before", "after"))
+        lines = [
+            f"{titled(name)} {told['value']:.5g} ± {told['error']:.2g} (simulated with "
+            f"{told['simulated']:.5g}; ± {told['error_all']:.2g} if all physics were free)"
+            for name, told in content["parameters"].items()
+        ] or ["no parameter of the physics is determined better than it was known"]
+        if fixed:
+            falls = ", ".join(
+                f"{titled(name)} (chi-square would fall by "
+                f"{told['chi_square_would_fall_by']:.1f})"
+                for name, told in fixed.items()
+            )
+            lines.append(f"left as simulated: {falls}")
+        lines.append(f"chi-square per function {before:.2f} before, {after:.2f} after")
+        return "\n".join([*lines, str(self.folder)])
+
+    def _repr_html_(self) -> str:
+        from cpunet.html_pages import part
+
+        rows = [
+            [
+                titled(name),
+                f"{one['value']:.5g} ± {one['error']:.2g}",
+                f"{one['simulated']:.5g}",
+            ]
+            for name, one in self.content["parameters"].items()
+        ]
+        head = ["physics", "calibrated", "as simulated"]
+        shown = part(
+            "object", "", head=head, rows=rows, lines=map(titled, self.content["notes"])
+        )
+        return shown + super()._repr_html_()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan:
+    """What pulses know of the physics before any fit: ``cpunet.calibrate(..., plan=True)``.
+
+    Parameters
+    ----------
+    content
+        ``errors`` of each parameter by number of pulses, alone and with all parameters free;
+        ``directions`` by number of pulses.
+    """
+
+    content: dict[str, Any]
+
+    @property
+    def errors(self) -> DataFrame:
+        """Expected errors: a row per parameter and kind, a column per number of pulses."""
+        from pandas import DataFrame
+
+        rows = {
+            (name, kind): told[kind]
+            for name, told in self.content["errors"].items()
+            for kind in ("alone", "all_free")
+        }
+        return DataFrame.from_dict(rows, orient="index")
+
+    def plot(self) -> Figure:
+        """Draw the directions with a middling number of pulses."""
+        from cpunet.calibration.figures import directions_figure
+
+        return directions_figure(self.content["directions"][self._middle])
+
+    def save(self, folder: str | Path, force: bool = False) -> None:
+        """Write ``plan.json`` and ``plan.png``.
+
+        Raises
+        ------
+        CpunetError
+            If the folder exists and `force` is off, or is no plan.
+        """
+        with folder_written_aside(Path(folder), PLAN, force=force) as aside:
+            (aside / "plan.json").write_text(json.dumps(self.content, indent=1) + "\n")
+            self.plot().savefig(aside / "plan.png", dpi=DPI)
+
+    def __str__(self) -> str:
+        counts = [f"N={n}" for n in self.content["pulses"]]
+        tables = []
+        for kind, title in (("alone", "error of one alone"), ("all_free", "with all free")):
+            rows = [
+                [titled(name), *(f"{e:.3g}" for e in (told["prior"], *told[kind].values()))]
+                for name, told in self.content["errors"].items()
+            ]
+            tables.append(text_table([title, "prior", *counts], rows))
+        directions = [
+            f"{d['error']:8.3f}  {titled(d['words'], units=False)}"
+            for d in self.content["directions"][self._middle]
+        ]
+        unit = "error in units of the prior:"
+        about = f"directions with {self._middle} pulses of each side, {unit}"
+        return "\n".join([*tables, about, *directions])
+
+    def __repr__(self) -> str:
+        return f"<Plan of {self.content['detector']}: {', '.join(self.content['errors'])}>"
+
+    @property
+    def _middle(self) -> str:
+        pulses = self.content["pulses"]
+        return str(pulses[len(pulses) // 2])

@@ -1,1 +1,0 @@
-"""Joint calibration of detector and electronics; its result is a run and a detector."""

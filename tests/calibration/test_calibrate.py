@@ -1,0 +1,182 @@
+"""`cpunet.calibrate`: a detector that is 3 K warmer than it was simulated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cpunet
+from cpunet.cli.app import run
+from cpunet.recipes import load_recipe
+from cpunet.simulation.geometry_readers import read_detector
+
+# Pulses of the peak, on each side: as few as a fit takes, and enough for a small error.
+FEW, ENOUGH = 240, 420
+# A readout of few numbers, and a chain that can describe it.
+READOUT = {
+    "slow": {"fraction": 0.065, "tau_ns": 400.0},
+    "decays": [{"fraction": 1.0, "tau_us": 80.0}],
+}
+PLAIN = (
+    "generator.slow_ns=[400]",
+    "generator.fast_decays_us=[]",
+    "training.ringing_mhz=[]",
+    "training.start_factors=[1]",
+    "training.steps=5",
+)
+
+
+def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
+    """A small stand; made by the package's own job, in this process."""
+    from cpunet.jobs.simulation.stand import make_stand
+
+    from cpunet.electronics.chain import Electronics, read_electronics
+    from cpunet.simulation.energy_windows import energy_windows
+    from cpunet.simulation.shifted import Shift
+
+    make_stand(
+        Electronics.model_validate(read_electronics("legend200").model_dump() | readout),
+        read_detector("ppc"),
+        tuple(energy_windows("FEP,DEP", load_recipe("fast").peaks, 0.5)),
+        (full_energy, 60),
+        out,
+        kind="shifted",
+        shift=Shift(temperature_K=3),
+        seed=3,
+    )
+    return out
+
+
+def calibrated_to(stand: Path, run: Path, *overrides: str) -> cpunet.Calibration:
+    recipe = load_recipe("fast", overrides)
+    sides = stand / "sim.lh5", stand / "data.lh5"
+    return cpunet.calibrate(*sides, run, free=["temperature"], recipe=recipe)
+
+
+@pytest.fixture(scope="module")
+def stand(tmp_path_factory) -> Path:
+    return make_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, **READOUT)
+
+
+@pytest.fixture(scope="module")
+def calibrated(stand, tmp_path_factory) -> cpunet.Calibration:
+    """A search of one short round, for a chain of few parameters."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, few in {"ROUNDS": 1, "STEPS": 6, "FIRST_STEPS": 8}.items():
+            patch.setattr(f"cpunet.calibration.search.{name}", few)
+        return calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
+
+
+def require_temperature(run: Path) -> dict[str, Any]:
+    """What is told of the temperature, which must be near the true one."""
+    told = json.loads((run / "calibration.json").read_text())
+    temperature = told["parameters"]["temperature_K"]
+    simulated = read_detector("ppc").temperature_K
+    assert temperature["simulated"] == simulated
+    assert temperature["error"] > 0
+    assert abs(temperature["value"] - simulated - 3) < 3.5 * temperature["error"]
+    chi = told["chi_square"]
+    assert chi["after"] < chi["before"]
+    assert len(told["pulls"]["after"]) == chi["moments"]
+    assert told["directions"][0]["components"] == {"temperature_K": 1.0}
+    names = told["covariance"]["names"]
+    assert np.shape(told["covariance"]["matrix"]) == (len(names), len(names))
+    assert len(told["profiles"]["temperature_K"]["chi_square"]) == 5
+    for name in ("profiles", "pulls", "directions"):
+        assert (run / f"{name}.png").stat().st_size > 1000
+    return told
+
+
+def test_the_temperature_is_found(calibrated):
+    require_temperature(calibrated.folder)
+
+
+@pytest.mark.slow
+def test_the_temperature_is_found_with_a_small_error(tmp_path):
+    told = require_temperature(
+        calibrated_to(make_stand(tmp_path / "stand", ENOUGH), tmp_path / "run").folder
+    )
+    assert told["parameters"]["temperature_K"]["error"] < 0.5
+    chi = told["chi_square"]
+    assert chi["after"] < 1.6 * chi["moments"] < chi["before"]
+    profile = told["profiles"]["temperature_K"]["chi_square"]
+    assert np.argmin(profile) == 2  # of five, the middle one
+
+
+def test_it_is_a_run_like_any_other(calibrated, stand):
+    run = cpunet.Calibration.load(calibrated.folder)
+    physics = run.physics.loc["temperature_K"]
+    assert run.detector.temperature_K == physics["value"]
+    assert physics["prior_error"] > 0
+    assert run.settings.dt_ns == run.dt_ns
+    assert run.translate(run.simulation).valid.any()
+    assert {"pulls", "profiles", "directions"} == set(run.figures)
+    html = run._repr_html_()
+    assert "temperature [K]" in html
+    assert "cpunet run" in html
+    lines = str(run).splitlines()
+    assert lines[0].startswith("temperature [K] ")
+    assert lines[-1] == str(run.folder)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "free",
+    [
+        "temperature,hole_velocity_low",
+        pytest.param("temperature,hole_velocity_low,impurity", marks=pytest.mark.slow),
+    ],
+)
+def test_a_plan_is_told_before_any_fit(stand, free, tmp_path, capsys):
+    out = tmp_path / "plan"
+    words = ["--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--plan", "--out", out]
+    prior = ["--prior", "hole_velocity_low=1.2±0.06"]
+    assert run(["calibrate", *map(str, words), "--free", free, *prior]) == 0
+    printed = capsys.readouterr().out
+    assert "temperature [K]" in printed
+    assert "in units of the prior" in printed
+    told = json.loads((out / "plan.json").read_text())
+    # as given, not in units of the simulated value
+    assert told["errors"]["hole_velocity_low_factor"]["prior"] == pytest.approx(0.06)
+    of_temperature = told["errors"]["temperature_K"]
+    assert of_temperature["alone"]["40000"] < of_temperature["alone"]["1000"]
+    assert of_temperature["alone"]["1000"] < of_temperature["all_free"]["1000"]
+    assert (out / "plan.png").stat().st_size > 1000
+    errors = cpunet.Plan(told).errors
+    assert errors.loc[("temperature_K", "alone"), "1000"] == of_temperature["alone"]["1000"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"out": None}, "give `out`, the run folder to make, or `plan`"),
+        ({"free": ["colour"]}, "'colour': no such parameter of the physics"),
+        ({"prior": ["temperature=90"]}, "expected NAME=VALUE±ERROR"),
+        ({"prior": {"temperature": (90, 0)}}, "an error above 0"),
+        ({"prior": {"mood": (1, 2)}}, "'mood': no such parameter of the physics"),
+        ({"free": ["bias"], "fix": ["bias"]}, "all of it .* is fixed"),
+        ({"recipe": "paper"}, "fits no readout chain"),
+        ({"read": cpunet.ReadOptions(data_table="all")}, "a detector with physics of its own"),
+    ],
+)
+def test_what_is_wrong_is_told(stand, given, told, tmp_path):
+    with pytest.raises(cpunet.CpunetError, match=told):
+        cpunet.calibrate(
+            stand / "sim.lh5", stand / "data.lh5", **({"out": tmp_path / "run"} | given)
+        )
+    assert not (tmp_path / "run").exists()
+
+
+def test_pulses_without_hits_are_refused(stand, tmp_path):
+    data = stand / "data.lh5"
+    with pytest.raises(cpunet.CpunetError, match="give an output of cpunet simulate or"):
+        cpunet.calibrate(data, data, tmp_path / "run")
+
+
+def test_an_input_is_not_overwritten(stand):
+    with pytest.raises(cpunet.CpunetError, match="holds the input"):
+        cpunet.calibrate(stand / "sim.lh5", stand / "data.lh5", stand, force=True)
