@@ -25,7 +25,9 @@ import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.jobs.translation.simflow_files import read_library
+from cpunet.legend.peak_currents import currents_about_peak, heights
+from cpunet.legend.realistic_library import read_library
+from cpunet.legend.templates import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -34,8 +36,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.translation.library_mode import TemplateTranslator
-from cpunet.translation.peak_currents import currents_about_peak, heights
 from cpunet.translation.translator import REN
 
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)

@@ -72,14 +72,15 @@ COMMANDS = {
     ],
     "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
     "response": [("RUN", "RUN"), ("RUN --stand D", "D"), ("RUN", ".")],
-    "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
+    "export onnx": [
+        ("RUN", "RUN/weights.safetensors"),
+        ("RUN --report REPORT", "REPORT/ren.onnx"),
+    ],
+    "export legend": [("RUN", "RUN"), ("RUN --report REPORT", "REPORT")],
     "library make": [
         ("--detector D/my.yaml", "D/my.yaml"),
-        ("--detector icpc --crystal D/my.yaml", "D/my.yaml"),
+        ("--detector icpc --settings D/my.yaml", "D/my.yaml"),
     ],
-    "library merge": [("D/hits.lh5 D/sim.lh5", "D/sim.lh5")],
-    "library expand": [("D/hits.lh5", "D/hits.lh5")],
-    "library lithium": [],  # reads no file
     "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
     "import": [("--ren D/fep_REN.pt", "D")],
 }

@@ -29,7 +29,7 @@ from synthetic import write_run
 
 TRAIN = "train --recipe fast --sim sim.lh5 --data data.lh5 --out out"
 SIMULATE = "simulate --detector ppc.yaml --hits hits.npz --out out"
-WRITE = "library lithium --out out.lh5"
+WRITE = "translate run sim.lh5 --no-noise --out out.lh5"
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 
@@ -183,7 +183,8 @@ MISTAKES = {
         f"{TRAIN} --set training.steps=-1", r"fast: training.steps: .*"
     ),
     "options that exclude each other": Mistake(
-        "export run --out out.onnx --detector V1", r"--detector .*--to legend-pars; add it"
+        "library translate run sim.lh5 --out out --rings 2",
+        r".*--rings.*--format simflow; add it",
     ),
     "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
     "option left out": Mistake("train --sim sim.lh5", r"Missing option '--data'.*--help"),
@@ -193,7 +194,7 @@ MISTAKES = {
         without("optuna"),
     ),
     "export without its extra": Mistake(
-        "export run --out out.onnx",
+        "export onnx run --out out.onnx",
         r"the package onnx is needed for ONNX; pip install .*",
         without("onnx"),
     ),

@@ -10,11 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cpunet.jobs.inspection.chain_description import describe_responses
-
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.settings import read_values
+from cpunet.training.chain_description import describe_responses
 
 
 def run_chain(

@@ -28,11 +28,27 @@ COMMANDS = {
         "cpunet.training.check:check",
         "Say whether simulated and measured pulses can be compared, and what to do if not.",
     ),
+    "export legend": (
+        "cpunet.legend.export:export_legend",
+        "Export a readout chain as parameters for LEGEND's simulation chain.",
+    ),
+    "export onnx": (
+        "cpunet.translation.export:export_onnx",
+        "Export the deterministic part of a run as ONNX.",
+    ),
     "import": (
         "cpunet.training.published:import_weights",
         "Make a run of the weights that the authors published.",
     ),
     "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "library make": (
+        "cpunet.legend.make_library:make_library",
+        "Simulate the charge pulse of every place in a detector.",
+    ),
+    "library translate": (
+        "cpunet.legend.translate_library:translate_library",
+        "Translate a library of charge pulses with a trained run, without noise.",
+    ),
     "simulate": (
         "cpunet.simulation.simulate:simulate",
         "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
@@ -78,8 +94,15 @@ app = App(
     ),
     result_action="return_value",
 )
+GROUPS = {
+    "export": App(name="export", help="Write a run for other software."),
+    "library": App(name="library", help="Make and translate pulse-shape libraries."),
+}
+for _group in GROUPS.values():
+    app.command(_group)
 for _name, (_function, _help) in COMMANDS.items():
-    app.command(_function, name=_name, help=_help)
+    *_group_of, _word = _name.split()
+    (GROUPS[_group_of[0]] if _group_of else app).command(_function, name=_word, help=_help)
 
 
 def run(words: Sequence[str]) -> int:

@@ -16,8 +16,6 @@ from cpunet.cli.boundary import ended_with, stop
 from cpunet.cli.calibrate import calibrate
 from cpunet.cli.demo import demo
 from cpunet.cli.environment import share_the_machine
-from cpunet.cli.export import export
-from cpunet.cli.library import library
 from cpunet.cli.messages import messages_to_stderr, out
 from cpunet.cli.response import response
 from cpunet.cli.stand import stand
@@ -64,10 +62,8 @@ for command in (
     calibrate,
     tune,
     response,
-    export,
 ):
     app.command()(command)
-app.add_typer(library, name="library")
 
 
 def main() -> None:
