@@ -80,7 +80,7 @@ from pathlib import Path
 sys.argv = sys.argv[1:]
 try:
     if sys.argv[0] == "cpunet":
-        from cpunet.cli.main import main
+        from cpunet.cli import main
         main()
     else:
         runpy.run_path(sys.argv[0], run_name="__main__")

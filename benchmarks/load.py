@@ -21,7 +21,7 @@ from validation import repeated
 NAMES = "V{detector:02d}-p{period:02d}"
 _CALL = """
 import resource, sys, time
-from cpunet.cli.main import main
+from cpunet.cli import main
 begun = time.monotonic()
 sys.argv = ["cpunet", *sys.argv[1:]]
 try:

@@ -25,7 +25,9 @@ import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.jobs.translation.simflow_files import read_library
+from cpunet.legend.peak_currents import currents_about_peak, heights
+from cpunet.legend.realistic_library import read_library
+from cpunet.legend.templates import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -34,8 +36,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.translation.library_mode import TemplateTranslator
-from cpunet.translation.peak_currents import currents_about_peak, heights
 from cpunet.translation.translator import REN
 
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
@@ -44,7 +44,7 @@ SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
 def run(*words: object) -> None:
     """Run a command, and print its time and memory."""
     begun = time.monotonic()
-    program = "from cpunet.cli.main import main; main()"
+    program = "from cpunet.cli import main; main()"
     process = subprocess.Popen([sys.executable, "-c", program, *map(str, words)])
     _, status, used = os.wait4(process.pid, 0)
     if status:

@@ -18,14 +18,14 @@ import numpy as np
 import scipy.fft
 
 from cpunet.electronics.exponentials import Exponentials
+from cpunet.legend.lithium import LithiumLayer, arrived, delayed
+from cpunet.legend.peak_currents import currents_about_peak, heights
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.lithium import LithiumLayer, arrived, delayed
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
 from cpunet.training.closed_forms import learned_chain
-from cpunet.translation.peak_currents import currents_about_peak, heights
 from cpunet.translation.translator import REN
 
 DEPTHS_MM = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6)

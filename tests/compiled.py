@@ -33,13 +33,13 @@ OWN = (
     "; train --sim stand/sim.lh5 --data stand/data.lh5 --out run"
     "; validate run --sim stand/sim.lh5 --data stand/data.lh5 --no-baselines --out report",
     "simulate --detector ppc --hits hits.npz --library --out library.lh5"
-    "; fields ppc --out fields.png",
+    "; info ppc --out fields.png",
 )
 RUN = """
 import sys
-from cpunet.cli.main import app
+from cpunet.cli import run
 for command in sys.argv[1:]:
-    app(command.split(), standalone_mode=False)
+    run(command.split())
 """
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cpunet.cli.main import main
+from cpunet.cli import main
 from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
 
 AFTER = 1  # iterations
@@ -26,7 +26,7 @@ SETTINGS = ["training.checkpoint_interval=1", "training.log_interval=1"]
 
 # what takes long to import, and a training or a test needs
 PRELOADED = [
-    "cpunet.cli.main",
+    "cpunet.cli",
     "cpunet.training.train",
     "cpunet.pulses.reading.hdf5",
     "pytest",

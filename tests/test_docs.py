@@ -18,8 +18,8 @@ import typer
 import yaml
 
 import cpunet
-from cpunet.cli.app import app as functions
-from cpunet.cli.main import app
+from cpunet.cli import app
+from cpunet.cli import app as functions
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
@@ -235,7 +235,7 @@ def test_the_first_tutorial_from_end_to_end(tmp_path):
         if words[1] == "train":
             words += [w for value in SHORT for w in ("--set", f"training.{value}")]
             words += ["--set", "scores.bootstraps=10"]
-        code = "from cpunet.cli.main import main; main()"
+        code = "from cpunet.cli import main; main()"
         done = subprocess.run(
             [sys.executable, "-c", code, *words[1:]],
             cwd=tmp_path,

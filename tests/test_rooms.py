@@ -7,13 +7,12 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import cpunet
 
 HOUSE = Path(cpunet.__file__).parent
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
-ORDER = PROJECT["tool"]["cpunet"]
+ROOMS = PROJECT["tool"]["cpunet"]["rooms"]
+LAST = ("inspection", "demonstration", "cli")  # behind all rooms
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -30,24 +29,13 @@ def imported(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{name.name}" for name in node.names)
 
 
-@pytest.mark.parametrize(
-    ("house", "package", "rooms"),
-    [
-        (HOUSE, "cpunet.", ORDER["rooms"]),
-        (HOUSE / "jobs", "cpunet.jobs.", ORDER["jobs"]),
-    ],
-)
-def test_no_module_imports_from_a_later_room(
-    house: Path, package: str, rooms: list[str]
-) -> None:
-    found = {path.name for path in house.iterdir() if (path / "__init__.py").exists()}
-    assert found == set(rooms)
+def test_no_module_imports_from_a_later_room() -> None:
+    found = {path.name for path in HOUSE.iterdir() if (path / "__init__.py").exists()}
+    assert found == set(ROOMS)
     wrong = []
-    for place, room in enumerate(rooms):
-        later = tuple(f"{package}{name}" for name in rooms[place + 1 :])
-        for path in (house / room).rglob("*.py"):
-            names = {
-                n for n in imported(path) if f"{n}.".startswith(tuple(f"{r}." for r in later))
-            }
+    for place, room in enumerate(ROOMS):
+        later = tuple(f"cpunet.{name}." for name in (*ROOMS[place + 1 :], *LAST))
+        for path in (HOUSE / room).rglob("*.py"):
+            names = {n for n in imported(path) if f"{n}.".startswith(later)}
             wrong += [f"{path.relative_to(HOUSE)} imports {name}" for name in sorted(names)]
     assert not wrong

@@ -24,6 +24,8 @@ __all__ = [
     "FileOptions",
     "HitFile",
     "HitOptions",
+    "LegendParameters",
+    "LithiumLayer",
     "Plan",
     "PulseFile",
     "Pulses",
@@ -38,17 +40,25 @@ __all__ = [
     "check",
     "compare",
     "demo",
+    "expand_library",
+    "export_legend",
+    "export_onnx",
     "import_weights",
     "info",
     "list_recipes",
+    "lithium_table",
     "load",
+    "make_library",
     "make_stand",
+    "merge_libraries",
     "open_pulses",
+    "read_library",
     "response",
     "simulate",
     "subtract_tails",
     "train",
     "translate",
+    "translate_library",
     "tune",
     "validate",
 ]
@@ -61,6 +71,11 @@ if TYPE_CHECKING:
     from cpunet.electronics.stand import Stand, make_stand
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
+    from cpunet.legend.export import LegendParameters, export_legend
+    from cpunet.legend.lithium import LithiumLayer, lithium_table
+    from cpunet.legend.make_library import make_library
+    from cpunet.legend.realistic_library import expand_library, merge_libraries, read_library
+    from cpunet.legend.translate_library import translate_library
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
     from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
@@ -73,6 +88,7 @@ if TYPE_CHECKING:
     from cpunet.training.response import response
     from cpunet.training.run import Run
     from cpunet.training.train import train
+    from cpunet.translation.export import export_onnx
     from cpunet.translation.options import Adc
     from cpunet.translation.translate import translate
     from cpunet.translation.translation import Translation
@@ -92,6 +108,22 @@ _HOMES = {
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
     "simulation.hit_sources": ("HitFile",),
+    "legend.export": (
+        "LegendParameters",
+        "export_legend",
+    ),
+    "legend.lithium": (
+        "LithiumLayer",
+        "lithium_table",
+    ),
+    "legend.make_library": ("make_library",),
+    "legend.realistic_library": (
+        "expand_library",
+        "merge_libraries",
+        "read_library",
+    ),
+    "legend.translate_library": ("translate_library",),
+    "translation.export": ("export_onnx",),
     "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import cpunet
-from cpunet.cli.app import run
+from cpunet.cli import run
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 

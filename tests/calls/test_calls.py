@@ -263,7 +263,7 @@ def test_a_recipe_and_settings_are_not_both_given():
 
 @pytest.mark.slow
 def test_the_page_runs_on_a_stand(tmp_path, monkeypatch):
-    from cpunet.cli.main import main
+    from cpunet.cli import main
 
     monkeypatch.chdir(tmp_path)
     words = ["cpunet", "stand", "--preset", "legend200", "--seed", "1", "--out", "stand"]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pytest
 from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
 
-from cpunet.cli.main import main
+from cpunet.cli import main
 
 DT_NS = 16.0
 PEAKS_KEV = {"DEP": 1592.511, "SEP": 2103.511, "FEP": 2614.511}

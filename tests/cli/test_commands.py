@@ -14,7 +14,7 @@ import pytest
 import yaml
 from matplotlib.figure import Figure
 
-from cpunet.cli.main import main
+from cpunet.cli import main
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.outputs import mark
 from cpunet.training.run import RUN

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from cpunet.cli.app import app as functions
-from cpunet.cli.main import app
+from cpunet.cli import app
+from cpunet.cli import app as functions
 
 GAMMAS = "--detector icpc --events FEP=1"
 TRAINING = "--sim D/sim.lh5 --data D/data.lh5"
@@ -68,14 +68,15 @@ COMMANDS = {
     ],
     "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
     "response": [("RUN", "RUN"), ("RUN --truth D", "D"), ("RUN", ".")],
-    "export": [("RUN", "RUN/weights.safetensors"), ("RUN --report REPORT", "REPORT/ren.onnx")],
+    "export onnx": [
+        ("RUN", "RUN/weights.safetensors"),
+        ("RUN --report REPORT", "REPORT/ren.onnx"),
+    ],
+    "export legend": [("RUN", "RUN"), ("RUN --report REPORT", "REPORT")],
     "library make": [
         ("--detector D/my.yaml", "D/my.yaml"),
-        ("--detector icpc --crystal D/my.yaml", "D/my.yaml"),
+        ("--detector icpc --settings D/my.yaml", "D/my.yaml"),
     ],
-    "library merge": [("D/hits.lh5 D/sim.lh5", "D/sim.lh5")],
-    "library expand": [("D/hits.lh5", "D/hits.lh5")],
-    "library lithium": [],  # reads no file
     "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
     "import": [("--ren D/fep_REN.pt", "D")],
 }

@@ -20,7 +20,7 @@ import pytest
 import yaml
 from torch import nn
 
-from cpunet.cli.main import main
+from cpunet.cli import main
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.outputs import folder_written_aside
 from cpunet.recipes import load_recipe
@@ -33,7 +33,7 @@ NEEDED = {
     "simulate": {"--detector": "ppc.yaml", "--hits": "hits.npz", "--out": "out"},
 }
 TRAIN, SIMULATE = NEEDED
-WRITE = "library lithium --out out.lh5"
+WRITE = "translate run sim.lh5 --no-noise --out out.lh5"
 Patch = Callable[[pytest.MonkeyPatch], None]
 
 
@@ -187,12 +187,13 @@ MISTAKES = {
         f"{TRAIN} --set training.steps=-1", r"fast: training.steps: .*"
     ),
     "options that exclude each other": Mistake(
-        "export run --out out.onnx --detector V1", r"--detector .*--to legend-pars; add it"
+        "library translate run sim.lh5 --out out --rings 2",
+        r".*--rings.*--format simflow; add it",
     ),
     "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
     "option left out": Mistake("validate run --sim sim.lh5", r".*--data.*--help"),
     "export without its extra": Mistake(
-        "export run --out out.onnx",
+        "export onnx run --out out.onnx",
         r"the package onnx is needed for ONNX; pip install .*",
         without("onnx"),
     ),

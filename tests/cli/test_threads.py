@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from cpunet.cli.environment import SPIN_COUNT, share_the_machine
+from cpunet.cli import SPIN_COUNT, sound_environment
 
 
 @pytest.mark.parametrize(
@@ -22,5 +22,5 @@ def test_threads_soon_sleep_unless_the_user_says_otherwise(monkeypatch, name, va
         monkeypatch.setenv(known, "")
         monkeypatch.delenv(known)
     monkeypatch.setenv(name, value)
-    share_the_machine()
+    sound_environment()
     assert os.environ.get("GOMP_SPINCOUNT") == spins

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import cpunet
-from cpunet.cli.main import main
+from cpunet.cli import main
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses, tables_of
 from cpunet.pulses.writing import write_pulses

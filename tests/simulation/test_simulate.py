@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.pulse_shape_library import write_library
+from cpunet.legend.make_library import make_library
 from cpunet.pulses.loading import load_simulated
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
@@ -333,5 +333,5 @@ def test_a_library_without_templates_is_not_written(ppc, tmp_path):
         (20, r"\d+ are not collected in time"),
     ):
         with pytest.raises(CpunetError, match=said):
-            write_library(ppc, tmp_path / "psl.lh5", settings=short, grid_mm=grid_mm)
+            make_library(ppc, tmp_path / "psl.lh5", settings_file=short, grid_mm=grid_mm)
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,7 @@ import torch
 import yaml
 from torch import nn
 
-from cpunet.cli.main import main
+from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError

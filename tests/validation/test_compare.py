@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 import pytest
 
-from cpunet.cli.app import run
+from cpunet.cli import run
 from cpunet.errors import CpunetError
 from cpunet.validation.compare import compare
 from cpunet.validation.forest_plot import span, ticks

@@ -86,7 +86,11 @@ def configuration(metadata: Path) -> dict[str, Any]:
             for name in DETECTORS
         },
         "calibrate": {"free": "temperature", "events": 300},
-        "library": {"grid_mm": 8, "make": ["--angles=0,45"], "translate": ["--currents"]},
+        "library": {
+            "grid_mm": 8,
+            "make": ["--angles=0,45"],
+            "translate": ["--format=currents"],
+        },
         "events": {"hits": "stp/*.lh5"},
         "validate": {"rivals": False},
     }

@@ -334,7 +334,7 @@ class Run(Part):
 
     def summary(self) -> list[tuple[str, str]]:
         """What was trained, on what, and how well it fits: topics and texts."""
-        from cpunet.jobs.inspection.run_words import summary
+        from cpunet.training.run_words import summary
 
         return summary(self)
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.simflow_files import (
+from cpunet.legend.low_rank import Loss
+from cpunet.legend.peak_currents import LENGTH, PEAK
+from cpunet.legend.realistic_library import (
     Made,
     describe,
     expand_library,
     merge_libraries,
     read_library,
 )
-from cpunet.translation.low_rank import Loss
-from cpunet.translation.peak_currents import LENGTH, PEAK
 
 R, Z = np.arange(2.0), np.arange(3.0)
 BASIS = np.eye(2, LENGTH, PEAK, dtype=np.float32)  # two samples

@@ -18,19 +18,13 @@ from cpunet.progress import stage
 from cpunet.settings import read_json
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import Run, RunLike, as_run
-from cpunet.translation.exports import CHECKED, OPSET, TOLERANCE, Format, export
 from cpunet.translation.graphs import Graph
+from cpunet.translation.onnx import CHECKED, OPSET, TOLERANCE, write_onnx
 from cpunet.translation.translator import IREN, REN, Translator
-
-_LANGUAGES = {
-    "onnx": f"ONNX, opset {OPSET}",
-    "torchscript": "TorchScript (`torch.jit.load`)",
-    "torch-export": "torch.export program (`torch.export.load`)",
-}
 
 
 @dataclass(frozen=True)
-class Exported:
+class Export:
     """Exported files, and the largest difference of a sample from the run."""
 
     graph: Path
@@ -38,17 +32,20 @@ class Exported:
     noise: Path | None
     difference: float
 
+    def __str__(self) -> str:
+        files = [self.graph, self.card, *([self.noise] if self.noise else [])]
+        return f"{', '.join(map(str, files))}: within {self.difference:.1e} of the run"
 
-def export_run(
+
+def export_onnx(
     run: RunLike,
-    out: Path,
-    form: Format,
+    out: str | Path,
     *,
     inverse: bool = False,
-    report: Path | None = None,
+    report: str | Path | None = None,
     force: bool = False,
-) -> Exported:
-    """Export the deterministic part of a run for other software, and check it against the run.
+) -> Export:
+    """Export the deterministic part of a run as ONNX, and check it against the run.
 
     Beside ``NAME.onnx`` (or another name of `out`) it writes ``NAME.card.md``, which describes
     the training, inputs and outputs, and how to add noise.  If the run adds electronic noise,
@@ -57,24 +54,32 @@ def export_run(
     Parameters
     ----------
     run
-        A trained run, or its folder.
+        A trained run or its folder.
     out
-        File to write.
-    form
-        ``"onnx"``, ``"torchscript"`` or ``"torch-export"``.
+        File to write, its card beside it.
     inverse
-        Whether to export IREN instead of REN.
+        Export IREN instead of REN.
     report
-        Folder of a report on this run, whose scores are copied to the card.
+        Report on this run, whose scores go into the card.
     force
-        Whether to replace existing files; those of noise are removed if there is none.
+        Replace existing files; those of noise are removed if there is none.
+
+    Returns
+    -------
+    Export
+        The files.
 
     Raises
     ------
     CpunetError
         If the run is not finished, the report has no scores, a package is missing or the
         exported graph differs from the run.
+
+    Examples
+    --------
+    cpunet export onnx run --out ren.onnx
     """
+    out, report = Path(out), None if report is None else Path(report)
     card, noise_file = out.with_suffix(".card.md"), out.with_suffix(".noise.npz")
     run = as_run(run)
     for path in (out, card, noise_file):
@@ -89,9 +94,9 @@ def export_run(
         written_aside(out) as aside,
         written_aside(card) as text,
     ):
-        difference = export(graph, aside, form)
-        done = Exported(out, card, None if noise is None else noise_file, difference)
-        text.write_text(_card(run, translator, graph, done, form, scores), encoding="utf-8")
+        difference = write_onnx(graph, aside)
+        done = Export(out, card, None if noise is None else noise_file, difference)
+        text.write_text(_card(run, translator, graph, done, scores), encoding="utf-8")
         if noise is not None:
             with written_aside(noise_file) as stored:
                 _write_noise(stored, noise)
@@ -126,15 +131,14 @@ def _card(
     run: Run,
     translator: Translator,
     graph: Graph,
-    done: Exported,
-    form: Format,
+    done: Export,
     scores: Mapping[str, Any] | None,
 ) -> str:
     parts = [
         f"# {done.graph.name}\n",
         f"{type(translator).__name__} of a cpunet run: "
         + ("simulated → measured-like" if translator.part == "ren" else "measured → simulated")
-        + f" pulses. {_LANGUAGES[form]}; any batch size. Largest difference from the run in "
+        + f" pulses. ONNX, opset {OPSET}; any batch size. Largest difference from the run in "
         f"batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of the "
         f"pulse height (refused above {TOLERANCE:g}).\n",
         "## Made from\n",
@@ -223,7 +227,7 @@ def _interface(translator: Translator, graph: Graph) -> list[str]:
     return lines
 
 
-def _noise(graph: Graph, done: Exported) -> list[str]:
+def _noise(graph: Graph, done: Export) -> list[str]:
     lines = []
     if "epsilon" in graph.inputs:
         lines = [

@@ -15,10 +15,19 @@ from lgdo import Array, Scalar, Struct
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.pulse_shape_library import write_library
-from cpunet.jobs.translation.simflow_checks import chosen_libraries, known_detector
-from cpunet.jobs.translation.simflow_files import expand_library, merge_libraries, read_library
-from cpunet.jobs.translation.simflow_library import enclosed, translate_for_simflow
+from cpunet.legend.ideal_library import chosen_libraries, known_detector
+from cpunet.legend.make_library import make_library
+from cpunet.legend.peak_currents import (
+    PEAK,
+    currents_about_peak,
+    heights,
+    most_frequent,
+)
+from cpunet.legend.production import enclosed
+from cpunet.legend.realistic_library import expand_library, merge_libraries, read_library
+from cpunet.legend.ring_padding import continued, with_rings
+from cpunet.legend.templates import TemplateTranslator
+from cpunet.legend.translate_library import translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.clustering import cluster_hits
@@ -30,14 +39,6 @@ from cpunet.simulation.hit_readers import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run, SideInfo
-from cpunet.translation.library_mode import TemplateTranslator
-from cpunet.translation.peak_currents import (
-    PEAK,
-    currents_about_peak,
-    heights,
-    most_frequent,
-)
-from cpunet.translation.ring_padding import continued, with_rings
 from cpunet.translation.translator import REN
 from synthetic import write_run
 
@@ -143,7 +144,7 @@ def test_rings_go_on_from_the_crystal() -> None:
 
 
 def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Path) -> None:
-    told = translate_for_simflow(chain, ideal, tmp_path / "psl.lh5")
+    told = translate_library(chain, ideal, tmp_path / "psl.lh5", format="simflow").numbers
     library = lh5.read("V01", str(tmp_path / "psl.lh5"))
     assert set(library) == {
         "r",
@@ -181,19 +182,21 @@ def test_without_rings_the_nodes_stay(chain: Path, tmp_path: Path) -> None:
     # as SolidStateDetectors.jl writes it: two nodes about the axis, and a step beyond the end
     nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
     source = write(tmp_path / "ideal.lh5", charge(), r=Array(nodes, attrs={"units": "m"}))
-    translate_for_simflow(chain, source, tmp_path / "psl.lh5", rings=0)
+    translate_library(chain, source, tmp_path / "psl.lh5", rings=0, format="simflow")
     library = read_library(tmp_path / "psl.lh5")
     np.testing.assert_allclose(library.r_mm, 1000 * nodes)
     np.testing.assert_array_equal(
         np.isfinite(library.drift_time_ns[0]), np.isfinite(charge()[..., 0])
     )
-    with pytest.raises(CpunetError, match="-1 rings"):
-        translate_for_simflow(chain, source, tmp_path / "x.lh5", rings=-1)
+    with pytest.raises(CpunetError, match="-1: give 0 to 100 rings"):
+        translate_library(chain, source, tmp_path / "x.lh5", rings=-1, format="simflow")
 
 
 def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: Path) -> None:
-    translate_for_simflow(chain, ideal, tmp_path / "whole.lh5")
-    told = translate_for_simflow(chain, ideal, tmp_path / "few.lh5", rank=8)["V01"]
+    translate_library(chain, ideal, tmp_path / "whole.lh5", format="simflow")
+    told = translate_library(
+        chain, ideal, tmp_path / "few.lh5", low_rank=8, format="simflow"
+    ).numbers["V01"]
     whole, few = read_library(tmp_path / "whole.lh5"), read_library(tmp_path / "few.lh5", "V01")
     assert (whole.rank, few.rank) == (None, 8)
     np.testing.assert_array_equal(whole.drift_time_ns[45], few.drift_time_ns[45])
@@ -213,20 +216,24 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
 def test_components_of_a_detector_are_its_own(
     chain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cpunet.jobs.translation.simflow_library.MOST", 20)
+    monkeypatch.setattr("cpunet.legend.production.MOST", 20)
     source = write(tmp_path / "ideal.lh5", charge())
-    alone = translate_for_simflow(chain, source, tmp_path / "alone.lh5", rank=8)
+    alone = translate_library(
+        chain, source, tmp_path / "alone.lh5", low_rank=8, format="simflow"
+    ).numbers
     with h5py.File(source, "a") as file:
         for name in ("V02", "V03", "V04"):
             file.copy("V01", name)
-    beside = translate_for_simflow(chain, source, tmp_path / "beside.lh5", rank=8)
+    beside = translate_library(
+        chain, source, tmp_path / "beside.lh5", low_rank=8, format="simflow"
+    ).numbers
     assert beside["V01"]["loss"] == alone["V01"]["loss"]
 
 
 def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None:
     other = write(tmp_path / "ideal.lh5", charge(), "B02")
     for source, name in ((ideal, "v.lh5"), (other, "b.lh5")):
-        translate_for_simflow(chain, source, tmp_path / name)
+        translate_library(chain, source, tmp_path / name, format="simflow")
     both = [tmp_path / "v.lh5", tmp_path / "b.lh5"]
     assert merge_libraries(both, tmp_path / "psl.lh5") == ["B02", "V01"]
     assert sorted(lh5.ls(str(tmp_path / "psl.lh5"))) == ["B02", "V01"]
@@ -277,7 +284,7 @@ def test_other_libraries_are_refused_in_one_line(
 ) -> None:
     source = write(tmp_path / "ideal.lh5", charge(), **change)
     with pytest.raises(CpunetError) as error:
-        translate_for_simflow(chain, source, tmp_path / "psl.lh5")
+        translate_library(chain, source, tmp_path / "psl.lh5", format="simflow")
     assert words in str(error.value)
     assert str(source) in str(error.value)
     assert "\n" not in str(error.value)
@@ -311,11 +318,11 @@ def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
 
 def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "ideal.lh5", without(charge(), np.s_[2, 3]))
-    told = translate_for_simflow(chain, source, tmp_path / "psl.lh5")
+    told = translate_library(chain, source, tmp_path / "psl.lh5", format="simflow").numbers
     assert told["V01"]["healed"] == 2
     times = read_library(tmp_path / "psl.lh5").drift_time_ns[0]
     whole = write(tmp_path / "whole.lh5", charge())
-    translate_for_simflow(chain, whole, tmp_path / "psl2.lh5")
+    translate_library(chain, whole, tmp_path / "psl2.lh5", format="simflow")
     known = read_library(tmp_path / "psl2.lh5").drift_time_ns[0]
     assert times[2, 6] == pytest.approx(known[2, 6], abs=20)  # of 60 from node to node
 
@@ -375,8 +382,10 @@ def test_a_over_e_of_geant4_events_at_the_nodes(
     chain: Path, reference_data: Path, tmp_path: Path
 ) -> None:
     detector, hits = geant4_events(reference_data, 300)
-    write_library(detector, tmp_path / "ideal.lh5", grid_mm=2.0)
-    told = translate_for_simflow(chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5")
+    make_library(detector, tmp_path / "ideal.lh5", grid_mm=2.0)
+    told = translate_library(
+        chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5", format="simflow"
+    ).numbers
     (name,) = told
     with h5py.File(tmp_path / "ideal.lh5") as file:
         there = ~np.isnan(file[f"{name}/waveform_000_deg"][:, :, 0])
@@ -405,8 +414,10 @@ def test_a_over_e_of_all_geant4_events(
     chain: Path, reference_data: Path, tmp_path: Path
 ) -> None:
     detector, hits = geant4_events(reference_data, None)
-    write_library(detector, tmp_path / "ideal.lh5", grid_mm=0.5)
-    told = translate_for_simflow(chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5")
+    make_library(detector, tmp_path / "ideal.lh5", grid_mm=0.5)
+    told = translate_library(
+        chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5", format="simflow"
+    ).numbers
     ((_, numbers),) = told.items()
     assert hits.n_events > 8000
     r, phi = np.hypot(hits.x_mm, hits.y_mm), np.arctan2(hits.y_mm, hits.x_mm)

@@ -9,19 +9,26 @@ so one solution covers all depths, and its modes cover all times.
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
 import scipy.linalg
 
+import cpunet
 from cpunet.errors import CpunetError
+from cpunet.legend.library_arrays import put_column
+from cpunet.outputs import refuse_existing, written_aside
+from cpunet.pulses.writing import FileInTheMaking
 
 Values = npt.NDArray[np.float64]
 
 NODES = 400  # grid intervals across the layer
+LENGTH_NS, STEP_MM = 10_000, 0.01  # of tables, as of those of reboost
 MM2_PER_NS = 1e-7  # 1 cm²/s in mm²/ns
 
 
@@ -134,3 +141,71 @@ def delayed(charge: npt.NDArray[np.floating], share: Values) -> npt.NDArray[np.f
     length = scipy.fft.next_fast_len(2 * n_samples, real=True)
     spectra = scipy.fft.rfft(charge.astype(float), length) * scipy.fft.rfft(coming, length)
     return np.asarray(scipy.fft.irfft(spectra, length)[:, :n_samples], np.float32)
+
+
+@dataclass(frozen=True)
+class LithiumTable:
+    """A table of delayed charge.
+
+    Parameters
+    ----------
+    path
+        The file.
+    dead_mm
+        Depth from which half of the charge arrives.
+    half_ns
+        Time after which half of that has arrived.
+    """
+
+    path: Path
+    dead_mm: float
+    half_ns: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.path}: half of the charge from {self.dead_mm:.2f} mm arrives, half of that "
+            f"within {self.half_ns:.0f} ns"
+        )
+
+
+def lithium_table(layer: LithiumLayer, out: str | Path, *, force: bool = False) -> LithiumTable:
+    """Tabulate the charge that arrives from a lithium layer, for reboost's surface model.
+
+    The LH5 file contains ``struct{depth, dt, t0, arrived, activeness}``: depths in mm from the
+    surface, shares of the charge that have arrived at each nanosecond, shape (times, depths)
+    as `reboost.hpge.psd.make_convolved_surface_library` takes them, and the final shares.
+
+    Raises
+    ------
+    CpunetError
+        If the layer is thinner than the spacing of the depths, or the file exists (without
+        `force`) or cannot be written.
+    """
+    out = Path(out)
+    refuse_existing(out, force=force)
+    if layer.thickness_mm < STEP_MM:
+        raise CpunetError(
+            f"depths every {STEP_MM} mm in a layer of {layer.thickness_mm} mm; give a thicker "
+            "one"
+        )
+    depth = STEP_MM * np.arange(round(layer.thickness_mm / STEP_MM))
+    time = np.arange(LENGTH_NS, dtype=float)
+    share = arrived(layer, depth, time)
+    arrays = {
+        "depth": (depth, "mm"),
+        "dt": (np.array(1.0), "ns"),
+        "t0": (np.array(0.0), "ns"),
+        "arrived": (share.T.copy(), ""),
+        "activeness": (share[:, -1].copy(), ""),
+    }
+    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        group = made.h5.create_group("lithium")
+        for key, (values, units) in arrays.items():
+            put_column(group, key, values, units)
+        group.attrs["datatype"] = f"struct{{{','.join(arrays)}}}"
+        group.attrs["cpunet"] = json.dumps({"cpunet": cpunet.__version__} | asdict(layer))
+    ends = share[:, -1]
+    dead = float(np.interp(0.5, ends, depth))
+    middle = arrived(layer, [dead], time)[0]
+    half = float(np.interp(0.5 * middle[-1], middle, time))
+    return LithiumTable(out, dead, half)

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.hdf5_files import text_attribute
+from cpunet.legend.templates import AFTER_NS, BEFORE_NS, aligned_currents
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.reading.columns import TIME_UNITS
-from cpunet.translation.library_mode import AFTER_NS, BEFORE_NS, aligned_currents
 
 
 @dataclass(frozen=True)

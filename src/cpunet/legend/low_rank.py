@@ -13,7 +13,7 @@ import numpy.typing as npt
 import scipy.linalg
 
 from cpunet.errors import CpunetError
-from cpunet.translation.peak_currents import PEAK
+from cpunet.legend.peak_currents import PEAK
 
 MOST = 2000  # maximum number of templates that determine the components
 Floats = npt.NDArray[np.float32]
@@ -32,7 +32,7 @@ def components(templates: Floats, rank: int) -> Floats:
     """
     if len(templates) < rank:
         raise CpunetError(
-            f"--low-rank {rank} of {len(templates)} templates; give a smaller number"
+            f"`low_rank` {rank} of {len(templates)} templates; give a smaller number"
         )
     n = len(templates)
     gram = np.asarray(templates @ templates.T, np.float64)

@@ -12,14 +12,14 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.export import export_run
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.translation.exports import FORMATS, export
+from cpunet.translation.export import _score_table, export_onnx
+from cpunet.translation.onnx import write_onnx
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.comparisons import compare
 from synthetic import write_report, write_run
@@ -74,7 +74,7 @@ def prepared(sim: np.ndarray) -> np.ndarray:
 def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
     onnx = pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")
-    done = export_run(chain, tmp_path / "ren.onnx", "onnx")
+    done = export_onnx(chain, tmp_path / "ren.onnx")
     assert done.difference < 2e-5
     model = onnx.load(tmp_path / "ren.onnx")
     onnx.checker.check_model(model)
@@ -102,7 +102,7 @@ def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
 def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
     pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")
-    export_run(run, tmp_path / "ren.onnx", "onnx")
+    export_onnx(run, tmp_path / "ren.onnx")
     session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
     windows, translator = prepared(sim), REN.load(run)
     channels = translator.backend.network.latent_mean.out_channels
@@ -117,20 +117,17 @@ def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
 
 
 @pytest.mark.thorough
-def test_torchscript_and_torch_export(run, chain, tmp_path):
+def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
     # as where the physics are off
     stretched = write_chain(tmp_path / "stretched", "generator.drift_terms=2")
-    for folder, kind in ((run, IREN), (chain, REN), (chain, IREN), (stretched, REN)):
+    for folder, kind in ((run, IREN), (chain, IREN), (stretched, REN)):
         graph = kind.load(folder).backend.graph(800)
-        for form in ("torchscript", "torch-export"):
-            if (folder, form) == (run, "torch-export"):
-                continue  # seconds, and what ONNX is made of
-            assert export(graph, tmp_path / "graph", form) < 2e-5
+        assert write_onnx(graph, tmp_path / "graph") < 2e-5
 
 
 def test_the_card_and_the_noise(chain, tmp_path):
     report, scores = written_report(tmp_path / "report")
-    done = export_run(chain, tmp_path / "ren.pt", "torchscript", report=report)
+    done = export_onnx(chain, tmp_path / "ren.onnx", report=report)
     assert (done.card.name, done.noise.name) == ("ren.card.md", "ren.noise.npz")
     card = done.card.read_text()
     for words in (
@@ -154,26 +151,34 @@ def test_the_card_and_the_noise(chain, tmp_path):
         np.testing.assert_allclose(total, 9.0, rtol=1e-5)
         assert noise["samples"] == 2 * (len(total) - 1)
     with pytest.raises(CpunetError, match="exists already"):
-        export_run(chain, tmp_path / "ren.pt", "torchscript")
-    export_run(chain, tmp_path / "iren.pt", "torchscript", inverse=True)
-    assert not (tmp_path / "iren.noise.npz").exists()
+        export_onnx(chain, tmp_path / "ren.onnx")
+    # noise of before does not stay beside an export without
+    assert export_onnx(chain, tmp_path / "ren.onnx", inverse=True, force=True).noise is None
+    assert not done.noise.exists()
 
 
 def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
     with pytest.raises(CpunetError, match=r"metrics\.json: cannot be read"):
-        export_run(chain, tmp_path / "ren.pt", "torchscript", report=chain)
+        export_onnx(chain, tmp_path / "ren.onnx", report=chain)
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
-        export_run(chain, tmp_path / "ren.onnx", "onnx")
+        export_onnx(chain, tmp_path / "ren.onnx")
     graph = REN.load(chain).backend.graph(800)
-    with pytest.raises(CpunetError, match="not known"):
-        export(graph, tmp_path / "x", "tflite")
+    monkeypatch.undo()
     # a graph that is not the run's is not left behind
     other = REN.load(chain)
     with torch.no_grad():
         other.backend.chain.response.log_decay_us.add_(1)
     wrong = replace(graph, expected=other.backend.graph(800).expected)
     with pytest.raises(CpunetError, match="differs from the run"):
-        export(wrong, tmp_path / "x", "torchscript")
-    assert set(FORMATS) == {"onnx", "torchscript", "torch-export"}
+        write_onnx(wrong, tmp_path / "x")
     assert [p.name for p in tmp_path.iterdir() if p.name != "x"] == []
+
+
+def test_parts_of_a_report_that_are_no_scores_are_left_out():
+    peaks = {
+        "DEP": 3,
+        "SEP": {"parameters": 3},
+        "FEP": {"parameters": {"tail_slope": {"iou": {"ren": 80.04, "raw": None}}, "rise": 1}},
+    }
+    assert _score_table(peaks)[3:] == ["| FEP | tail slope | ren 80.0 |", ""]

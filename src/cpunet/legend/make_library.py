@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.library_arrays import put_column
+from cpunet.legend.library_arrays import put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
+from cpunet.settings import Set, read_settings
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
 
@@ -25,16 +28,47 @@ ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
 ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
-def write_library(
-    detector: Detector,
-    out: Path,
+@dataclass(frozen=True)
+class Library:
+    """A library of charge pulses that was made.
+
+    Parameters
+    ----------
+    path
+        The file.
+    templates
+        Number of grid points times angles.
+    written, outside, late
+        Numbers of those with a template, without a signal, and whose charge is not collected
+        within the record.
+    """
+
+    path: Path
+    templates: int
+    written: int
+    outside: int
+    late: int
+
+    def __str__(self) -> str:
+        return (
+            f"{self.path}: {self.written} of {self.templates} places have a template; "
+            f"{self.outside} give no signal, {self.late} are not collected in time"
+        )
+
+
+def make_library(
+    detector: str | Path | Detector,
+    out: str | Path,
     *,
-    settings: SimulationSettings | None = None,
     grid_mm: float = 1.0,
-    angles_deg: tuple[int, ...] = ANGLES_DEG,
+    angles: str | Sequence[int] = ANGLES_DEG,
+    dt_ns: float | None = None,
+    length_ns: float | None = None,
+    settings: Set = (),
+    settings_file: str | Path | SimulationSettings | None = None,
     force: bool = False,
-) -> dict[str, Any]:
-    """Simulate the charge pulses of all points of a grid and write them as a library.
+) -> Library:
+    """Simulate the charge pulse of every place in a detector.
 
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
     under the detector's name: r and z in mm from the centre of the point contact, times in
@@ -46,35 +80,83 @@ def write_library(
     Parameters
     ----------
     detector
-        Geometry, impurities and bias.
+        icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.
     out
         LH5 file to write.
-    settings
-        Settings of the simulation; by default with 5000 samples of 1 ns.
     grid_mm
-        Spacing in r and z.
-    angles_deg
-        Azimuths from <100>.
+        Spacing of the places in r and z.
+    angles
+        Azimuths from <100> in degrees, as 0,45.
+    dt_ns
+        Sampling period in ns; 1 by default.
+    length_ns
+        Length of a template; 5000 by default.
+    settings
+        Override a value of the detector: bias_V=3500 (repeatable).
+    settings_file
+        YAML file of settings of the simulation, which then has period and length.
+    force
+        Replace an existing file.
 
     Returns
     -------
-    dict
-        ``templates`` (grid points times angles), ``written``, ``outside`` (no signal) and
-        ``late`` (not collected within the record).
+    Library
+        The file, with numbers of its templates.
 
     Raises
     ------
     CpunetError
         If the detector is not depleted, no grid point has a template, or the file cannot be
         written.
+
+    Examples
+    --------
+    cpunet library make --detector icpc --out psl.lh5
     """
-    refuse_existing(out, force=force)
+    out = Path(out)
+    inputs = [given for given in (detector, settings_file) if isinstance(given, str | Path)]
+    refuse_existing(out, *inputs, force=force)
+    if not isinstance(detector, Detector):
+        detector = read_detector(detector, settings)
+    angles_deg = _degrees(angles)
+    wanted = _settings(settings_file, dt_ns, length_ns)
+    counts = _write(detector, out, wanted, grid_mm, angles_deg)
+    return Library(out, **counts)
+
+
+def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:
+    words = angles.split(",") if isinstance(angles, str) else angles
+    try:
+        degrees = tuple(int(word) for word in words)
+    except ValueError:
+        raise CpunetError(f"`angles` {angles}: give whole degrees, as 0,45") from None
+    wrong = [angle for angle in degrees if not 0 <= angle < 360]
+    if wrong or not degrees or len(set(degrees)) < len(degrees):
+        raise CpunetError(f"`angles` {angles}: give different ones from 0 to 359 degrees")
+    return degrees
+
+
+def _settings(
+    given: str | Path | SimulationSettings | None, dt_ns: float | None, length_ns: float | None
+) -> SimulationSettings:
+    if isinstance(given, SimulationSettings):
+        return given
+    sampling = {"dt_ns": dt_ns, "length_ns": length_ns}
+    if given is None:
+        sampling = {"dt_ns": dt_ns or DT_NS, "length_ns": length_ns or LENGTH_NS}
+    chosen = {name: value for name, value in sampling.items() if value is not None}
+    return read_settings(SimulationSettings, given, chosen)
+
+
+def _write(
+    detector: Detector,
+    out: Path,
+    settings: SimulationSettings,
+    grid_mm: float,
+    angles_deg: tuple[int, ...],
+) -> dict[str, int]:
     if not (math.isfinite(grid_mm) and grid_mm > 0):
-        raise CpunetError(f"the grid is {grid_mm} mm wide; expected more than 0")
-    wrong = [angle for angle in angles_deg if not 0 <= angle < 360]
-    if wrong or not angles_deg or len(set(angles_deg)) < len(angles_deg):
-        raise CpunetError(f"angles {angles_deg}: give different ones from 0 to 359 degrees")
-    settings = settings or SimulationSettings(dt_ns=DT_NS, length_ns=LENGTH_NS)
+        raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
     with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))

@@ -15,15 +15,15 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened, text_attribute
-from cpunet.jobs.translation.library_file import (
+from cpunet.legend.library_file import (
     WAVEFORM,
     libraries,
     n_templates,
     sampling_period_ns,
 )
+from cpunet.legend.ring_padding import padded_axis
 from cpunet.settings import read_values
 from cpunet.training.run import Run
-from cpunet.translation.ring_padding import padded_axis
 
 PERIOD_NS = 1.0
 PULSES = "geds/sim"  # table of `cpunet simulate` with its provenance

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,12 @@ from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.translation.library_file import n_not_ending, require_charge
-from cpunet.jobs.translation.simflow_checks import (
+from cpunet.legend.ideal_library import (
     IdealLibrary,
     chosen_libraries,
     known_detector,
 )
+from cpunet.legend.library_file import n_not_ending, require_charge
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 WHOLE = "cpunet.yaml"
 LEGEND_PARS = FolderKind(
     name="legend-pars",
-    command="cpunet export --to legend-pars",
+    command="cpunet export legend",
     known_by=WHOLE,
     own=r"(elecmod|aoemeanmod|aoeresmod|cpunet)\.yaml",
 )
@@ -48,16 +48,61 @@ EVERY_DETECTOR = "default"  # name under which production looks up detectors wit
 SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
 
 
-def export_legend_pars(
+@dataclass(frozen=True)
+class LegendParameters:
+    """A folder of parameters.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    detector
+        Name of the entries.
+    content
+        Content of ``cpunet.yaml`` under this name.
+    """
+
+    folder: Path
+    detector: str
+    content: dict[str, Any]
+
+    def __str__(self) -> str:
+        two = self.content["electronics"]["equivalent"]
+        lines = [
+            f"{self.folder}: {self.detector}: sigma {two['sigma_ns']:.1f} ns, tau "
+            f"{two['tau_ns']:.1f} ns; the current is up to "
+            f"{two['current_error_percent']:.1f} % of its height off, A/E "
+            f"± {two['ae_error_percent']:.1f} % between currents of 1 and 300 ns"
+        ]
+        if found := two.get("of_library"):
+            alone, pairs = found["single_site"], found["two_sites"]
+            lines.append(
+                f"on {found['templates']} places of {found['library']}, A/E is off by "
+                f"{alone['rms_percent']:.2g} % RMS, {alone['largest_percent']:.2g} % at most; "
+                f"on pairs of them by {pairs['rms_percent']:.2g} and "
+                f"{pairs['largest_percent']:.2g} %"
+            )
+        for method, one in self.content["ae_against_energy"].items():
+            line = one["mean"]
+            lines.append(
+                f"A/E against energy, {method}: {line['per_mev_percent']:+.3f} ± "
+                f"{line['per_mev_error_percent']:.3f} % per MeV"
+            )
+        if not self.content["ae_against_energy"]:
+            lines.append("A/E against energy: none, since no `report` was given")
+        return "\n".join(lines)
+
+
+def export_legend(
     run: RunLike,
-    out: Path,
+    out: str | Path,
     *,
     detector: str | None = None,
-    report: Path | None = None,
-    library: Path | None = None,
+    report: str | Path | None = None,
+    library: str | Path | None = None,
     force: bool = False,
-) -> dict[str, Any]:
-    """Write a folder of parameters for LEGEND's simulation chain.
+) -> LegendParameters:
+    """Export a readout chain as parameters for LEGEND's simulation chain.
 
     ``elecmod.yaml`` holds sigma and tau of the nearest Gaussian ⊗ exponential, in ns;
     ``aoemeanmod.yaml`` the translation's mean of A/E against energy in keV, 1 at 1592.5 keV;
@@ -74,23 +119,29 @@ def export_legend_pars(
         Name of the entries; by default that of the detector that the run was trained with,
         or else ``default``.
     report
-        Folder of a report on this run, as source of A/E.  Without it, the two files on A/E
-        are not written.
+        Report on this run, as source of A/E.  Without it, the two files on A/E are not
+        written.
     library
         Library of ideal charge pulses on which the error of the kernel is determined.
     force
-        See `cpunet.train`.
+        Replace an existing folder.
 
     Returns
     -------
-    dict
-        Content of ``cpunet.yaml``, under the detector's name.
+    LegendParameters
+        The folder, and what was written.
 
     Raises
     ------
     CpunetError
         If the run has no readout chain, or the report belongs to another run or has no A/E.
+
+    Examples
+    --------
+    cpunet export legend run --report report --library ideal.lh5 --out pars
     """
+    out = Path(out)
+    report, library = (None if path is None else Path(path) for path in (report, library))
     run = as_run(run)
     given = (run.folder, report, library)
     refuse_existing(out, *given, force=force)
@@ -132,7 +183,7 @@ def export_legend_pars(
         for kind, content in pars.items():
             _write(folder / f"{kind}.yaml", {name: content})
         _write(folder / WHOLE, {name: whole})
-    return {name: whole}
+    return LegendParameters(out, name, whole)
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:

@@ -12,13 +12,13 @@ from lgdo import Array, Scalar, Struct
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.pulse_shape_library import write_library
-from cpunet.jobs.translation.translate_library import translate_library
+from cpunet.legend.make_library import make_library
+from cpunet.legend.templates import TemplateTranslator
+from cpunet.legend.translate_library import translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.translation.library_mode import TemplateTranslator
 from cpunet.translation.translator import REN
 from synthetic import after_pole_and_decay, sampled, write_run
 
@@ -131,7 +131,7 @@ def test_stretched_templates_keep_their_begin(chain, stretched, dt_ns):
 def test_schema_and_all_else_stay(chain, tmp_path):
     charge = templates(1500, 2.0)
     source = write(tmp_path / "psl.lh5", charge, 2.0)
-    told = translate_library(chain, source, tmp_path / "ren.lh5")
+    told = translate_library(chain, source, tmp_path / "ren.lh5").numbers
     assert told["libraries"] == ["V01"]
     assert (told["templates"], told["translated"], told["outside"]) == (24, 20, 4)
     assert told["rejections"] == {}
@@ -159,7 +159,7 @@ def test_libraries_at_any_depth_and_without_t0(chain, tmp_path):
     source = write(tmp_path / "psl.lh5", charge, 4.0, t0=None)
     with h5py.File(source, "a") as file:
         file.copy("V01", "scan/slope_1/dep_1")
-    told = translate_library(chain, source, tmp_path / "ren.lh5")
+    told = translate_library(chain, source, tmp_path / "ren.lh5").numbers
     assert told["libraries"] == ["V01", "scan/slope_1/dep_1"]
     for path in told["libraries"]:
         made = lh5.read(path, str(tmp_path / "ren.lh5"))
@@ -195,7 +195,7 @@ def test_reboost_finds_the_current_amplitude(chain, tmp_path):
     psd, utils = (pytest.importorskip(f"reboost.hpge.{name}") for name in ("psd", "utils"))
     ak = pytest.importorskip("awkward")
     source = write(tmp_path / "psl.lh5", templates(1500, 2.0), 2.0)
-    translate_library(chain, source, tmp_path / "ren.lh5", currents=True)
+    translate_library(chain, source, tmp_path / "ren.lh5", format="currents")
     translate_library(chain, source, tmp_path / "charge.lh5")
     library = utils.load_hpge_pulse_shape_library(
         str(tmp_path / "ren.lh5"), "V01", "waveform_000_deg"
@@ -225,16 +225,16 @@ def test_reboost_finds_the_current_amplitude(chain, tmp_path):
 def test_a_library_of_our_own(chain, tmp_path):
     utils = pytest.importorskip("reboost.hpge.utils")
     settings = SimulationSettings(dt_ns=4, length_ns=3200, step_ns=2)
-    counts = write_library(
+    counts = make_library(
         read_detector("ppc", ["grid_mm=0.2"]),
         tmp_path / "psl.lh5",
-        settings=settings,
+        settings_file=settings,
         grid_mm=8,
     )
-    told = translate_library(chain, tmp_path / "psl.lh5", tmp_path / "ren.lh5")
-    assert counts["templates"] == told["templates"]
-    assert counts["written"] == told["translated"] > 0
-    assert counts["outside"] + counts["late"] == told["outside"]
+    told = translate_library(chain, tmp_path / "psl.lh5", tmp_path / "ren.lh5").numbers
+    assert counts.templates == told["templates"]
+    assert counts.written == told["translated"] > 0
+    assert counts.outside + counts.late == told["outside"]
     (name,) = told["libraries"]
     for file in ("psl.lh5", "ren.lh5"):
         library = utils.load_hpge_pulse_shape_library(
@@ -269,7 +269,7 @@ def test_a_network_keeps_the_place_and_height(run, tmp_path):
 
 def test_a_network_is_not_linear_and_that_is_told(run, tmp_path):
     source = write(tmp_path / "psl.lh5", templates(700, 16.0), 16.0)
-    told = translate_library(run, source, tmp_path / "ren.lh5")
+    told = translate_library(run, source, tmp_path / "ren.lh5").numbers
     assert told["linearity"]["largest"] > 1e-4
 
 

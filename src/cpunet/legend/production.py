@@ -7,7 +7,7 @@ t0, waveform_000_deg, drift_time_000_deg, ...}`` of currents in units of the mos
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,28 +19,27 @@ import numpy.typing as npt
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.translation.library_file import n_not_ending, require_charge
-from cpunet.jobs.translation.simflow_checks import (
+from cpunet.legend.ideal_library import (
     IdealLibrary,
     chosen_libraries,
     known_detector,
     require_complete,
 )
-from cpunet.jobs.translation.simflow_files import TOLD, Made, describe
-from cpunet.outputs import refuse_existing, written_aside
-from cpunet.progress import Stage, stage
-from cpunet.pulses.writing import FileInTheMaking
-from cpunet.training.devices import resolve_device
-from cpunet.training.run import RunLike, as_run
-from cpunet.translation.library_mode import TemplateTranslator
-from cpunet.translation.low_rank import MOST, Loss, components
-from cpunet.translation.peak_currents import (
+from cpunet.legend.library_file import n_not_ending, require_charge
+from cpunet.legend.low_rank import MOST, Loss, components
+from cpunet.legend.peak_currents import (
     LENGTH,
     currents_about_peak,
     heights,
     most_frequent,
 )
-from cpunet.translation.ring_padding import RINGS, continued, with_rings
+from cpunet.legend.realistic_library import TOLD, Made, describe
+from cpunet.legend.ring_padding import continued, with_rings
+from cpunet.legend.templates import TemplateTranslator
+from cpunet.outputs import written_aside
+from cpunet.progress import Stage, stage
+from cpunet.pulses.writing import FileInTheMaking
+from cpunet.training.run import Run
 from cpunet.translation.translator import REN
 
 ROWS = 16  # rows of r translated at a time
@@ -49,16 +48,15 @@ STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 Floats = npt.NDArray[np.float32]
 
 
-def translate_for_simflow(
-    run: RunLike,
+def translate_for_production(
+    run: Run,
+    ren: REN,
     source: Path,
     out: Path,
     *,
-    detectors: Sequence[str] = (),
-    rings: int = RINGS,
-    rank: int | None = None,
-    device: str = "auto",
-    force: bool = False,
+    detectors: Sequence[str],
+    rings: int,
+    rank: int | None,
 ) -> dict[str, Any]:
     """Translate libraries of ideal charge pulses to the format of LEGEND's production.
 
@@ -68,24 +66,8 @@ def translate_for_simflow(
     minus that of a step of charge at time 0.  The grid is padded around the crystal: currents
     there are means of their neighbours, and drift times are extrapolated linearly.
 
-    Parameters
-    ----------
-    run
-        A trained run, or its folder.
-    source
-        LH5 file of one library or more, of charge sampled every nanosecond.
-    out
-        LH5 file to write.
-    detectors
-        Names of the libraries to translate; by default that of the detector that the run was
-        trained with, or all if this is unknown.
-    rings
-        Number of rings of padding around the crystal.
-    rank
-        Number of components to write, with the coefficients of each grid point, instead of
-        templates; see `cpunet.jobs.translation.simflow_files.read_library`.
-    device, force
-        See `cpunet.train`.
+    With a rank, so many components and the coefficients of each grid point are written instead
+    of templates; see `cpunet.legend.realistic_library.read_library`.
 
     Returns
     -------
@@ -100,13 +82,10 @@ def translate_for_simflow(
         If the file contains no such library, or it is damaged, of another detector or
         sampling period.
     """
-    run = as_run(run)
-    refuse_existing(out, run.folder, source, force=force)
     if not 0 <= rings <= 100:
-        raise CpunetError(f"{rings} rings of padding; give 0 to 100")
+        raise CpunetError(f"`rings` {rings}: give 0 to 100 rings of padding")
     if rank is not None and not 1 <= rank <= 1000:
-        raise CpunetError(f"--low-rank {rank}: give 1 to 1000 components")
-    ren = REN.of(run, resolve_device(device))
+        raise CpunetError(f"`low_rank` {rank}: give 1 to 1000 components")
     told: dict[str, Any] = {}
     with opened(source) as given:
         names = chosen_libraries(given, source, detectors, known_detector(run))
@@ -119,6 +98,23 @@ def translate_for_simflow(
                 job = _Writing(looked, library, rings, rank)
                 told[library.path] = job.write(given[library.path], group, made_from)
     return told
+
+
+def in_words(told: Mapping[str, Any]) -> str:
+    """Numbers of a library as text."""
+    healed = f", {told['healed']} of them within it" if told["healed"] else ""
+    text = (
+        f"{told['translated']} of {told['templates']} templates translated, "
+        f"{told['padded']} added about the crystal{healed}; A/E is most often "
+        f"{told['mode_per_ns']:.4g}/ns"
+    )
+    if loss := told.get("loss"):
+        text += (
+            f"\n{told['rank']} components: samples within {loss['largest']:.1e} of the "
+            f"most frequent A/E (RMS {loss['rms']:.1e}), A/E within "
+            f"{loss['a_over_e_percent']:.2g} % (RMS {loss['a_over_e_rms_percent']:.2g} %)"
+        )
+    return text
 
 
 @dataclass(eq=False)

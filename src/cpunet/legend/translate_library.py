@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.jobs.simulation.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
-from cpunet.jobs.translation.library_file import (
+from cpunet.legend.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
+from cpunet.legend.library_file import (
     WAVEFORM,
     libraries,
     n_not_ending,
@@ -21,6 +23,9 @@ from cpunet.jobs.translation.library_file import (
     require_charge,
     sampling_period_ns,
 )
+from cpunet.legend.production import in_words, translate_for_production
+from cpunet.legend.ring_padding import RINGS
+from cpunet.legend.templates import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import FloatArray
@@ -29,7 +34,6 @@ from cpunet.pulses.reading.source import BLOCK_BYTES
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
-from cpunet.translation.library_mode import BEFORE_NS, TemplateTranslator, linearity
 from cpunet.translation.translator import REN
 
 TEMPLATES_AT_A_TIME = 1024
@@ -79,55 +83,117 @@ class _Tally:
         self.translate = translate
 
 
+@dataclass(frozen=True)
+class TranslatedLibrary:
+    """A library that was translated.
+
+    Parameters
+    ----------
+    path
+        The file.
+    numbers
+        Of charge and currents ``libraries`` (their paths), ``templates``, ``translated``,
+        ``outside`` (all NaN), ``rejections`` (counts by reason) and ``linearity`` (see
+        `cpunet.legend.templates.Linearity`).  For production, by name of the library, see
+        `cpunet.legend.production.translate_for_production`.
+    """
+
+    path: Path
+    numbers: dict[str, Any]
+
+    def __str__(self) -> str:
+        if "libraries" not in self.numbers:
+            return "\n".join(
+                f"{self.path}: {name}: {in_words(one)}" for name, one in self.numbers.items()
+            )
+        told, apart = self.numbers, self.numbers["linearity"]
+        rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
+        return (
+            f"{self.path}: {told['translated']} of {told['templates']} templates translated; "
+            f"{told['outside']} outside{rejected}\n"
+            f"sums of {apart['events']} events: sample by sample within {apart['largest']:.1e} "
+            f"of the highest, current amplitude within {apart['current_amplitude']:.1e} of "
+            "itself"
+        )
+
+
 def translate_library(
     run: RunLike,
-    source: Path,
-    out: Path,
+    library: str | Path,
+    out: str | Path,
     *,
-    currents: bool = False,
+    format: Literal["charge", "currents", "simflow"] = "charge",
+    detector: Sequence[str] = (),
+    rings: int = RINGS,
+    low_rank: int | None = None,
     device: str = "auto",
     force: bool = False,
-) -> dict[str, Any]:
-    """Translate every template of a library without noise, and copy everything else unchanged.
+) -> TranslatedLibrary:
+    """Translate every template of a library without noise.
 
     A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
     charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
-    `cpunet.jobs.simulation.pulse_shape_library.write_library` make them; a file may hold
-    several, at any depth.  Names, units, shapes, types and the time axis are unchanged; a
-    missing ``t0``, without which reboost cannot read a library, becomes 0.  Templates with NaN
-    are unchanged.  Files are streamed.
+    `cpunet.make_library` make them; a file may hold several, at any depth.  Files are
+    streamed.
 
     Parameters
     ----------
     run
-        A trained run, or its folder.
-    source
+        A trained run or its folder.
+    library
         LH5 file of one library or more.
     out
         LH5 file to write.
-    currents
-        Whether to write currents for `reboost.hpge.psd.maximum_current` instead: in 1/ns,
-        averaged as for the current amplitude, with the maximum at time 0 (``t0`` is negative);
-        ``drift_time_*_deg`` become the times of the maxima, by which a template must be
-        shifted to be in its original position.
-    device, force
-        See `cpunet.train`.
+    format
+        charge: all else is copied unchanged; a missing ``t0``, without which reboost cannot
+        read a library, becomes 0, templates with NaN stay.  currents: for
+        `reboost.hpge.psd.maximum_current`, in 1/ns, averaged as for the current amplitude,
+        with the maximum at time 0 (``t0`` is negative); ``drift_time_*_deg`` become the times
+        of the maxima.  simflow: currents as LEGEND's production reads them.
+    detector
+        With simflow: library of the file to translate (repeatable); by default that of the
+        detector that the run was trained with, or all if it is unknown.
+    rings
+        With simflow: rings of nodes beyond the crystal; 3 as production.
+    low_rank
+        With simflow: number of components in place of whole templates.
+    device
+        cpu, cuda or auto.
+    force
+        Replace an existing file.
 
     Returns
     -------
-    dict
-        ``libraries`` (their paths), ``templates``, ``translated``, ``outside`` (all NaN),
-        ``rejections`` (counts by reason) and ``linearity`` (see
-        `cpunet.translation.library_mode.Linearity`).
+    TranslatedLibrary
+        The file, with what was counted.
 
     Raises
     ------
     CpunetError
         If the file contains no library of charge templates, or the run cannot translate it.
+
+    Examples
+    --------
+    cpunet library translate run psl.lh5 --out psl_ren.lh5
+    cpunet library translate run psl.lh5 --out psl_simflow.lh5 --format simflow
     """
-    run = as_run(run)
+    if format != "simflow" and (low_rank is not None or detector or rings != RINGS):
+        raise CpunetError(
+            "`low_rank`, `rings` and `detector` are those of the `format` simflow; add it"
+        )
+    run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
     ren = REN.of(run, resolve_device(device))
+    if format == "simflow":
+        numbers = translate_for_production(
+            run, ren, source, out, detectors=detector, rings=rings, rank=low_rank
+        )
+    else:
+        numbers = _templates(ren, source, out, currents=format == "currents")
+    return TranslatedLibrary(out, numbers)
+
+
+def _templates(ren: REN, source: Path, out: Path, *, currents: bool) -> dict[str, Any]:
     tally = _Tally(currents)
     with opened(source) as given:
         paths = libraries(given, source)

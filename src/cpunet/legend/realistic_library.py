@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
-from cpunet.jobs.simulation.library_arrays import put_column
-from cpunet.jobs.translation.library_file import number
+from cpunet.legend.library_arrays import put_column
+from cpunet.legend.library_file import number
+from cpunet.legend.low_rank import Loss
+from cpunet.legend.peak_currents import LENGTH, PEAK
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
-from cpunet.translation.low_rank import Loss
-from cpunet.translation.peak_currents import LENGTH, PEAK
 
 Floats = npt.NDArray[np.float32]
 Values = npt.NDArray[np.float64]
@@ -167,7 +167,7 @@ def read_library(path: Path | str, detector: str | None = None) -> RealisticLibr
     Parameters
     ----------
     path
-        LH5 file that `cpunet library translate --format simflow` or `merge` made.
+        LH5 file that `cpunet library translate --format simflow` or `merge_libraries` made.
     detector
         Name of the library; can be left out if the file has only one.
 
@@ -238,7 +238,9 @@ def _is_realistic(group: h5py.Group) -> bool:
     return bool(names)
 
 
-def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) -> list[str]:
+def merge_libraries(
+    sources: Sequence[str | Path], out: str | Path, *, force: bool = False
+) -> list[str]:
     """Copy realistic libraries of several detectors into one file, as in production.
 
     Parameters
@@ -261,10 +263,11 @@ def merge_libraries(sources: Sequence[Path], out: Path, *, force: bool = False) 
         If a file contains no realistic library, two libraries belong to one detector, or their
         time axes differ.
     """
-    refuse_existing(out, *sources, force=force)
+    paths, out = [*map(Path, sources)], Path(out)
+    refuse_existing(out, *paths, force=force)
     first: dict[str, tuple[Path, tuple[float, float, int]]] = {}
     with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
-        for path in sources:
+        for path in paths:
             with opened(path) as file:
                 names = realistic_libraries(file)
                 if not names:
@@ -316,7 +319,7 @@ def _require_new(
             )
 
 
-def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]:
+def expand_library(source: str | Path, out: str | Path, *, force: bool = False) -> list[str]:
     """Expand components to whole templates, so that reboost can read the file.
 
     Libraries of whole templates are copied.
@@ -331,12 +334,13 @@ def expand_library(source: Path, out: Path, *, force: bool = False) -> list[str]
     CpunetError
         If the file contains no library of components.
     """
+    source, out = Path(source), Path(out)
     refuse_existing(out, source, force=force)
     with opened(source) as file:
         names = realistic_libraries(file)
         if not any(_COMPONENTS in file[name] for name in names):
             raise CpunetError(
-                f"{source}: no library of components; make one with --low-rank, or use the "
+                f"{source}: no library of components; make one with `low_rank`, or use the "
                 "file as it is"
             )
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:

@@ -13,8 +13,8 @@ import yaml
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.simulation.pulse_shape_library import write_library
-from cpunet.jobs.translation.export_legend import export_legend_pars
+from cpunet.legend.export import export_legend
+from cpunet.legend.make_library import make_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
@@ -46,9 +46,9 @@ def test_a_stretched_drift_is_not_in_the_parameters(
     (tmp_path / "run").mkdir()
     info = json.loads((chain / "run.json").read_text())
     write_run(tmp_path / "run", nn.ModuleDict({"ren": generator}), recipe, info)
-    told = export_legend_pars(tmp_path / "run", tmp_path / "pars")
+    told = export_legend(tmp_path / "run", tmp_path / "pars")
     assert any("charges drift for 8.0 % longer than simulated" in n for n in caplog.messages)
-    assert told["default"]["electronics"]["chain"]["drift_stretch"] == pytest.approx(0.08)
+    assert told.content["electronics"]["chain"]["drift_stretch"] == pytest.approx(0.08)
 
 
 def report(folder: Path, **changes: Any) -> Path:
@@ -67,7 +67,7 @@ def read(path: Path) -> Any:
 
 def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     out = tmp_path / "pars"
-    told = export_legend_pars(chain, out, detector="V01", report=report(tmp_path / "report"))
+    told = export_legend(chain, out, detector="V01", report=report(tmp_path / "report"))
     assert {p.name for p in out.glob("*.yaml")} == {
         "elecmod.yaml",
         "aoemeanmod.yaml",
@@ -85,15 +85,15 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     width = read(out / "aoeresmod.yaml")["V01"]
     assert width == {"expression": "SigmaFit", "parameters": LAW}
     whole = read(out / "cpunet.yaml")
-    assert whole == json.loads(json.dumps(told))
+    assert whole == json.loads(json.dumps({told.detector: told.content}))
     assert whole["V01"]["electronics"]["chain"]["pole_1_ns"] == pytest.approx(45)
     assert whole["V01"]["electronics"]["equivalent"]["late_charge_percent"] > 0.5
     assert 40 < whole["V01"]["drift_time"]["current_maximum_delay_ns"] < 80
     with pytest.raises(CpunetError, match="exists already"):
-        export_legend_pars(chain, out)
+        export_legend(chain, out)
     # without a report, what is known of A/E is nothing; old files of the kind go
-    told = export_legend_pars(chain, out, force=True)
-    assert set(told) == {"default"}
+    told = export_legend(chain, out, force=True)
+    assert told.detector == "default"
     assert sorted(p.name for p in out.glob("*.yaml")) == ["cpunet.yaml", "elecmod.yaml"]
 
 
@@ -108,16 +108,16 @@ def test_a_library_of_currents_is_refused(chain: Path, tmp_path: Path) -> None:
             np.exp(-0.5 * ((time - 300) / 30) ** 2), (2, 2, 1)
         )
     with pytest.raises(CpunetError, match="these are currents"):
-        export_legend_pars(chain, tmp_path / "pars", library=source)
+        export_legend(chain, tmp_path / "pars", library=source)
     assert not (tmp_path / "pars").exists()
 
 
 @pytest.mark.slow  # a library is made
 def test_two_numbers_on_a_library(chain: Path, tmp_path: Path) -> None:
     detector = read_detector("ppc", ["grid_mm=0.2"])
-    write_library(detector, tmp_path / "ideal.lh5", grid_mm=6, angles_deg=(0,))
-    told = export_legend_pars(chain, tmp_path / "pars", library=tmp_path / "ideal.lh5")
-    found = told["default"]["electronics"]["equivalent"]["of_library"]
+    make_library(detector, tmp_path / "ideal.lh5", grid_mm=6, angles=(0,))
+    told = export_legend(chain, tmp_path / "pars", library=tmp_path / "ideal.lh5")
+    found = told.content["electronics"]["equivalent"]["of_library"]
     assert found["library"] == detector.name
     assert found["templates"] > 10
     assert 0 < found["single_site"]["rms_percent"] < 3
@@ -141,9 +141,7 @@ def test_other_reports_are_refused(
     chain: Path, tmp_path: Path, changes: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(CpunetError) as error:
-        export_legend_pars(
-            chain, tmp_path / "pars", report=report(tmp_path / "report", **changes)
-        )
+        export_legend(chain, tmp_path / "pars", report=report(tmp_path / "report", **changes))
     assert words in str(error.value)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "pars").exists()

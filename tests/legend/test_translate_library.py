@@ -13,8 +13,7 @@ import pytest
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.simflow_library import translate_for_simflow
-from cpunet.jobs.translation.translate_library import translate_library
+from cpunet.legend.translate_library import translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from synthetic import write_run
@@ -58,7 +57,7 @@ def test_libraries_of_different_lengths_and_periods(run: Path, tmp_path: Path) -
     put_charge(source, "V02", 300, 8.0)
     angles = {"waveform_000_deg": charge(400, 4.0), "waveform_045_deg": charge(500, 4.0)}
     put(source, "V03", 4.0, angles, "ns")
-    told = translate_library(run, source, tmp_path / "ren.lh5")
+    told = translate_library(run, source, tmp_path / "ren.lh5").numbers
     assert told["translated"] == 4 * len(R) * len(Z)
     assert told["linearity"]["largest"] < 1e-5
 
@@ -84,7 +83,9 @@ def test_units_in_bytes_and_a_period_in_a_column(
     for group, dt_ns, units in (("a", 4.0, np.bytes_(b"ns")), ("b", np.array([4.0]), "ns")):
         put_charge(tmp_path / f"{group}.lh5", group, 600, dt_ns, units)  # type: ignore[arg-type]
         out = tmp_path / f"ren_{group}.lh5"
-        translate_library(run, tmp_path / f"{group}.lh5", out, currents=currents)
+        translate_library(
+            run, tmp_path / f"{group}.lh5", out, format="currents" if currents else "charge"
+        )
         with h5py.File(out) as file:
             assert file[f"{group}/t0"][()] == (-1000 if currents else 0)
             assert file[f"{group}/t0"].attrs["units"] == "ns"
@@ -93,7 +94,7 @@ def test_units_in_bytes_and_a_period_in_a_column(
 def test_currents_of_whole_numbers_are_not_rounded(run: Path, tmp_path: Path) -> None:
     counts = np.round(1000 * charge(600, 4.0)).astype(np.int32)
     put(tmp_path / "psl.lh5", "V01", 4.0, {"waveform_000_deg": counts}, "ns")
-    translate_library(run, tmp_path / "psl.lh5", tmp_path / "ren.lh5", currents=True)
+    translate_library(run, tmp_path / "psl.lh5", tmp_path / "ren.lh5", format="currents")
     with h5py.File(tmp_path / "ren.lh5") as file:
         values = file["V01/waveform_000_deg"][()]
     # all charge is in the current
@@ -101,7 +102,7 @@ def test_currents_of_whole_numbers_are_not_rounded(run: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    "translate", [translate_for_simflow, partial(translate_library, currents=True)]
+    "translate", [partial(translate_library, format=name) for name in ("simflow", "currents")]
 )
 def test_currents_of_negative_charge_are_refused(
     run: Path, tmp_path: Path, translate: Callable[[Path, Path, Path], Any]
@@ -114,7 +115,7 @@ def test_currents_of_negative_charge_are_refused(
             file[f"V01/{name}"].attrs["units"] = "mm"
     with pytest.raises(CpunetError, match="12 of 12 templates end below half"):
         translate(run, source, tmp_path / "ren.lh5")
-    assert translate_library(run, source, tmp_path / "ren.lh5")["translated"] == 12
+    assert translate_library(run, source, tmp_path / "ren.lh5").numbers["translated"] == 12
 
 
 def test_an_empty_axis_is_told_in_one_line(run: Path, tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.jobs.translation.lithium_library import write_lithium_library
-from cpunet.simulation.lithium import LithiumLayer, arrived, delayed
+from cpunet.legend.lithium import LithiumLayer, arrived, delayed, lithium_table
 
 
 def test_what_arrives_in_the_end() -> None:
@@ -83,8 +82,8 @@ def test_numbers_without_a_meaning(numbers: tuple[float, ...], words: str) -> No
 @pytest.mark.slow
 def test_the_file_serves_reboosts_surface_model(tmp_path: Path) -> None:
     psd = pytest.importorskip("reboost.hpge.psd")
-    told = write_lithium_library(LithiumLayer(1.0), tmp_path / "lithium.lh5")
-    assert 0.5 < told["dead_mm"] < 0.8
+    told = lithium_table(LithiumLayer(1.0), tmp_path / "lithium.lh5")
+    assert 0.5 < told.dead_mm < 0.8
     made = lh5.read("lithium", str(tmp_path / "lithium.lh5"))
     assert made["arrived"].nda.shape == (10_000, 100)
     np.testing.assert_array_equal(made["activeness"].nda, made["arrived"].nda[-1])
@@ -96,6 +95,6 @@ def test_the_file_serves_reboosts_surface_model(tmp_path: Path) -> None:
     assert highest[2] < 0.01
     assert (np.diff(highest[20:]) > 0).all()
     with pytest.raises(CpunetError, match="exists already"):
-        write_lithium_library(LithiumLayer(1.0), tmp_path / "lithium.lh5")
+        lithium_table(LithiumLayer(1.0), tmp_path / "lithium.lh5")
     with pytest.raises(CpunetError, match="give a thicker one"):
-        write_lithium_library(LithiumLayer(0.005, 0.001), tmp_path / "x.lh5")
+        lithium_table(LithiumLayer(0.005, 0.001), tmp_path / "x.lh5")

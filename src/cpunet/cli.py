@@ -1,0 +1,280 @@
+"""The command ``cpunet``: commands made of the public functions by their signatures.
+
+Results go to stdout, messages and progress to stderr.  Whatever ends a command becomes one line
+and an exit status: 2 for what the user can mend, 1 for a result that is not ``ok`` and for what
+nobody thought of, 128 and more for a signal.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import signal
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from cyclopts import App, CycloptsError, Parameter, default_name_transform
+
+import cpunet
+from cpunet.errors import CpunetError
+from cpunet.installation import DISTRIBUTION, other_package
+from cpunet.pulses.reading.files import FileOptions, ReadOptions
+from cpunet.simulation.hits import HitOptions
+from cpunet.translation.options import Adc
+
+log = logging.getLogger(__name__)
+
+# Where the function of a command is, and what it does.
+COMMANDS = {
+    "demo": (
+        "cpunet.demonstration:demo",
+        "Simulate, digitise, train, translate and validate on a stand with a known answer.",
+    ),
+    "check": (
+        "cpunet.training.check:check",
+        "Say whether simulated and measured pulses can be compared, and what to do if not.",
+    ),
+    "export legend": (
+        "cpunet.legend.export:export_legend",
+        "Export a readout chain as parameters for LEGEND's simulation chain.",
+    ),
+    "export onnx": (
+        "cpunet.translation.export:export_onnx",
+        "Export the deterministic part of a run as ONNX.",
+    ),
+    "import": (
+        "cpunet.training.published:import_weights",
+        "Make a run of the weights that the authors published.",
+    ),
+    "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "response": (
+        "cpunet.training.response:response",
+        "Say in terms of physics what readout was learned, beside the truth if it is known.",
+    ),
+    "library make": (
+        "cpunet.legend.make_library:make_library",
+        "Simulate the charge pulse of every place in a detector.",
+    ),
+    "library translate": (
+        "cpunet.legend.translate_library:translate_library",
+        "Translate a library of charge pulses with a trained run, without noise.",
+    ),
+    "simulate": (
+        "cpunet.simulation.simulate:simulate",
+        "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
+    ),
+    "stand": (
+        "cpunet.electronics.stand:make_stand",
+        "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
+    ),
+    "train": (
+        "cpunet.training.train:train",
+        "Train REN and IREN on simulated and measured pulses, unpaired.",
+    ),
+    "translate": (
+        "cpunet.translation.translate:translate",
+        "Translate pulses with a trained run, keeping the rows and columns of their files.",
+    ),
+    "calibrate": (
+        "cpunet.calibration.calibrate:calibrate",
+        "Calibrate the detector and its electronics together.",
+    ),
+    "validate": (
+        "cpunet.validation.validate:validate",
+        "Score a run per peak and write a report.",
+    ),
+    "compare": (
+        "cpunet.validation.compare:compare",
+        "Put the scores of several validations beside each other.",
+    ),
+}
+
+GROUPS = {
+    "export": App(name="export", help="Write a run for other software."),
+    "library": App(name="library", help="Make and translate pulse-shape libraries."),
+}
+# Parameters whose options have other names; those of these classes are options of their own.
+SHORT = {"electronics": "preset", "settings": "set", "settings_file": "settings"}
+for _options in (Adc, FileOptions, HitOptions, ReadOptions):
+    Parameter(name="*", accepts_keys=True)(_options)
+
+DEBUG, USAGE, BUG = "--debug", 2, 1
+# Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
+# than most gaps between two operations and far shorter than others hold a core.
+SPIN_COUNT = "3000"
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+NO_MEMORY = ("allocate memory", "out of memory", "unable to allocate")
+
+
+def _option(name: str) -> str:
+    return SHORT.get(name) or default_name_transform(name)
+
+
+def with_options(text: str) -> str:
+    """A text in which parameters in backticks are the options that they are."""
+    return re.sub(r"`([a-z_]+)`", lambda name: f"--{_option(name[1])}", text)
+
+
+def _made() -> App:
+    """The application, which loads a command's function when it is called."""
+    made = App(
+        name="cpunet",
+        help=f"{cpunet.__doc__.splitlines()[0].partition(': ')[2].capitalize()}\n\n"
+        f"{DEBUG} shows the whole traceback if a command fails.",
+        version=cpunet.__version__,
+        # of "a path or an object", the command line takes paths
+        default_parameter=Parameter(
+            accepts_keys=False,
+            consume_multiple=False,
+            name_transform=_option,
+            negative_iterable=(),
+        ),
+        result_action="return_value",
+    )
+    for group in GROUPS.values():
+        made.command(group)
+    for name, (function, told) in COMMANDS.items():
+        *group_of, word = name.split()
+        place = GROUPS[group_of[0]] if group_of else made
+        place.command(function, name=word, help=told)
+    return made
+
+
+app = _made()
+
+
+def run(words: Sequence[str]) -> int:
+    """Run the command of some words, print its result, and return the exit status.
+
+    Raises
+    ------
+    CpunetError
+        If the words are no command, or the command fails; parameters, which stand in
+        backticks, are named as the options that they are.
+    """
+    try:
+        result: Any = app(words, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        told = " ".join(str(error).split()).rstrip(".")
+        command = " ".join(["cpunet", *(error.command_chain or ())])
+        raise CpunetError(told, f"see {command} --help") from error
+    except CpunetError as error:
+        raise CpunetError(with_options(str(error))) from error
+    if not words or (words[0] in GROUPS and len(words) == 1):
+        return USAGE  # the help was shown
+    if result is not None:
+        print(with_options(str(result)))  # noqa: T201 - the only place that prints
+    return 0 if getattr(result, "ok", True) else BUG
+
+
+def main() -> None:
+    """Run the command line: it ends in one line on stderr, if anything goes wrong."""
+    words = sys.argv[1:]
+    end = words.index("--") if "--" in words else len(words)  # then names only
+    debug = DEBUG in words[:end]  # known wherever it stands
+    words = [word for word in words[:end] if word != DEBUG] + words[end:]
+    with _messages_to_stderr():
+        try:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, _stop)
+            sound_environment()
+            if clash := other_package():
+                log.warning(clash)
+            status = run(words)
+        except BaseException as error:
+            status = _ended_with(error, words, debug=debug)
+    sys.exit(status)
+
+
+def sound_environment() -> None:
+    """Mend variables that libraries read when they are loaded, and which may be nonsense here.
+
+    Pictures are written to files, whatever backend a notebook shows its own with; a terminal
+    that says it is no column wide shows text as any other.  OpenMP's threads wait for each
+    other in busy loops: if other programs run as well, the thread that the others wait for
+    often has no core, because a waiting one occupies it.  Short loops bridge the gaps between
+    two operations; a thread that waits longer sleeps.  If the user has set OpenMP's own
+    variables, these are not changed.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    for name in ("COLUMNS", "LINES", "NUMBA_NUM_THREADS"):
+        if not os.environ.get(name, "1").isdecimal() or os.environ.get(name) == "0":
+            del os.environ[name]
+    if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
+        os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT
+
+
+class _Lines(logging.Formatter):
+    """One line for each record, which begins with its level if that is a warning or more."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line = with_options(" ".join(super().format(record).split()))
+        if record.levelno < logging.WARNING:
+            return line
+        return f"{_bold(f'{record.levelname.lower()}:')} {line}"
+
+
+@contextmanager
+def _messages_to_stderr() -> Iterator[None]:
+    """Print records of this package within the context, from level INFO up."""
+    logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Lines())
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
+
+
+def _bold(text: str) -> str:
+    return f"\033[1m{text}\033[0m" if sys.stderr.isatty() else text
+
+
+def _fail(message: str) -> None:
+    sys.stderr.write(f"{_bold('error:')} {' '.join(message.split())}\n")
+
+
+def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> int:
+    """Say in one line what a command of these words ended with; return the exit status."""
+    text = " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt | SystemExit):
+        status = error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT
+        if status in (128 + signal.SIGINT, 128 + signal.SIGTERM):
+            _fail("interrupted; nothing half-written was left")
+        return status if isinstance(status, int) else BUG
+    if isinstance(error, BrokenPipeError):  # nobody reads on, as in "cpunet … | head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BUG
+    if debug:
+        traceback.print_exception(error)
+    files = ", ".join(word for word in words if os.path.exists(word))  # noqa: PTH110
+    about = f"{files}: " if files else ""
+    if isinstance(error, CpunetError):
+        _fail(text)
+    elif isinstance(error, MemoryError) or any(part in text.lower() for part in NO_MEMORY):
+        _fail(f"{about}out of memory ({text[:200]}); take fewer pulses, or smaller batches")
+    elif isinstance(error, OSError) and error.errno:
+        remedy = "make room" if error.errno in FULL else "check its name and permissions"
+        about = f"{error.filename}: "[-200:] if error.filename else about
+        _fail(f"{about}{os.strerror(error.errno)}; {remedy}, or choose another place")
+    else:
+        _fail(
+            f"{about}unexpected {type(error).__name__} ({text[:200]}); please report it to the "
+            f"makers of {DISTRIBUTION}, with what {DEBUG} prints"
+        )
+        return BUG
+    return USAGE
+
+
+def _stop(number: int, _frame: FrameType | None) -> None:
+    """Leave as on an error, so that Ctrl-C and batch systems leave nothing half-written."""
+    sys.exit(128 + number)

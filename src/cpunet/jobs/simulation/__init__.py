@@ -1,1 +1,0 @@
-"""From hits to ideal pulses: simulations, fields, virtual test stands and libraries."""

@@ -1,1 +1,0 @@
-"""From two sets of pulses to a run: checks of the sets, networks and fitted responses."""

@@ -1,1 +1,0 @@
-"""From a run and a file to translated pulses, libraries and exported models."""

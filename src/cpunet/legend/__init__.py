@@ -1,0 +1,1 @@
+"""What LEGEND's simulation chain reads: pulse-shape libraries and parameters."""
