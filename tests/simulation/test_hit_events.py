@@ -112,7 +112,9 @@ def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
     uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
     path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")
     assert hit_detectors(path) == ["2", "11"]
-    with pytest.raises(CpunetError, match="holds detectors 2, 11; choose one with detector"):
+    with pytest.raises(
+        CpunetError, match="holds detectors 2, 11; choose one with `hits_detector`"
+    ):
         read_hits(path)
     np.testing.assert_allclose(read_hits(path, detector="11").hits.energy_kev, 2614.5)
     np.testing.assert_allclose(read_hits(path, detector="2").hits.energy_kev, 238.6)
