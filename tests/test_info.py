@@ -203,7 +203,7 @@ def test_files_of_hits_are_described(tmp_path):
     csv = tmp_path / "hits.csv"
     names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
     csv.write_text(
-        f"#class tools::wcsv::ntuple\n#title hits\n#separator 44\n{names}1,2,3,4,5\n"
+        f"#class tools::wcsv::ntuple\n#title hits\n#separator 44\n{names}1,200,3,4,5\n"
     )
     assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
     assert "names no unit" in str(info(csv))
@@ -417,7 +417,7 @@ def test_the_command_line(tmp_path, capsys, monkeypatch):
     )
     hits = tmp_path / "hits.npz"
     place = {name: [100.0, 101.0] for name in ("x_mm", "y_mm", "z_mm")}
-    np.savez(hits, **place, edep_keV=[1.0, 2.0], offsets=np.array([0, 2]))
+    np.savez(hits, **place, edep_keV=[100.0, 200.0], offsets=np.array([0, 2]))
     assert "100.00 % would be inside with --origin" in told(hits, "--detector", "icpc")
     words = ("--origin", 100, 100, "-1.5", "--flip-z")
     assert "inside   0.00 %" in told(hits, "--detector", "icpc", *words)

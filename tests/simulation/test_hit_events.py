@@ -11,8 +11,10 @@ import pytest
 from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
+from cpunet.simulation.hit_description import describe_hits
 from cpunet.simulation.hit_readers import hit_detectors, hit_parts, read_hits
 from cpunet.simulation.hit_readers.tables import parts_of
+from cpunet.simulation.hits import HitOptions
 
 N = 12
 # deposits of each Geant4 event: a decay of two steps, and one of its daughter 3 s later
@@ -107,12 +109,21 @@ def test_parts_are_the_same_events(tmp_path, monkeypatch, layout) -> None:
         np.testing.assert_array_equal(joined, getattr(whole, name))
 
 
+def test_a_description_has_the_same_events(tmp_path: Path) -> None:
+    path = written(tmp_path, "flat", steps(det_uid=(np.tile([11, 11, 2], N), "")), "germanium")
+    for window_us, table in ((10.0, {"2": N, "11": N}), (1e-3, {"2": N, "11": 2 * N})):
+        told = describe_hits(path, HitOptions(time_window_us=window_us), {})["detectors"]
+        assert {name: one["events"] for name, one in told.items()} == table
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
     uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
     path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")
     assert hit_detectors(path) == ["2", "11"]
-    with pytest.raises(CpunetError, match="holds detectors 2, 11; choose one with detector"):
+    with pytest.raises(
+        CpunetError, match="holds detectors 2, 11; choose one with `hits_detector`"
+    ):
         read_hits(path)
     np.testing.assert_allclose(read_hits(path, detector="11").hits.energy_kev, 2614.5)
     np.testing.assert_allclose(read_hits(path, detector="2").hits.energy_kev, 238.6)

@@ -51,7 +51,7 @@ def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
 def test_remage_without_a_detector_names_those_there(reference_data: Path) -> None:
     path = reference_data / "geant4" / "remage-th228-stp.lh5"
     with pytest.raises(
-        CpunetError, match="det1, det2, scint1, scint2; choose one with detector"
+        CpunetError, match="det1, det2, scint1, scint2; choose one with `hits_detector`"
     ):
         read_hits(path)
     with pytest.raises(CpunetError, match="no detector optdet1"):
@@ -69,7 +69,7 @@ def test_truncated_hdf5_is_one_line(reference_data: Path, tmp_path: Path) -> Non
 
 def test_geant4_csv_needs_units(reference_data: Path) -> None:
     path = reference_data / "geant4" / "single-invcoax-th228-geant4.csv"
-    with pytest.raises(CpunetError, match="column X names no unit; give length_unit"):
+    with pytest.raises(CpunetError, match="column X names no unit; give `length_unit`"):
         read_hits(path)
     hits = read_hits(path, length_unit="mm", energy_unit="keV").hits
     assert (hits.n_events, len(hits.edep_kev)) == (124, 1411)
@@ -93,7 +93,9 @@ def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
 
 
 def test_g4simple_detector_and_columns_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(CpunetError, match="holds detectors 1, 2; choose one with detector"):
+    with pytest.raises(
+        CpunetError, match="holds detectors 1, 2; choose one with `hits_detector`"
+    ):
         read_hits(g4simple_file(tmp_path))
     with pytest.raises(CpunetError, match="no detector 3; it holds 1, 2"):
         read_hits(g4simple_file(tmp_path), detector="3")

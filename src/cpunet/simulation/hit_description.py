@@ -57,6 +57,7 @@ def describe_hits(
                 detector=name,
                 length_unit=options.length_unit,
                 energy_unit=options.energy_unit,
+                time_window_us=options.time_window_us,
             ).hits
         except CpunetError as error:
             return str(error).removeprefix(f"{path}: ")

@@ -138,9 +138,7 @@ def choose(path: Path, there: list[str], detector: str | None) -> str | None:
     """
     names = ", ".join(there) or "none"
     if detector is None and len(there) > 1:
-        raise CpunetError(
-            f"{path}: holds detectors {names}; choose one with detector (--hits-detector)"
-        )
+        raise CpunetError(f"{path}: holds detectors {names}; choose one with `hits_detector`")
     if detector is not None and detector not in there:
         raise CpunetError(f"{path}: no detector {detector}; it holds {names}")
     return detector or next(iter(there), None)

@@ -245,5 +245,5 @@ def _without_detectors(path: Path, detector: str | None) -> None:
     if detector is not None:
         raise CpunetError(
             f"{path}: its hits name no detector to pick {detector} by; leave "
-            "--hits-detector out"
+            "`hits_detector` out"
         )

@@ -67,8 +67,7 @@ class Units:
         unit = named or given
         if unit is None:
             raise CpunetError(
-                f"{path}: column {column} names no unit; give {option} "
-                f"(--{option.replace('_', '-')}): {', '.join(known)}"
+                f"{path}: column {column} names no unit; give `{option}`: {', '.join(known)}"
             )
         if unit not in known:
             raise CpunetError(
@@ -175,7 +174,7 @@ def require_physics(path: Path, energy_kev: FloatArray) -> None:
         raise CpunetError(
             f"{path}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
             "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
-            "give energy_unit (--energy-unit) if it names none"
+            "give `energy_unit` if it names none"
         )
 
 
