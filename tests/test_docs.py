@@ -14,12 +14,10 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-import typer
 import yaml
 
 import cpunet
 from cpunet.cli import app
-from cpunet.cli import app as functions
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
@@ -65,29 +63,22 @@ def require_parsed(words: list[str]) -> None:
 
     What is set of a recipe must be one of its settings.
     """
-    if words[0] in [*functions]:
-        functions.parse_args(words, exit_on_error=False, print_error=False)
-        return
-    command, name = typer.main.get_command(app), "cpunet"
-    while words and words[0] in getattr(command, "commands", {}):
-        name, *words = words
-        command = command.commands[name]
-    assert not hasattr(command, "commands"), f"no command {words[:1]}"
-    given = command.make_context(name, list(words)).params
+    _, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+    given = bound.arguments
     if given.get("recipe") in list_recipes():
-        load_recipe(given["recipe"], given.get("set_values") or ())
+        load_recipe(given["recipe"], given.get("settings") or ())
 
 
 def option_names(words: list[str]) -> set[str]:
-    """Options of a command that is a function; none of a group of such."""
-    command = functions
+    """Options of a command; none of a group of commands."""
+    command = app
     for word in words:
         if word not in [*command]:
             break
         command = command[word]
     if command.default_command is None:
         return set()
-    found = command.assemble_argument_collection(default_parameter=functions.default_parameter)
+    found = command.assemble_argument_collection(default_parameter=app.default_parameter)
     return {name for argument in found for name in argument.names}
 
 
@@ -106,32 +97,33 @@ def test_the_commands_within_sentences():
     """What stands in a sentence may lack arguments, but its command and options are there."""
     for page in PAGES:
         for inline in re.findall(r"(?<!`)`cpunet ([^`]+)`(?!`)", page.read_text()):
-            command, words = typer.main.get_command(app), inline.split()
-            if words[0] in [*functions]:
-                known = option_names(words)
-                given = {word.strip("[]").partition("=")[0] for word in words}
-                assert {w for w in given if w[:2] == "--"} <= known | {"--help"}, inline
-                continue
-            while words and words[0] in getattr(command, "commands", {}):
-                command = command.commands[words.pop(0)]
-            known = {name for option in command.params for name in option.opts}
-            known |= {name for option in command.params for name in option.secondary_opts}
-            options = {word.strip("[]").partition("=")[0] for word in words if word[:2] == "--"}
-            assert options <= known | {"--help"}, f"{page.name}: cpunet {inline}"
-            first = words[0] if words else ""
-            if hasattr(command, "commands"):
-                assert not first.isalpha() or first.isupper(), f"{page.name}: cpunet {inline}"
+            words = inline.split()
+            first = words[0].strip("[]")
+            assert first in [*app] or not first.isalpha() or first.isupper(), inline
+            given = {word.strip("[]").partition("=")[0] for word in words}
+            options = {word for word in given if word[:2] == "--"}
+            assert options <= option_names(words) | {"--help", "--version", "--debug"}, inline
 
 
 def test_a_wrong_option_would_be_found():
-    with pytest.raises(Exception, match="No such option"):
+    with pytest.raises(Exception, match="Unknown option"):
         require_parsed(["train", "--sim", "a", "--data", "b", "--out", "c", "--nonsense"])
 
 
 def test_a_wrong_setting_would_be_found():
     with pytest.raises(CpunetError, match="no such setting"):
         require_parsed(
-            ["train", "--sim", "a", "--data", "b", "--out", "c", "--set", "training.nonsense=1"]
+            [
+                "train",
+                "--recipe",
+                "fast",
+                "--sim",
+                "a",
+                "--data",
+                "b",
+                "--set",
+                "training.none=1",
+            ]
         )
 
 

@@ -63,7 +63,7 @@ def test_the_command_line_tells_it(installed, capsys, monkeypatch):
     installed("cpunet/__init__.py")
     monkeypatch.setattr(sys, "argv", ["cpunet", "--version"])
     with pytest.raises(SystemExit):
-        main.main()
+        main()
     printed = capsys.readouterr()
     assert printed.out == f"cpunet {cpunet.__version__}\n"
     assert printed.err.startswith("warning: the package cpunet 1.0.0 is installed over")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import os
 import subprocess
@@ -32,13 +33,13 @@ def hook(name: str, needs: str) -> ModuleType:
 
 def test_every_option_of_every_command_is_in_the_reference():
     made = hook("commands", "mkdocs")
-    index = made.index_page()
+    index, usual = made.index_page(), made.app.default_parameter
     for name, command in made.commands():
         page = made.command_page(name, command)
         assert f"[`{name}`]" in index
-        for option in command.params:
-            if option.param_type_name == "option" and not option.hidden:
-                assert f"`{option.opts[0]}`" in page
+        for option in command.assemble_argument_collection(default_parameter=usual):
+            if option.show and option.field_info.kind is inspect.Parameter.KEYWORD_ONLY:
+                assert f"`{option.names[0]}`" in page
 
 
 def test_every_public_name_is_in_the_reference():

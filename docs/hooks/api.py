@@ -13,7 +13,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "cpunet"
 FOLDER = "reference/python"
-LEFT_OUT = {"cli"}  # has a reference of its own
+COMMANDS = "cli.py"  # has a reference of its own
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 # As data flow; a room that is not named there comes last.
 ORDER = PROJECT["tool"]["cpunet"]["rooms"]
@@ -54,6 +54,40 @@ order in which data flow.
 
 ::: cpunet.subtract_tails
 
+::: cpunet.check
+
+::: cpunet.response
+
+::: cpunet.demo
+
+::: cpunet.tune
+
+::: cpunet.list_recipes
+
+::: cpunet.import_weights
+
+::: cpunet.export_onnx
+
+::: cpunet.export_legend
+
+::: cpunet.make_library
+
+::: cpunet.translate_library
+
+::: cpunet.merge_libraries
+
+::: cpunet.expand_library
+
+::: cpunet.read_library
+
+::: cpunet.lithium_table
+
+::: cpunet.LegendParameters
+
+::: cpunet.LithiumLayer
+
+::: cpunet.Adc
+
 ::: cpunet.Run
 
 ::: cpunet.Translation
@@ -69,10 +103,6 @@ order in which data flow.
 ::: cpunet.PulseFile
 
 ::: cpunet.HitFile
-
-::: cpunet.Adc
-
-::: cpunet.import_weights
 
 ::: cpunet.FileOptions
 
@@ -95,7 +125,7 @@ order in which data flow.
 
 
 def public_modules(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*.py") if not path.name.startswith("_"))
+    return sorted(path for path in folder.glob("[!_]*.py") if path.name != COMMANDS)
 
 
 def name_of(path: Path) -> str:
@@ -123,8 +153,7 @@ def place(folder: Path) -> tuple[int, tuple[str, ...]]:
 def rooms() -> Iterator[Path]:
     """Folders of the package that hold modules to show, the package's own first."""
     for folder in sorted((path.parent for path in SOURCE.rglob("__init__.py")), key=place):
-        parts = folder.relative_to(SOURCE).parts
-        if not LEFT_OUT.intersection(parts) and public_modules(folder):
+        if public_modules(folder):
             yield folder
 
 

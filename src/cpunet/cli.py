@@ -127,7 +127,7 @@ def _made() -> App:
         name="cpunet",
         help=f"{cpunet.__doc__.splitlines()[0].partition(': ')[2].capitalize()}\n\n"
         f"{DEBUG} shows the whole traceback if a command fails.",
-        version=cpunet.__version__,
+        version=f"cpunet {cpunet.__version__}",
         # of "a path or an object", the command line takes paths
         default_parameter=Parameter(
             accepts_keys=False,

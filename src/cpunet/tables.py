@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 Lines: TypeAlias = Sequence[tuple[str, str]]
+
+NO_VALUE = "–"
+MAX_DIGITS = 9  # after the decimal point
 
 
 def text_table(
@@ -65,3 +68,28 @@ def span(ends: Sequence[float] | None, digits: int = 9) -> str:
 def percent(value: float) -> str:
     """Two digits, and whole numbers from 99.5 on."""
     return f"{value:.2g} %" if abs(value) < 99.5 else f"{value:.0f} %"
+
+
+def number(value: Any) -> str:
+    """Format a value for the page: four digits suffice to compare two scores."""
+    if value is None:
+        return NO_VALUE
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def with_std(value: Any, error: Any) -> str:
+    """Format a value with its error, if any, to two digits of the error.
+
+    Examples
+    --------
+    >>> with_std(0.52094, 0.0171), with_std(0.52094, 0.0996), with_std(0.1, None)
+    ('0.521 ± 0.017', '0.52 ± 0.10', '0.1')
+    """
+    if value is None or error is None:
+        return number(value)
+    # the exponent of the rounded error: 0.0996 is 0.10
+    exponent = int(f"{error:.1e}".partition("e")[2]) if error > 0 else -MAX_DIGITS
+    digits = max(1 - exponent, 0)
+    if digits >= MAX_DIGITS:
+        return f"{number(value)} ± {error:.2g}"
+    return f"{value:.{digits}f} ± {error:.{digits}f}"

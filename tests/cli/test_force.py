@@ -6,16 +6,15 @@ import json
 from pathlib import Path
 
 import pytest
-import typer
+from cyclopts import App
 
 from cpunet.cli import app
-from cpunet.cli import app as functions
 
 GAMMAS = "--detector icpc --events FEP=1"
 TRAINING = "--sim D/sim.lh5 --data D/data.lh5"
 # Words of each command, and names for --out that are, hold or lie in one of its inputs.
 COMMANDS = {
-    "demo": [("--preset demo/run/my.yaml", "demo"), ("--recipe demo/stand/my.yaml", "demo")],
+    "demo": [],  # reads no file
     "simulate": [
         ("--detector icpc --hits D/hits.lh5", "D/hits.lh5"),
         ("--detector icpc --hits D/link.lh5", "D/hits.lh5"),
@@ -87,30 +86,17 @@ CASES = [
 ]
 
 
-def writing_commands() -> set[str]:
+def writing_commands(below: App = app, name: str = "") -> set[str]:
     """Names of all commands that have ``--force``."""
-    found = set()
-
-    def walk(command, name: str) -> None:
-        for sub, inner in getattr(command, "commands", {}).items():
-            walk(inner, f"{name} {sub}".strip())
-        if any("--force" in option.opts for option in command.params):
-            found.add(name)
-
-    def walk_functions(group, name: str) -> None:
-        for word in (word for word in group if word[0] != "-"):
-            inner, whole = group[word], f"{name} {word}".strip()
-            if inner.default_command is None:
-                walk_functions(inner, whole)
-                continue
-            usual = functions.default_parameter
-            options = inner.assemble_argument_collection(default_parameter=usual)
-            if any("--force" in option.names for option in options):
-                found.add(whole)
-
-    walk(typer.main.get_command(app), "")
-    walk_functions(functions, "")
-    return found
+    if below.default_command is not None:
+        options = below.assemble_argument_collection(default_parameter=app.default_parameter)
+        return {name} if any("--force" in option.names for option in options) else set()
+    words = [word for word in below if word[0] != "-"]
+    return {
+        found
+        for word in words
+        for found in writing_commands(below[word], f"{name} {word}".strip())
+    }
 
 
 def test_every_command_that_writes_is_here():

@@ -143,7 +143,10 @@ def _settings(
         return given
     sampling = {"dt_ns": dt_ns, "length_ns": length_ns}
     if given is None:
-        sampling = {"dt_ns": dt_ns or DT_NS, "length_ns": length_ns or LENGTH_NS}
+        sampling = {
+            "dt_ns": DT_NS if dt_ns is None else dt_ns,
+            "length_ns": LENGTH_NS if length_ns is None else length_ns,
+        }
     chosen = {name: value for name, value in sampling.items() if value is not None}
     return read_settings(SimulationSettings, given, chosen)
 

@@ -9,10 +9,9 @@ from contextlib import suppress
 from cpunet.electronics.remains import remains_in_words
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import SideInfo
-from cpunet.tables import counted, percent
+from cpunet.tables import counted, percent, with_std
 from cpunet.training.chain_description import noise_kev
 from cpunet.training.run import FitInfo, Run
-from cpunet.validation.nested_tables import with_std
 
 PARTS = 8  # maximum number of deviating parts of a fit
 UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 
 from cpunet.html_pages import joined, part
 from cpunet.plotting import GROUP, colours, group, label, styled
+from cpunet.tables import with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
-from cpunet.validation.nested_tables import html_table, with_std
+from cpunet.validation.nested_tables import html_table
 
 FIGURE = "A over E and energy"
 

@@ -9,12 +9,11 @@ from markupsafe import Markup
 
 from cpunet.html_pages import joined, part
 from cpunet.plotting import LABELS, NO_NOISE, label
+from cpunet.tables import NO_VALUE, number, with_std
 
-NO_VALUE = "–"
 ERRORS = ("_std", "_error")  # suffixes of the name of an error
 UNITS = {"ns": "ns", "kev": "keV", "percent": "%", "mm": "mm"}  # at the end of a key
 SPELT = {"auc": "AUC", "iou": "IoU", "rms": "RMS", "wasserstein": "W₁"}
-MAX_DIGITS = 9  # after the decimal point
 LONG = 12  # longer lists are summarised
 BROAD = 6  # tables with more columns than this are transposed if they have fewer rows
 
@@ -64,31 +63,6 @@ def nested_html(value: Any, level: int = 4) -> Markup:
         parts.append(part("heading", level, words_of(name)))
         parts.append(nested_html(item, min(level + 1, 6)))
     return joined(parts)
-
-
-def number(value: Any) -> str:
-    """Format a value for the page: four digits suffice to compare two scores."""
-    if value is None:
-        return NO_VALUE
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def with_std(value: Any, error: Any) -> str:
-    """Format a value with its error, if any, to two digits of the error.
-
-    Examples
-    --------
-    >>> with_std(0.52094, 0.0171), with_std(0.52094, 0.0996), with_std(0.1, None)
-    ('0.521 ± 0.017', '0.52 ± 0.10', '0.1')
-    """
-    if value is None or error is None:
-        return number(value)
-    # the exponent of the rounded error: 0.0996 is 0.10
-    exponent = int(f"{error:.1e}".partition("e")[2]) if error > 0 else -MAX_DIGITS
-    digits = max(1 - exponent, 0)
-    if digits >= MAX_DIGITS:
-        return f"{number(value)} ± {error:.2g}"
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _matrix(rows: Mapping[str, Mapping[str, Any]], corner: str) -> Markup:

@@ -24,9 +24,10 @@ from cpunet.html_pages import (
 )
 from cpunet.plotting import colours, label
 from cpunet.pulses.parameters import PARAMETERS
+from cpunet.tables import number
 from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.validation.ae_energy_figure import ae_energy_html
-from cpunet.validation.nested_tables import nested_html, number
+from cpunet.validation.nested_tables import nested_html
 from cpunet.validation.report import PAGE
 from cpunet.validation.report_tables import (
     pairs_table,

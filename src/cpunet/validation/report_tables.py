@@ -11,7 +11,8 @@ from cpunet.html_pages import joined, part
 from cpunet.plotting import NO_NOISE, label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
-from cpunet.validation.nested_tables import NO_VALUE, html_table, number, with_std, words_of
+from cpunet.tables import NO_VALUE, number, with_std
+from cpunet.validation.nested_tables import html_table, words_of
 from cpunet.validation.score_panels import score_panels
 
 
