@@ -179,10 +179,8 @@ def main() -> None:
     end = words.index("--") if "--" in words else len(words)  # then names only
     debug = DEBUG in words[:end]  # known wherever it stands
     words = [word for word in words[:end] if word != DEBUG] + words[end:]
-    with _messages_to_stderr():
+    with _messages_to_stderr(), _stopped_as_on_an_error():
         try:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, _stop)
             sound_environment()
             if clash := other_package():
                 log.warning(clash)
@@ -275,6 +273,16 @@ def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> i
     return USAGE
 
 
-def _stop(number: int, _frame: FrameType | None) -> None:
-    """Leave as on an error, so that Ctrl-C and batch systems leave nothing half-written."""
-    sys.exit(128 + number)
+@contextmanager
+def _stopped_as_on_an_error() -> Iterator[None]:
+    """Let Ctrl-C and batch systems leave nothing half-written."""
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        sys.exit(128 + number)
+
+    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -11,6 +11,7 @@ import pytest
 
 import cpunet
 from cpunet.cli import run
+from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 
@@ -30,23 +31,13 @@ PLAIN = (
 )
 
 
-def make_stand(out: Path, full_energy: int, **readout: object) -> Path:
-    """A small stand; made by the package's own job, in this process."""
-    from cpunet.jobs.simulation.stand import make_stand
-
-    from cpunet.electronics.chain import Electronics, read_electronics
-    from cpunet.simulation.energy_windows import energy_windows
-    from cpunet.simulation.shifted import Shift
-
-    make_stand(
-        Electronics.model_validate(read_electronics("legend200").model_dump() | readout),
-        read_detector("ppc"),
-        tuple(energy_windows("FEP,DEP", load_recipe("fast").peaks, 0.5)),
-        (full_energy, 60),
-        out,
-        kind="shifted",
-        shift=Shift(temperature_K=3),
-        seed=3,
+def shifted_stand(out: Path, full_energy: int, **readout: object) -> Path:
+    """A small stand whose data are 3 K warmer than simulated."""
+    chain = Electronics.model_validate(read_electronics("legend200").model_dump() | readout)
+    events = {"FEP": full_energy, "DEP": 60}
+    shift = {"temperature_K": 3}
+    cpunet.make_stand(
+        out, electronics=chain, detector="ppc", events=events, shift=shift, seed=3
     )
     return out
 
@@ -59,7 +50,7 @@ def calibrated_to(stand: Path, run: Path, *overrides: str) -> cpunet.Calibration
 
 @pytest.fixture(scope="module")
 def stand(tmp_path_factory) -> Path:
-    return make_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, **READOUT)
+    return shifted_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, **READOUT)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +89,7 @@ def test_the_temperature_is_found(calibrated):
 @pytest.mark.slow
 def test_the_temperature_is_found_with_a_small_error(tmp_path):
     told = require_temperature(
-        calibrated_to(make_stand(tmp_path / "stand", ENOUGH), tmp_path / "run").folder
+        calibrated_to(shifted_stand(tmp_path / "stand", ENOUGH), tmp_path / "run").folder
     )
     assert told["parameters"]["temperature_K"]["error"] < 0.5
     chi = told["chi_square"]

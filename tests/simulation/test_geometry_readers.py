@@ -207,7 +207,7 @@ def test_the_public_metadata(reference_data: Path) -> None:
     assert bege.impurity_1e10_per_cm3(0, [0, 40]) == pytest.approx(-curve / 10)
     said = refused(diodes / "P99000A.yaml", "temperature_K=90")
     assert "there is no" in said
-    assert "crystals/P99000.yaml); give the crystal's file with --crystal" in said
+    assert "crystals/P99000.yaml); give `settings` impurity_z0_1e10_per_cm3=VALUE" in said
     ppc = read_detector(
         diodes / "P99000A.yaml",
         ["temperature_K=90"],
@@ -258,13 +258,13 @@ def test_what_the_metadata_lack_is_named(
     path = metadata(tmp_path, {"name": "000"}, without_impcc(characterization=site))
     given = ["temperature_K=90", "li_thickness=1", "bias_V=3000"]
     said = refused(path, *given)
-    assert "B99000.yaml has no impurity_curve); give the crystal's file" in said
+    assert "B99000.yaml has no impurity_curve); give `settings` impurity_z0" in said
     given += ["impurity_z0_1e10_per_cm3=-1"]
     assert read_detector(path, given).bias_V == 3000
     assert "combined_0vbb_analysis.fccd_in_mm.value nor" in refused(path, *given[2:])
     said = refused(path, given[0], given[1], given[3])
     assert "l200_site.recommended_voltage_in_V nor" in said
-    assert said.endswith("give --set bias_V=VALUE")
+    assert said.endswith("give `settings` bias_V=VALUE")
     assert capfd.readouterr() == ("", "")
 
 
@@ -300,7 +300,7 @@ def test_diodes_with_a_name_or_height_that_none_has(tmp_path: Path) -> None:
 
 def test_a_crystal_belongs_to_a_diode(tmp_path: Path) -> None:
     path = metadata(tmp_path, CRYSTAL, DIODE)
-    with pytest.raises(CpunetError, match="leave out --crystal"):
+    with pytest.raises(CpunetError, match="leave out `crystal`"):
         read_detector("icpc", crystal=path)
     with pytest.raises(CpunetError, match=r"nowhere\.yaml: no such file"):
         read_detector(path, ["temperature_K=90"], tmp_path / "nowhere.yaml")

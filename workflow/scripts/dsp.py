@@ -14,6 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.settings import read_values
 from cpunet.training.chain_description import describe_chain
+from cpunet.training.run import Run
 
 
 def run_chain(
@@ -79,7 +80,7 @@ def _chain(config: Path) -> dict[str, Any]:
 
 def _decay_us(run: Path) -> float:
     try:
-        return float(describe_chain(run)["values"]["decay_us"])
+        return float(describe_chain(Run.load(run))["values"]["decay_us"])
     except CpunetError as error:
         raise CpunetError(f"{error}; or give events.tau_us") from error
 
