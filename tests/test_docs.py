@@ -73,7 +73,7 @@ def option_names(words: list[str]) -> set[str]:
     """Options of a command; none of a group of commands."""
     command = app
     for word in words:
-        if word not in [*command]:
+        if word not in [*command] or word.startswith("-"):
             break
         command = command[word]
     if command.default_command is None:

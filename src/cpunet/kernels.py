@@ -67,7 +67,7 @@ def start_threads() -> None:
     with threadpoolctl.ThreadpoolController().select(user_api="openmp").limit(limits=None):
         numba.get_num_threads()
     asked = os.environ.get("OMP_NUM_THREADS", "")  # which numba does not look at
-    if asked.isdecimal() and int(asked):
+    if asked.isdecimal() and int(asked) and "NUMBA_NUM_THREADS" not in os.environ:
         numba.set_num_threads(min(int(asked), config.NUMBA_NUM_THREADS))
 
 

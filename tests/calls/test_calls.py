@@ -276,3 +276,44 @@ def test_the_page_runs_on_a_stand(tmp_path, monkeypatch):
         exec(compile(code, "python.md", "exec"), names)
     assert Path("report/report.html").is_file()
     assert names["calibrated"].physics is not None
+
+
+@pytest.mark.thorough
+def test_what_one_would_type_works(home, tmp_path, all_undrawn):
+    """Paths and objects alike, from files to scores, nothing written unless one saves it."""
+    sim, data = (cpunet.open_pulses(home / f"{side}.lh5").read() for side in ("sim", "raw"))
+    assert (len(sim), len(sim[:7]), len(sim[sim.energy_kev > 0])) == (N, 7, N - 1)
+    assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
+    assert list(sim.to_dataframe()) == ["event_number", "energy_kev", "peak"]
+    recipe = cpunet.load(sim.save(tmp_path / "sim.lh5")).open().read()
+    assert len(recipe) == N
+    assert "fast" in cpunet.list_recipes()
+
+    assert cpunet.check(sim, data).ok
+    run = cpunet.train(sim, data, recipe=load_recipe("fast", SHORT), device="cpu")
+    assert run.folder is None
+    assert dict(run.summary())
+    assert len(run.losses)
+    assert run.plot().axes
+    saved = run.save(tmp_path / "run")
+    assert cpunet.load(tmp_path / "run").fit == saved.fit
+
+    like_data = run.translate(sim, seed=1)
+    assert like_data.waveforms.shape == (N, 800)
+    assert {"current_amplitude", "energy_kev"} <= {*like_data.to_dataframe()}
+    assert len(cpunet.load(like_data.save(tmp_path / "translated.lh5")).open().read()) == N
+    assert run.ren.translate(sim.waveforms[:2], noise=False).shape == (2, 800)
+    assert run.iren.translate(data.waveforms[:2]).shape == (2, 800)
+
+    report = run.validate(sim, data, baselines=False, device="cpu")
+    assert report.folder is None
+    assert report.scores.loc["FEP", "drift_time", "ren"].iou > 0
+    assert report["FEP"].loc["drift_time", "ren"].ceiling > 0
+    assert report.plot().axes
+    assert "FEP" in report.to_dict()["peaks"]
+    report.save(tmp_path / "report")
+    again = cpunet.load(tmp_path / "report")
+    assert again.verdicts == report.verdicts
+    assert len(cpunet.compare(tmp_path / "report", again).table)
+    for shown in (sim, run, like_data, report, cpunet.info(tmp_path / "run")):
+        assert "\n" not in repr(shown)

@@ -123,7 +123,12 @@ def train(
             return _trained(job, place)
 
     if sides[1].table != ALL:
-        return one(sides, target, init, resume)
+        run = one(sides, target, init, resume)
+        if target is not None:
+            words = ("cpunet validate", target, "--sim", sides[0].path, "--data", sides[1].path)
+            report = target.with_name(f"{target.name}-report")
+            log.info(" ".join(map(str, ("next:", *words, "--out", report))))
+        return run
     if target is None:
         raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
 

@@ -171,8 +171,15 @@ class Report:
             made.fill(method, values[np.isfinite(values)])
         return made
 
-    def plot(self, peak: str, parameter: str = "current_amplitude") -> Figure:
+    def plot(self, peak: str | None = None, parameter: str = "current_amplitude") -> Figure:
         """Draw the distributions of a parameter by method, with its scores.
+
+        Parameters
+        ----------
+        peak
+            Name of a scored peak; None for the first.
+        parameter
+            Name of a scored parameter.
 
         Raises
         ------
@@ -182,6 +189,7 @@ class Report:
         from cpunet.validation.drawings import DRAWN
         from cpunet.validation.run_figures import parameter_histograms
 
+        peak = next(iter(self.values)) if peak is None else peak
         of_peak = named(self.values, peak, "scored peak")
         compared = named(self._compared(peak), parameter, "scored parameter")
         values = {m: of_peak[m][parameter] for m in DRAWN if m in of_peak}
