@@ -79,6 +79,7 @@ def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
     model = onnx.load(tmp_path / "ren.onnx")
     onnx.checker.check_model(model)
     assert {opset.version for opset in model.opset_import if not opset.domain} == {18}
+    assert model.ir_version == 8  # that of ONNX 1.13, which brought opset 18
     session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
     windows = prepared(sim)
     translator = REN.load(chain)

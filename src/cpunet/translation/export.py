@@ -19,7 +19,7 @@ from cpunet.settings import read_json
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import Run, RunLike, as_run
 from cpunet.translation.graphs import Graph
-from cpunet.translation.onnx import CHECKED, OPSET, TOLERANCE, write_onnx
+from cpunet.translation.onnx import CHECKED, FORMAT, OPSET, TOLERANCE, write_onnx
 from cpunet.translation.translator import IREN, REN, Translator
 
 
@@ -138,9 +138,9 @@ def _card(
         f"# {done.graph.name}\n",
         f"{type(translator).__name__} of a cpunet run: "
         + ("simulated → measured-like" if translator.part == "ren" else "measured → simulated")
-        + f" pulses. ONNX, opset {OPSET}; any batch size. Largest difference from the run in "
-        f"batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of the "
-        f"pulse height (refused above {TOLERANCE:g}).\n",
+        + f" pulses. ONNX, opset {OPSET}, IR {FORMAT}; any batch size. Largest difference from "
+        f"the run in batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of "
+        f"the pulse height (refused above {TOLERANCE:g}).\n",
         "## Made from\n",
         *_origin(run, translator),
         "## In and out\n",

@@ -19,7 +19,9 @@ import torch
 from cpunet.errors import CpunetError
 from cpunet.translation.graphs import Graph
 
-OPSET = 18
+# Version of the operators, and the lowest version of the file format that holds them: what a
+# runtime older than the exporter reads.
+OPSET, FORMAT = 18, 8
 TOLERANCE = 1e-4  # maximum difference between file and run, for pulses of height 1
 CHECKED = (1, 3)  # batch sizes of the comparison
 TRACED = 2
@@ -83,7 +85,10 @@ def _program(graph: Graph) -> bytes:
         raise CpunetError("ONNX has no operators for this run's U-Net") from error
     finally:
         logger.setLevel(level)
-    content: bytes = cast(Any, program).model_proto.SerializeToString()
+    model = cast(Any, program).model_proto
+    model.ir_version = FORMAT
+    _needed("onnx").checker.check_model(model)
+    content: bytes = model.SerializeToString()
     return content
 
 
