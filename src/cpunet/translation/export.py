@@ -139,8 +139,8 @@ def _card(
         f"{type(translator).__name__} of a cpunet run: "
         + ("simulated → measured-like" if translator.part == "ren" else "measured → simulated")
         + f" pulses. ONNX, opset {OPSET}, IR {FORMAT}; any batch size. Largest difference from "
-        f"the run in batches of {' and '.join(map(str, CHECKED))} pulses: {done.difference:.1e} of "
-        f"the pulse height (refused above {TOLERANCE:g}).\n",
+        f"the run in batches of {' and '.join(map(str, CHECKED))} pulses: "
+        f"{done.difference:.1e} of the pulse height (refused above {TOLERANCE:g}).\n",
         "## Made from\n",
         *_origin(run, translator),
         "## In and out\n",
