@@ -8,6 +8,7 @@ nobody thought of, 128 and more for a signal.
 from __future__ import annotations
 
 import errno
+import inspect
 import logging
 import os
 import re
@@ -19,7 +20,14 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from cyclopts import App, CycloptsError, Parameter, default_name_transform
+from cyclopts import (
+    App,
+    CycloptsError,
+    MissingArgumentError,
+    Parameter,
+    UnknownCommandError,
+    default_name_transform,
+)
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -105,6 +113,7 @@ for _options in (Adc, FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 
 DEBUG, USAGE, BUG = "--debug", 2, 1
+HELP = {"--help", "-h"}
 # Turns of the loop in which a thread of OpenMP waits before it sleeps: about 0.1 ms, longer
 # than most gaps between two operations and far shorter than others hold a core.
 SPIN_COUNT = "3000"
@@ -161,16 +170,37 @@ def run(words: Sequence[str]) -> int:
     try:
         result: Any = app(words, exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        told = " ".join(str(error).split()).rstrip(".")
         command = " ".join(["cpunet", *(error.command_chain or ())])
-        raise CpunetError(told, f"see {command} --help") from error
+        raise CpunetError(_wrong_usage(error), f"see {command} --help") from error
     except CpunetError as error:
         raise CpunetError(with_options(str(error))) from error
+    if HELP.intersection(words):
+        sys.stdout.writelines(
+            f"{line}\n" for line in examples([w for w in words if w[0] != "-"])
+        )
     if not words or (words[0] in GROUPS and len(words) == 1):
         return USAGE  # the help was shown
     if result is not None:
         print(with_options(str(result)))  # noqa: T201 - the only place that prints
     return 0 if getattr(result, "ok", True) else BUG
+
+
+def _wrong_usage(error: CycloptsError) -> str:
+    """What is wrong with the words of a command."""
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        return f"{error.argument.names[0]} is missing"
+    told = " ".join(str(error).split())
+    if isinstance(error, UnknownCommandError):  # more words list the first of all commands
+        told = told.partition(" Available commands")[0]
+    return told.rstrip(".")
+
+
+def examples(words: Sequence[str]) -> list[str]:
+    """Examples of a command, from the docstring of its function; none of a group."""
+    function = app.parse_commands(words)[1][-1].default_command if words else None
+    _, _, after = (inspect.getdoc(function) or "").partition("Examples\n--------\n")
+    lines = [line.strip("` ") for line in after.splitlines()]
+    return ["Examples:", *(f"  {line}" for line in lines if line)] if after else []
 
 
 def main() -> None:

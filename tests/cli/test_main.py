@@ -10,6 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
+from cpunet.cli import COMMANDS
+
 
 def test_no_command_at_all(command):
     outcome = command()
@@ -17,13 +19,28 @@ def test_no_command_at_all(command):
     assert "Usage" in outcome.out + outcome.err
 
 
-@pytest.mark.parametrize("name", [[], ["train"], ["translate"], ["validate"], ["info"]])
-def test_help(command, name):
-    outcome = command(*name, "--help")
+def test_help(command):
+    outcome = command("--help")
     assert outcome.code == 0
-    assert "Usage" in outcome.out
-    expected = {"train", "translate", "validate", "info"} if not name else {"--force"}
-    assert all(word in outcome.out for word in expected)
+    for name in COMMANDS:
+        assert f" {name.split()[0]} " in outcome.out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_has_examples(command, name):
+    outcome = command(*name.split(), "--help")
+    assert outcome.code == 0
+    usage, _, examples = outcome.out.partition("Examples:\n")
+    assert f"Usage: cpunet {name}" in usage
+    assert all(line.startswith(f"  cpunet {name} ") for line in examples.splitlines())
+    assert examples
+
+
+def test_words_that_are_missing_or_unknown_are_named(command):
+    assert command("train", "--sim", "sim.lh5").err == (
+        "error: --data is missing; see cpunet train --help\n"
+    )
+    assert command("trai").err.startswith('error: Unknown command "trai"')
 
 
 def test_the_help_does_not_load_torch():
