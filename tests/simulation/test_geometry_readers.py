@@ -247,7 +247,7 @@ def test_wrong_crystals_name_the_field(
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'crystals' / 'B99000.yaml'}: ")
     assert said in message
-    assert "--crystal" in message
+    assert "another file of the crystal" in message
     assert "\n" not in message
 
 

@@ -28,7 +28,7 @@ MODELS = {
     "linear_exponential_boule": ("a", "b", "n", "l", "m"),
     "parabolic_exponential_boule": ("a", "b", "c", "n", "l", "m"),
 }
-_ANOTHER = "correct it, or give another file with --crystal"
+_ANOTHER = "correct it, or take another file of the crystal"
 _LARGEST_EXPONENT = 300
 LONGEST_MM = 1e6  # of any boule; squares of larger numbers may overflow
 

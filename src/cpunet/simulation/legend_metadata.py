@@ -69,8 +69,8 @@ _SIMULATED = ("icpc", "bege", "ppc")
 _NEAREST_CM = 1e-6
 _IMPCC = (
     "production.impcc.array needs equally long value_in_1e9e/cm3 and "
-    "dist_from_contact_in_mm at different distances; correct it, or remove it and give the "
-    "crystal's file with --crystal"
+    "dist_from_contact_in_mm at different distances; correct it, or remove it and put the "
+    "crystal's file into ../crystals"
 )
 
 
