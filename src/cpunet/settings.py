@@ -232,3 +232,16 @@ def _kinds(annotation: Any) -> set[Any]:
     if get_origin(annotation) is Annotated:
         parts = parts[:1]
     return set().union(*map(_kinds, parts)) if parts else {annotation}
+
+
+def require_seed(seed: int) -> int:
+    """The seed, if random numbers can begin with it.
+
+    Raises
+    ------
+    CpunetError
+        If it is not from 0 to 2³² - 1.
+    """
+    if not 0 <= seed < 2**32:
+        raise CpunetError(f"`seed`: {seed} is not from 0 to {2**32 - 1}")
+    return seed

@@ -115,6 +115,9 @@ MISTAKES = {
         r"sim10.lh5: sampled every 10 ns, but data.lh5 every 16 ns; resample one of them",
     ),
     # selection
+    "a negative seed": Mistake(
+        f"{SIMULATE} --seed=-1", r"--seed: -1 is not from 0 to 4294967295"
+    ),
     "unknown peak": Mistake(f"{TRAIN} --peak TEP", r".*'TEP' is no known peak .*FEP.*"),
     "constant pulses": Mistake(
         f"{TRAIN} --data constant.lh5", r"constant.lh5: .*constant.*; .*"

@@ -44,6 +44,7 @@ from cpunet.pulses.loading import load_simulated
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+from cpunet.settings import require_seed
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.settings import SimulationSettings
@@ -145,7 +146,7 @@ def calibrate(
         refuse_existing(Path(out), *inputs, force=force)
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
-    job = _Job(*files, settings, Freedom.of(free, fix, prior), peak, events, seed)
+    job = _Job(*files, settings, Freedom.of(free, fix, prior), peak, events, require_seed(seed))
     if plan:
         planned = job.plan()
         if out is not None:

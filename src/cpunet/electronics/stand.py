@@ -25,7 +25,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.settings import Set, checked, read_json, read_settings
+from cpunet.settings import Set, checked, read_json, read_settings, require_seed
 from cpunet.simulation.energy_windows import wanted_events
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
@@ -211,7 +211,7 @@ def make_stand(
         wanted_events(events, load_recipe("fast").peaks, physics.window_kev),
         shift=Shift.of(shift) if shift else None,
         settings=physics,
-        seed=seed,
+        seed=require_seed(seed),
     )
     return write_stand(plan, Path(out), force=force)
 

@@ -21,7 +21,7 @@ from cpunet.progress import stage
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.settings import Set, read_settings
+from cpunet.settings import Set, read_settings, require_seed
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.energy_windows import Window, energy_windows, wanted_events
 from cpunet.simulation.events import EventPulses, simulate_events
@@ -166,6 +166,7 @@ def simulate(
 
     cpunet simulate --detector V01.yaml --hits stp.lh5 --flip-z --out sim.lh5
     """
+    require_seed(seed)
     out = Path(out)
     of_detector, of_settings = split_overrides(settings)
     files = [f for f in (detector, settings_file) if isinstance(f, str | Path)]

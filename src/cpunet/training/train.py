@@ -26,6 +26,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+from cpunet.settings import require_seed
 from cpunet.training.chain import train_chain
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.checkpoints import unfinished_folder, unfinished_name
@@ -110,8 +111,7 @@ def train(
     target = None if out is None else Path(out)
     if target is not None and not isinstance(recipe, Recipe):
         refuse_inputs(target, recipe)
-    if not 0 <= seed < 2**32:
-        raise CpunetError(f"`seed`: {seed} is not from 0 to {2**32 - 1}")
+    require_seed(seed)
     chosen, device = load_recipe(recipe, settings), resolve_device(device)
     sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
 

@@ -12,6 +12,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside
 from cpunet.pulses.channels import ALL, Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, as_run
 from cpunet.validation.compare import compared
 from cpunet.validation.report import REPORT, Report
@@ -85,7 +86,12 @@ def validate(
     if max_pulses < 100:
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
     sim, data = pulse_file(sim, read.sim), pulse_file(data, read.data)
-    how = {"baselines": baselines, "max_pulses": max_pulses, "seed": seed, "device": device}
+    how = {
+        "baselines": baselines,
+        "max_pulses": max_pulses,
+        "seed": require_seed(seed),
+        "device": device,
+    }
     how["truth"] = None if truth is None else Path(truth)
     folder = None if out is None else Path(out)
     if data.table == ALL:
