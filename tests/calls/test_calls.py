@@ -314,6 +314,6 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     report.save(tmp_path / "report")
     again = cpunet.load(tmp_path / "report")
     assert again.verdicts == report.verdicts
-    assert len(cpunet.compare(tmp_path / "report", again).table)
+    assert len(cpunet.compare(tmp_path / "report", again).metrics) == 2
     for shown in (sim, run, like_data, report, cpunet.info(tmp_path / "run")):
         assert "\n" not in repr(shown)
