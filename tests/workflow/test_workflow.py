@@ -246,7 +246,7 @@ def test_a_failure_stops_no_other_detector(place):
     commands = [call[0] for call in calls]
     assert commands[0] == "demo"
     assert sorted(commands) == sorted(
-        ["demo", "fields", "simulate", "train", "train", "translate", "validate"]
+        ["demo", "info", "simulate", "train", "train", "translate", "validate"]
     )
     require_configured_words(calls)
     results = place.folder / "all results"

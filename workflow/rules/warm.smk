@@ -31,14 +31,12 @@ rule warm:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
         runtime=30,
     params:
-        # whatever is compiled takes part in a small demonstration
-        demo="--events FEP=400,SEP=60,DEP=60 --set training.steps=1"
-        " --set training.start_factors=[1.0] --set scores.bootstraps=20",
-        # and dspeed's chain, if events are to go through it
+        # whatever is compiled takes part in the demonstration, and dspeed's chain, if events are
+        # to go through it
         events=dsp_of_a_demo,
     shell:
         "(folder=$(mktemp -d); trap 'rm -rf \"$folder\"' EXIT;"
-        ' cpunet demo {params.demo} --device cpu --out "$folder/demo"{params.events})'
+        ' cpunet demo --quick --out "$folder/demo"{params.events})'
         " > {log:q} 2>&1"
 
 
