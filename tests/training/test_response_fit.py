@@ -228,7 +228,7 @@ def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> 
 def test_a_ringing_is_found_where_there_is_one() -> None:
     ringing = {"frequency_MHz": 6.0, "fraction": 0.25, "damping_ns": 160.0}
     chain = Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing})
-    rings = measured_with(chain)
+    rings = Problem(*measured_with(chain))
     response, fit = rings.fit(0, "training.start_factors=[1]")
     numbers, errors = response.describe(), fit.errors
     assert fit.chi_square < GOOD_FIT * fit.moments
@@ -251,7 +251,9 @@ def test_a_fast_decay_gets_a_time_of_its_own() -> None:
     A ringing would imitate it, if the fit from the fixed ones were left with that.
     """
     decays = [{"fraction": 0.95, "tau_us": 54.6}, {"fraction": 0.05, "tau_us": 2.9}]
-    fast = measured_with(CHAIN.model_validate(CHAIN.model_dump() | {"decays": decays}))
+    fast = Problem(
+        *measured_with(CHAIN.model_validate(CHAIN.model_dump() | {"decays": decays}))
+    )
     fixed = "generator.fast_decays_us=[4, 16]"
     response, fit = fast.fit(0, fixed, "training.start_factors=[1]")
     assert response.config.free_decays
