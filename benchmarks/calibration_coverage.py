@@ -28,7 +28,7 @@ from cpunet.calibration.search import Search
 from cpunet.calibration.titles import titled
 from cpunet.electronics.measured_noise import measured_noise
 from cpunet.plotting import styled
-from cpunet.pulses.loading import load_measured, load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
@@ -106,8 +106,8 @@ def experiments(
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
     files = [PulseFile(stand / f"{name}.lh5") for name in ("sim", "data")]
-    sim = load_simulated(files[0], recipe, selection).prepared
-    data = load_measured(files[1], recipe, selection).prepared
+    sim = load_pulses(files[0], "simulated", recipe, selection).prepared
+    data = load_pulses(files[1], "measured", recipe, selection).prepared
     noise, _ = measured_noise(files[1], data.pulses, recipe.preparation)
     stored = StoredSimulation.read(files[0].path)
     physics = Physics(stored.detector, stored.settings, nuisances)

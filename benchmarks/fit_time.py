@@ -19,7 +19,7 @@ import numpy as np
 
 from cpunet.electronics.measured_noise import measured_noise
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.loading import load_measured, load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
@@ -37,8 +37,8 @@ def one(stand: Path, n: int) -> dict[str, float]:
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
     files = [PulseFile(stand / f"{side}.lh5") for side in ("sim", "data")]
-    sim = load_simulated(files[0], recipe, selection).prepared.pulses
-    data = load_measured(files[1], recipe, selection).prepared.pulses
+    sim = load_pulses(files[0], "simulated", recipe, selection).prepared.pulses
+    data = load_pulses(files[1], "measured", recipe, selection).prepared.pulses
     noise, _ = measured_noise(files[1], data, recipe.preparation)
     sides = first(sim, n), first(data, n)
     loaded = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

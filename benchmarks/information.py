@@ -24,7 +24,7 @@ from cpunet.electronics.finishing import finish
 from cpunet.electronics.measured_noise import measured_noise
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.loading import load_measured, load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import prepare
@@ -188,8 +188,8 @@ def main() -> None:
         return
     files = [PulseFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
     selection = parse_selection("FEP", RECIPE.peaks)
-    sim = load_simulated(files[0], RECIPE, selection).prepared.pulses
-    data = load_measured(files[1], RECIPE, selection).prepared.pulses
+    sim = load_pulses(files[0], "simulated", RECIPE, selection).prepared.pulses
+    data = load_pulses(files[1], "measured", RECIPE, selection).prepared.pulses
     noise, _ = measured_noise(files[1], data, RECIPE.preparation)
     if arguments.chain is not None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)

@@ -166,7 +166,7 @@ def test_an_input_is_refused(tmp_path, monkeypatch, out, given, told):
     (tmp_path / "linked.lh5").symlink_to("data/raw.lh5")
     os.link("data/raw.lh5", "hard.lh5")
     (tmp_path / "elsewhere").symlink_to("data")
-    with pytest.raises(CpunetError, match=f"^{out}: {told}.*; choose another --out$"):
+    with pytest.raises(CpunetError, match=f"^{out}: {told}.*; choose another `out`$"):
         refuse_existing(Path(out), None, given, force=True)
 
 
@@ -184,7 +184,7 @@ def test_a_folder_is_replaced_only_with_force(tmp_path):
     run = tmp_path / "run"
     make(run, run_json="old", log__a="old")
     with (
-        pytest.raises(CpunetError, match="exists already; choose another name or give --force"),
+        pytest.raises(CpunetError, match="exists already; choose another name or give `force`"),
         folder_written_aside(run, RUN),
     ):
         pytest.fail("entered")
@@ -223,7 +223,7 @@ def test_other_folders_are_not_replaced(tmp_path):
     (tmp_path / "file").touch()
     for other in (target, tmp_path / "report", tmp_path / "file"):
         with pytest.raises(
-            CpunetError, match="is no folder that cpunet train made, so --force"
+            CpunetError, match="is no folder that cpunet train made, so `force`"
         ):
             make(other, run_json="new")
     assert tree(target) == {"thesis.tex": ""}

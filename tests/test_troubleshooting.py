@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from cpunet.cli import with_options
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
 QUOTED = re.findall(r"^\| `(.+?)` \|", PAGE.read_text(), re.MULTILINE)
@@ -25,10 +27,12 @@ def text_of(node: ast.AST) -> str:
 
 @pytest.fixture(scope="module")
 def messages() -> str:
-    """All texts of the package."""
+    """All texts of the package, as the command line shows them."""
     paths = sorted((ROOT / "src").rglob("*.py"))
-    return "\n".join(
-        text_of(node) for path in paths for node in ast.walk(ast.parse(path.read_text()))
+    return with_options(
+        "\n".join(
+            text_of(node) for path in paths for node in ast.walk(ast.parse(path.read_text()))
+        )
     )
 
 

@@ -2,7 +2,8 @@
 
 Data flow in one direction through its subpackages: ``pulses`` → ``simulation`` →
 ``electronics`` → ``networks`` → ``training`` → ``calibration`` → ``translation`` →
-``validation`` → ``jobs`` → ``cli``.  See ``docs/design.md``.
+``validation`` → ``legend``; the command line is made of their public functions.  See
+``docs/design.md``.
 """
 
 from __future__ import annotations

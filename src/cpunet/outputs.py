@@ -65,18 +65,18 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
     for source in (found for given in inputs for found in _named(given)):
         real = source.resolve()
         if _same(place, real):
-            raise CpunetError(f"{out}: is the input; choose another --out")
+            raise CpunetError(f"{out}: is the input; choose another `out`")
         if any(_same(place, above) for above in real.parents):
-            raise CpunetError(f"{out}: holds the input {source}; choose another --out")
+            raise CpunetError(f"{out}: holds the input {source}; choose another `out`")
         if any(_same(above, real) for above in place.parents):
-            raise CpunetError(f"{out}: lies in the input {source}; choose another --out")
+            raise CpunetError(f"{out}: lies in the input {source}; choose another `out`")
 
 
 def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
     """Raise a `CpunetError` if `target` exists and `force` is off, or like `refuse_inputs`."""
     refuse_inputs(target, *inputs)
     if target.exists() and not force:
-        raise CpunetError(f"{target}: exists already; choose another name or give --force")
+        raise CpunetError(f"{target}: exists already; choose another name or give `force`")
 
 
 def require_kind(target: Path, kind: FolderKind) -> None:
@@ -84,7 +84,7 @@ def require_kind(target: Path, kind: FolderKind) -> None:
     empty = target.is_dir() and not any(target.iterdir())
     if target.exists() and not (empty or made_here(target, kind)):
         raise CpunetError(
-            f"{target}: is no folder that {kind.command} made, so --force does not replace it; "
+            f"{target}: is no folder that {kind.command} made, so `force` does not replace it; "
             "choose another name"
         )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.pulses.loading import load_measured, load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
@@ -31,8 +31,8 @@ def made(command, tmp_path: Path) -> Path:
 def test_the_folder_is_read_and_prepared(made: Path):
     recipe = load_recipe("fast")
     chosen = parse_selection("FEP,DEP", recipe.peaks)
-    sim = load_simulated(PulseFile(made / "sim.lh5"), recipe, chosen)
-    data = load_measured(PulseFile(made / "data.lh5"), recipe, chosen)
+    sim = load_pulses(PulseFile(made / "sim.lh5"), "simulated", recipe, chosen)
+    data = load_pulses(PulseFile(made / "data.lh5"), "measured", recipe, chosen)
     assert len(sim.prepared) > 20
     assert len(data.prepared) > 10
     truth = prepared_truth(made / "truth.npz", sim, recipe.preparation)

@@ -13,7 +13,7 @@ from lgdo import Array, Table, VectorOfVectors, WaveformTable
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.doubts import apart, go_down, second_rate
-from cpunet.pulses.loading import load_measured
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
@@ -51,7 +51,7 @@ def test_the_polarity_is_the_reason_and_not_the_energies(tmp_path):
     assert not go_down(traces(energies).astype(np.float32))
     file = written(tmp_path / "down.lh5", traces(energies, sign=-1), energies)
     with pytest.raises(CpunetError, match="polarity is negative; turn them round"):
-        load_measured(file, RECIPE, FEP)
+        load_pulses(file, "measured", RECIPE, FEP)
 
 
 @pytest.mark.parametrize("resolution", [0.0, 0.02])
@@ -68,8 +68,8 @@ def test_energies_of_other_pulses_are_refused_unless_one_insists(tmp_path):
     energies = kev()
     file = written(tmp_path / "other.lh5", traces(energies), np.roll(energies, 1))
     with pytest.raises(CpunetError, match=r"% of amplitudes and energies do not go together"):
-        load_measured(file, RECIPE, FEP)
-    load_measured(PulseFile(file.path, insist=True), RECIPE, FEP)
+        load_pulses(file, "measured", RECIPE, FEP)
+    load_pulses(PulseFile(file.path, insist=True), "measured", RECIPE, FEP)
 
 
 @pytest.mark.parametrize("averaged", [2, 4])
@@ -88,7 +88,8 @@ def test_a_second_rate_is_found_at_its_sample(averaged):
 def test_a_second_rate_is_told_when_a_file_is_read(tmp_path, caplog):
     energies, fine = kev(), traces(kev(), 1000 + 4 * 500)
     both = np.concatenate([fine[:, :1000], fine[:, 1000:].reshape(N, 500, 4).mean(2)], axis=1)
-    load_measured(written(tmp_path / "two.lh5", np.rint(both), energies), RECIPE, FEP)
+    file = written(tmp_path / "two.lh5", np.rint(both), energies)
+    load_pulses(file, "measured", RECIPE, FEP)
     assert any("a second rate" in message for message in caplog.messages)
 
 
@@ -156,6 +157,6 @@ def test_arrays_that_could_be_traces_are_named(tmp_path):
     with h5py.File(tmp_path / "dsp.lh5", "w") as file:
         file["ch1/dsp/blsub"] = np.zeros((3, 50))
     with pytest.raises(
-        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*--table"
+        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*`table`"
     ):
         open_pulses(tmp_path / "dsp.lh5")

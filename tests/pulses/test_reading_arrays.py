@@ -124,7 +124,7 @@ def test_a_choice_between_groups(tmp_path):
 def test_npy_needs_the_period(tmp_path):
     path = tmp_path / "pulses.npy"
     np.save(path, VALUES)
-    with pytest.raises(CpunetError, match="period is not in the file; give --dt-ns"):
+    with pytest.raises(CpunetError, match="period is not in the file; give `dt_ns`"):
         open_pulses(path)
     np.testing.assert_array_equal(open_pulses(path, dt_ns=8).read().waveforms, VALUES)
     for dt_ns in (0, -1, np.nan):

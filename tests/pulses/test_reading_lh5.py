@@ -76,7 +76,7 @@ def test_the_units_of_the_energy_count(file, raw, units, factor):
     np.testing.assert_allclose(
         open_pulses(file).read().energy_kev, factor * np.linspace(1, 2, N)
     )
-    with pytest.raises(CpunetError, match=rf"in {units} already; drop --kev-per-adc"):
+    with pytest.raises(CpunetError, match=rf"in {units} already; drop `kev_per_adc`"):
         open_pulses(file, kev_per_adc=0.1)
 
 
@@ -92,7 +92,7 @@ def test_a_column_in_adc_is_no_energy_unless_calibrated(file, raw):
     calibrated = open_pulses(file, kev_per_adc=0.5).read().energy_kev
     np.testing.assert_array_equal(calibrated, 0.5 * np.arange(N))
     for name, units in (("energy", "in ADC"), ("trapE", "without units")):
-        with pytest.raises(CpunetError, match=rf"column {name} is {units}.*--kev-per-adc"):
+        with pytest.raises(CpunetError, match=rf"column {name} is {units}.*`kev_per_adc`"):
             open_pulses(file, energy=name)
     named = open_pulses(file, energy="trapE", kev_per_adc=2.0).read().energy_kev
     np.testing.assert_array_equal(named, 2.0 * (np.arange(N) + 1))
@@ -130,7 +130,7 @@ def test_several_tables_need_a_choice(file, raw):
     for channel in range(9):
         table = Table(col_dict={"waveform": waveform_table(raw + np.uint16(channel))})
         lh5.write(table, "raw", file, group=f"ch{channel}")
-    message = r"9 tables of waveforms \(ch0/raw, .*ch5/raw and 3 more\).*--table"
+    message = r"9 tables of waveforms \(ch0/raw, .*ch5/raw and 3 more\).*`table`"
     with pytest.raises(CpunetError, match=message):
         open_pulses(file)
     with pytest.raises(CpunetError, match=r"no table ch11/raw; there are ch0/raw"):
@@ -208,13 +208,13 @@ def test_a_period_that_is_no_period_is_refused(file, raw, dt):
 def test_the_users_period_must_agree(file, raw):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
-    with pytest.raises(CpunetError, match=r"every 16 ns, but --dt-ns says 10; drop"):
+    with pytest.raises(CpunetError, match=r"every 16 ns, but `dt_ns` says 10; drop"):
         open_pulses(file, dt_ns=10)
 
 
 def test_a_period_without_units_needs_the_user(file, raw):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw, 16.0, "")}), "raw", file)
-    with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give --dt-ns"):
+    with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give `dt_ns`"):
         open_pulses(file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
 

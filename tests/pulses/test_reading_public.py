@@ -88,12 +88,12 @@ def test_all_detectors_and_files_without_labels(tmp_path):
 def test_what_is_wrong_with_a_majorana_file(tmp_path):
     file = tmp_path / "MJD_Test_0.hdf5"
     write_majorana(file, 6, length=40)
-    with pytest.raises(CpunetError, match=r"2 detectors \(5, 9\); choose one with --table"):
+    with pytest.raises(CpunetError, match=r"2 detectors \(5, 9\); choose one with `table`"):
         open_pulses(file, dt_ns=10)
     with pytest.raises(CpunetError, match=r"no detector 7; there are 5, 9$"):
         open_pulses(file, table="7", dt_ns=10)
     with pytest.raises(
-        CpunetError, match=r"not in the file; give --dt-ns \(the Majorana.*10\)"
+        CpunetError, match=r"not in the file; give `dt_ns` \(the Majorana.*10\)"
     ):
         open_pulses(file, table="5")
     with h5py.File(file, "r+") as content:  # then it is any HDF5 file
@@ -148,9 +148,9 @@ def test_a_pickle_of_the_oldest_kind_and_numbered_events(tmp_path):
 DEFECTS = {
     "no period": (
         {"dt_ns": None},
-        r"give --dt-ns \(CPU-Net's pulses are sampled every 16 ns\)",
+        r"give `dt_ns` \(CPU-Net's pulses are sampled every 16 ns\)",
     ),
-    "a table": ({"table": "x"}, r"has no tables; leave out --table"),
+    "a table": ({"table": "x"}, r"has no tables; leave out `table`"),
     "no pulse": ({"then": 5}, r"entry 3 is no pulse \(no dictionary with wf\)"),
     "no numbers": (
         {"then": {"wf": np.zeros(40), "energy": "much"}},

@@ -25,7 +25,7 @@ def spectrum(rows: np.ndarray) -> bytes:
 def test_a_spectrum_is_a_pulse(tmp_path):
     path = tmp_path / "pulse.spe"
     path.write_bytes(spectrum(PULSE[np.newaxis]))
-    with pytest.raises(CpunetError, match="give --dt-ns"):
+    with pytest.raises(CpunetError, match="give `dt_ns`"):
         open_pulses(path)
     source = open_pulses(path, dt_ns=1)
     assert (source.n_pulses, source.length, source.dt_ns) == (1, 50, 1)
@@ -55,7 +55,7 @@ def test_time_and_value(tmp_path):
     source = open_pulses(path)
     assert source.dt_ns == pytest.approx(1.6, rel=1e-3)
     np.testing.assert_allclose(source.read().waveforms[0], PULSE, atol=0.01)
-    with pytest.raises(CpunetError, match="drop --dt-ns"):
+    with pytest.raises(CpunetError, match="drop `dt_ns`"):
         open_pulses(path, dt_ns=16)
 
 

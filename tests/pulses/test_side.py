@@ -88,7 +88,7 @@ def test_a_guess_can_be_overruled_and_a_record_cannot(tmp_path):
     assert str(refused.value) == (
         f"{tmp_path / 'looks.lh5'}: given as simulated pulses, but these look measured (whole "
         "numbers with noise before the pulse); swap them; if they are simulated, say so with "
-        "--insist"
+        "`insist`"
     )
     says = source_of(tmp_path / "says.lh5", adc(charge()), made_by="cpunet simulate 0.1.0")
     require_side(says, "simulated", "swap them", insist=False)

@@ -14,7 +14,7 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.legend.make_library import make_library
-from cpunet.pulses.loading import load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
@@ -74,7 +74,7 @@ def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     assert summary.hits < summary.hits_before_merging
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
-    used = load_simulated(PulseFile(out), recipe, selection).prepared
+    used = load_pulses(PulseFile(out), "simulated", recipe, selection).prepared
     assert len(used) >= summary.lines["FEP"] > 10
     pulses = next(open_pulses(out).blocks())
     assert pulses.waveforms.shape == (summary.n_written, 100)

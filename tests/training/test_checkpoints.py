@@ -141,7 +141,7 @@ def test_a_damaged_checkpoint_is_told(tmp_path, content):
     kept(tmp_path)
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-200] if content is None else content)
-    with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with --force"):
+    with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with `force`"):
         unfinished(tmp_path).begin(resume=True)
 
 
@@ -332,7 +332,7 @@ def test_a_training_that_cannot_be_put_in_place_is_kept(tmp_path):
         out.mkdir()  # someone else's
 
     with (
-        pytest.raises(CpunetError, match="finish it with --resume"),
+        pytest.raises(CpunetError, match="finish it with `resume`"),
         unfinished_folder(out) as folder,
     ):
         end(folder)

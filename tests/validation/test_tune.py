@@ -12,7 +12,7 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.pulses.loading import load_measured, load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -53,8 +53,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:
     selection = parse_selection("FEP", recipe.peaks)
-    sim = load_simulated(files.sim, recipe, selection)
-    data = load_measured(files.data, recipe, selection)
+    sim = load_pulses(files.sim, "simulated", recipe, selection)
+    data = load_pulses(files.data, "measured", recipe, selection)
     return HeldOut.of(sim, data, files.data, recipe, seed)
 
 

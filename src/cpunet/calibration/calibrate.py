@@ -40,7 +40,7 @@ from cpunet.memory import keep_freed_memory
 from cpunet.outputs import folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.channels import ALL
-from cpunet.pulses.loading import load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -183,7 +183,7 @@ class _Job:
         for note in content["notes"]:
             log.info(titled(note))
         _simulate_calibrated(calibrated, sides, folder, self.seed)
-        again = load_simulated(PulseFile(folder / SIM), self.recipe, sides.selection)
+        again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, sides.selection)
         # not stretched: what is off in the drift is for the physics to explain
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
         recipe = self.recipe.model_copy(update={"training": training})

@@ -14,8 +14,7 @@ from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, n
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import (
     InputSet,
-    load_measured,
-    load_simulated,
+    load_pulses,
     require_both_sides,
     require_same_sampling,
 )
@@ -135,9 +134,9 @@ def read_sides(
         If an input cannot be used.
     """
     selection = parse_selection(peak, recipe.peaks)
-    data = load_measured(data_file, recipe, selection)
+    data = load_pulses(data_file, "measured", recipe, selection)
     stored = StoredSimulation.read(sim.path)
-    simulated = load_simulated(sim, recipe, selection)
+    simulated = load_pulses(sim, "simulated", recipe, selection)
     require_same_sampling(simulated, data)
     for note in require_both_sides(simulated, data, selection):
         log.warning(note)

@@ -284,7 +284,7 @@ class JointProblem:
             told = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
             raise CpunetError(
                 f"with these physics {len(pulses) - len(prepared)} of {len(pulses)} events "
-                f"give no pulse ({told}); narrow the --prior of what is free"
+                f"give no pulse ({told}); narrow the `prior` of what is free"
             )
         return prepared.pulses
 

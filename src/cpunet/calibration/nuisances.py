@@ -251,7 +251,7 @@ class Physics:
             why = error.errors()[0]["msg"].removeprefix("Value error, ")
             raise CpunetError(
                 f"detector {self.detector.name}: with {told} there can be none ({why}); "
-                "narrow a --prior, or --fix one of them"
+                "narrow a `prior`, or `fix` one of them"
             ) from error
 
     def of(self, nuisances: Sequence[Nuisance]) -> Physics:

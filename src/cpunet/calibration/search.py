@@ -241,7 +241,7 @@ class Search:
         else:
             raise CpunetError(
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
-                "that cannot be simulated; narrow a --prior, or --fix a parameter"
+                "that cannot be simulated; narrow a `prior`, or `fix` a parameter"
             )
         outdated = there.outdated(free, farthest / FARTHEST)
         return there.again(outdated) if outdated else there

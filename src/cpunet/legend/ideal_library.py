@@ -75,7 +75,7 @@ class IdealLibrary:
             raise CpunetError(
                 f"{where}: sampled every {dt_ns:g} ns, production reads templates of 1 ns; "
                 "make the library with a period of 1 ns (`cpunet library translate` without "
-                "--format simflow takes any)"
+                "`format` simflow takes any)"
             )
         names = sorted(filter(WAVEFORM.fullmatch, group))
         angles = tuple(name.removeprefix("waveform_") for name in names)
@@ -142,7 +142,7 @@ def chosen_libraries(
     if known not in there:
         raise CpunetError(
             f"{source}: a library of {held}, but the run was trained with a simulation of "
-            f"{known}; give the library of {known}, or --detector {there[0]} to use this one "
+            f"{known}; give the library of {known}, or `detector` {there[0]} to use this one "
             "all the same"
         )
     return [known]

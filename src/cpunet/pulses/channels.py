@@ -63,7 +63,7 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     if not tables:
         raise CpunetError(
             f"{file.path}: holds no tables of waveforms of which to take all; leave out "
-            f"--data-table {ALL} or --table {ALL}"
+            f"`data_table` {ALL} or `table` {ALL}"
         )
     energy = file.energy or ""
     if ":" in energy and CHANNEL not in energy and len(tables) > 1:
@@ -114,17 +114,6 @@ class Outcome(Generic[R]):
         width = max(map(len, lines), default=0)
         return "\n".join(f"{name:<{width}}  {line}" for name, line in lines.items())
 
-    def require_all(self, out: Path) -> None:
-        """Raise a `CpunetError` with the number of failed channels, if any failed."""
-        if not self.failed:
-            return
-        n = len(self.done) + len(self.failed)
-        name, reason = next(iter(self.failed.items()))
-        others = f"; the others are in {out}" if self.done else ""
-        raise CpunetError(
-            f"{len(self.failed)} of {n} channels failed, the first: {name}: {reason}{others}"
-        )
-
 
 def one_by_one(
     channels: Mapping[str, Pair | CpunetError],
@@ -149,7 +138,7 @@ def one_by_one(
     """
     if out.is_file() or (out / MARKER).exists():
         raise CpunetError(
-            f"{out}: is the output of one channel; choose another --out for the folders of "
+            f"{out}: is the output of one channel; choose another `out` for the folders of "
             f"{len(channels)}"
         )
     outcome: Outcome[R] = Outcome()

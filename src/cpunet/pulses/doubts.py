@@ -13,7 +13,9 @@ Values = npt.NDArray[np.float64]
 Traces = npt.NDArray[np.float32]
 
 LOW_KEV = 300.0  # at lower energies, noise can be a good part of an amplitude
-APART = 0.1  # relative deviation from the common gain of what does not go together
+# Relative deviation from the common gain of what does not go together, and share of pulses up
+# to which amplitudes may differ as much and yet be all alike.
+APART, ALIKE = 0.1, 0.1
 MIN_PULSES = 30
 # Samples over which noise is averaged, least part of the tail on either side of a change of
 # rate, and least factors by which noise and slope change there.
@@ -39,7 +41,7 @@ def apart(kev: Values, amplitudes: Values) -> float:
         usable = (kev > LOW_KEV) & (amplitudes > 0)
     if usable.sum() < MIN_PULSES:
         return 0.0
-    if _far_from_median(amplitudes[usable]) < APART:
+    if _far_from_median(amplitudes[usable]) < ALIKE:
         return 0.0
     return _far_from_median(amplitudes[usable] / kev[usable])
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
-from cpunet.pulses.doubts import apart, second_rate
+from cpunet.pulses.doubts import apart, go_down, second_rate
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.reading.energies import amplitude
@@ -121,31 +121,76 @@ class InputSet:
         return self.provenance().model_dump(include={"dt_ns", "used", "sha256"})
 
 
-def load_simulated(
+def load_pulses(
     file: PulseFile,
+    side: Kind,
     recipe: Recipe,
     selection: EnergySelection,
     *,
     most: int | None = None,
     tell: bool = True,
 ) -> InputSet:
-    """Read and prepare the selected simulated pulses of a file, or a sample of `most`.
+    """Read and prepare the selected pulses of a file; measured ones have their quality cuts.
 
-    Without `tell` the log does not say what was found.
+    Parameters
+    ----------
+    file, side
+        File of pulses, and whether they are simulated or measured.
+    recipe
+        Recipe with the preparation, the cuts and the peaks.
+    selection
+        Energies to use.
+    most
+        Use a sample of so many pulses, if there are more.
+    tell
+        Whether the log says what was found.
+
+    Raises
+    ------
+    CpunetError
+        If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
-    return _load(file, "simulated", recipe, selection, most, tell=tell)
-
-
-def load_measured(
-    file: PulseFile,
-    recipe: Recipe,
-    selection: EnergySelection,
-    *,
-    most: int | None = None,
-    tell: bool = True,
-) -> InputSet:
-    """Like `load_simulated`, of measured pulses, with their quality cuts."""
-    return _load(file, "measured", recipe, selection, most, tell=tell)
+    source = file.open()
+    require_side(source, side, "are `sim` and `data` swapped?", insist=file.insist)
+    watched = _Watched(source)
+    try:
+        prepared = load_prepared(
+            watched,
+            recipe.preparation,
+            side,
+            select=selection.select,
+            peaks=lambda energies: label_peaks(energies, recipe.peaks),
+            most=most,
+        )
+    except CpunetError as error:
+        explained = watched.explained(error, selection)
+        if explained is error:
+            raise
+        raise explained from error
+    cuts = None
+    if side == "measured":
+        watched.require_sense(insist=file.insist)
+        cuts = fit_cuts(prepared, recipe.cuts)
+        prepared = apply_cuts(prepared, cuts)
+        if not len(prepared):
+            raise CpunetError(
+                f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
+            )
+    elif tell and _decays(prepared, recipe):
+        log.warning(
+            f"{file.path.name}: these pulses decay; "
+            "are they simulated ones, without electronics?"
+        )
+    rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+    if tell:
+        log.info(
+            f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
+            + (f" (left out: {rejected})" if rejected else "")
+        )
+    return InputSet(
+        prepared, source.dt_ns, file.path, watched.energies_kev, cuts, file.options,
+        recorded_detector(source),
+    )  # fmt: skip
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
@@ -168,14 +213,14 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         if max(counts) == 0:
             raise CpunetError(
                 f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
-                "leave it out of --peak",
+                "leave it out of `peak`",
             )
         if min(counts) == 0:
             missing, there = (sim, data) if counts[0] == 0 else (data, sim)
             raise CpunetError(
                 f"{missing.path}: no pulse of {part.name} can be used, {there.path.name} has "
                 f"{max(counts)}",
-                "leave it out of --peak, or give a file that has them",
+                "leave it out of `peak`, or give a file that has them",
             )
     lines = selection.lines_in_ranges
     if not lines:
@@ -211,6 +256,28 @@ class _Watched:
                 self._first = block.waveforms[:LOOKED_AT]
             yield block
 
+    @property
+    def energies_kev(self) -> Energies:
+        """The known energies."""
+        kev: Energies = np.concatenate([np.empty(0), *self._kev])
+        return kev[np.isfinite(kev)]
+
+    def explained(self, error: CpunetError, selection: EnergySelection) -> CpunetError:
+        """Why no pulse can be used, if what was read tells: polarity, energies, calibration."""
+        if self._first is not None and go_down(self._first):
+            return CpunetError(
+                f"{self.path}: the traces go down: their polarity is negative",
+                "turn them round, as by pulses.with_waveforms(-pulses.waveforms) in Python",
+            )
+        known = self.energies_kev
+        if len(known):
+            none = not selection.select(known).any()
+            return CpunetError(f"{error}{_where_energies_are(known)}") if none else error
+        found = suggested_calibration(np.concatenate([np.empty(0), *self._amplitudes]))
+        if found is None:
+            return error
+        return CpunetError(f"{error}; their amplitudes look like {found}")
+
     def require_sense(self, *, insist: bool) -> None:
         """Refuse energies that are of other pulses; warn of a second rate."""
         if insist or self._first is None:
@@ -228,90 +295,19 @@ class _Watched:
             log.warning(f"{self.path}: {found}; cut the traces there, or resample them")
 
 
-def _load(
-    file: PulseFile,
-    side: Kind,
-    recipe: Recipe,
-    selection: EnergySelection,
-    most: int | None,
-    *,
-    tell: bool,
-) -> InputSet:
-    source = file.open()
-    require_side(source, side, "are --sim and --data swapped?", insist=file.insist)
-    watched = _Watched(source)
-    seen: list[Energies] = []
-
-    def select(energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        seen.append(np.array(energy_kev, float))
-        return selection.select(energy_kev)
-
-    try:
-        prepared = load_prepared(
-            watched,
-            recipe.preparation,
-            side,
-            select=select,
-            peaks=lambda energies: label_peaks(energies, recipe.peaks),
-            most=most,
-        )
-    except CpunetError as error:
-        hint = _where_energies_are(seen, selection) or _likely_calibration(source, seen)
-        if not hint:
-            raise
-        raise CpunetError(f"{error}{hint}") from error
-    cuts = None
-    if side == "measured":
-        watched.require_sense(insist=file.insist)
-        cuts = fit_cuts(prepared, recipe.cuts)
-        prepared = apply_cuts(prepared, cuts)
-        if not len(prepared):
-            raise CpunetError(
-                f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
-            )
-    elif tell and _decays(prepared, recipe):
-        log.warning(
-            f"{file.path.name}: these pulses decay; "
-            "are they simulated ones, without electronics?"
-        )
-    rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
-    if tell:
-        log.info(
-            f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
-            + (f" (left out: {rejected})" if rejected else "")
-        )
-    return InputSet(
-        prepared, source.dt_ns, file.path, np.concatenate(seen), cuts, file.options,
-        recorded_detector(source),
-    )  # fmt: skip
-
-
-def _where_energies_are(seen: list[Energies], selection: EnergySelection) -> str:
-    """Hint on the range of energies in the file if none of them is selected."""
-    energies = np.concatenate(seen) if seen else np.empty(0)
-    if not len(energies) or selection.select(energies).any():
-        return ""
+def _where_energies_are(energies: Energies) -> str:
+    """Hint on the range of energies in a file of which none is selected."""
     low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
     there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
     if high > MAX_KEV:
-        return f"{there}: if these are ADC counts, give --kev-per-adc"
+        return f"{there}: if these are ADC counts, give `kev_per_adc`"
     if 0 < high < MIN_KEV:
-        return f"{there}: if these are MeV, give --kev-per-adc 1000"
+        return f"{there}: if these are MeV, give `kev_per_adc` 1000"
     from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
     n = int((energies >= from_kev).sum())
     if not n:
         return there
-    return f"{there}; --peak {from_kev:.0f}- takes {n} pulses"
-
-
-def _likely_calibration(source: PulseSource, seen: list[Energies]) -> str:
-    """Hint on the calibration from lines in the amplitudes, if no energy is known."""
-    if any(map(len, seen)):
-        return ""
-    found = suggested_calibration(
-        np.concatenate([amplitude(block.waveforms) for block in source.blocks()])
-    )
-    return "" if found is None else f"; their amplitudes look like {found}"
+    return f"{there}; `peak` {from_kev:.0f}- takes {n} pulses"
 
 
 def _decays(prepared: Prepared, recipe: Recipe) -> bool:

@@ -17,13 +17,11 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.doubts import go_down
 from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 # Traces per block: 20 to 130 MB for the record lengths in use.
 BLOCK_SIZE = 4096
-_LOOKED_AT = 256  # traces that show the polarity
 FEW = 10  # pulses of the wanted energies whose rejection is a reason
 
 Select = Callable[[FloatColumn], npt.NDArray[np.bool_]]
@@ -39,8 +37,8 @@ _REMEDIES = {
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
     Rejection.ENERGY_UNKNOWN: (
-        "name the column of their calibrated energies (--energy, --data-energy), or give "
-        "--kev-per-adc"
+        "name the column of their calibrated energies (`energy`, `data_energy`), or give "
+        "`kev_per_adc`"
     ),
     Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
 }
@@ -175,12 +173,6 @@ def _prepare_selected(
 
 
 def _nothing_left(source: Source, sets: list[Prepared]) -> CpunetError:
-    first = next(iter(source.blocks(_LOOKED_AT)), None)
-    if first is not None and go_down(first.waveforms):
-        return CpunetError(
-            f"{source.path}: the traces go down: their polarity is negative",
-            "turn them round, as by pulses.with_waveforms(-pulses.waveforms) in Python",
-        )
     codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
     if not len(codes):
         return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")

@@ -72,7 +72,7 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
         found = apparent_side(next(iter(source.blocks(_LOOKED_AT))).waveforms)
     if found is not None and found.side != wanted:
         begin = " If" if remedy.endswith("?") else "; if"
-        sure = "" if found.certain else f"{begin} they are {wanted}, say so with --insist"
+        sure = "" if found.certain else f"{begin} they are {wanted}, say so with `insist`"
         raise CpunetError(
             f"{source.path}: given as {wanted} pulses, but these {found.why}", f"{remedy}{sure}"
         )

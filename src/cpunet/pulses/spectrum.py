@@ -95,7 +95,7 @@ class Suggestion(NamedTuple):
 
     def __str__(self) -> str:
         lines = ", ".join(f"{line:.0f}" for line in sorted(self.lines_kev))
-        return f"{self.source} ({lines} keV) at --kev-per-adc {self.kev_per_adc:.4g}"
+        return f"{self.source} ({lines} keV) at `kev_per_adc` {self.kev_per_adc:.4g}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,8 +27,6 @@ from cpunet.simulation.grid import Grid, make_grid
 from cpunet.simulation.poisson import Potentials, solve_potentials
 
 log = logging.getLogger(__name__)
-
-Progress = Callable[[str], None]
 
 # fields that do not affect the parts of the potential
 NOT_IN_PARTS = (

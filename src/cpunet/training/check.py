@@ -23,14 +23,13 @@ from cpunet.pulses.channels import ALL, Pair, paired
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import (
     InputSet,
-    load_measured,
-    load_simulated,
+    load_pulses,
     require_both_sides,
     require_same_sampling,
 )
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.pulses.preparation import Rejection
+from cpunet.pulses.preparation import Kind, Rejection
 from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
@@ -246,11 +245,10 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
     selection = parse_selection(peak, recipe.peaks)
     findings: list[Finding] = []
     sets: dict[str, InputSet] = {}
-    for side, load, file in zip(
-        ("sim", "data"), (load_simulated, load_measured), pair, strict=True
-    ):
+    kinds: tuple[tuple[str, Kind], ...] = (("sim", "simulated"), ("data", "measured"))
+    for (side, kind), file in zip(kinds, pair, strict=True):
         try:
-            sets[side] = load(file, recipe, selection, tell=False)
+            sets[side] = load_pulses(file, kind, recipe, selection, tell=False)
         except CpunetError as error:
             findings.append(_refusal(f"{side} pulses", error))
     if len(sets) < 2:

@@ -100,8 +100,8 @@ def unfinished_folder(
         mark(folder, UNFINISHED, listed=False)
         if checkpoint.exists() and not (resume or force):
             raise CpunetError(
-                f"{folder}: an unfinished training; continue with --resume, or begin again "
-                "with --force"
+                f"{folder}: an unfinished training; continue with `resume`, or begin again "
+                "with `force`"
             )
         yield folder
         _put_in_place(folder, out, force=force)
@@ -109,7 +109,7 @@ def unfinished_folder(
     except OSError as error:
         raise CpunetError(
             f"{not_written(error, folder, folder)}; what is stored is kept, continue with "
-            "--resume"
+            "`resume`"
         ) from error
     finally:
         if not checkpoint.exists():
@@ -122,7 +122,7 @@ def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
         with folder_written_aside(out, RUN, force=force) as whole:
             copy_own(folder, whole, RUN)
     except CpunetError as error:
-        raise CpunetError(f"{error}; the training is kept, finish it with --resume") from error
+        raise CpunetError(f"{error}; the training is kept, finish it with `resume`") from error
 
 
 class UnfinishedRun:
@@ -185,7 +185,7 @@ class UnfinishedRun:
             for difference in differences(then["fingerprint"].get(kind), now):
                 raise CpunetError(
                     f"resumed with another {kind}: {difference}; give what the training was "
-                    "begun with, or begin again with --force"
+                    "begun with, or begin again with `force`"
                 )
         for difference in differences(then["environment"], self._environment):
             log.warning(f"resumed elsewhere: {difference}; the last bits may differ")
@@ -267,11 +267,11 @@ def _read(path: Path) -> dict[str, Any]:
         EOFError,
         pickle.PickleError,
     ):
-        raise CpunetError(f"{path}: damaged; begin again with --force") from None
+        raise CpunetError(f"{path}: damaged; begin again with `force`") from None
     if made_by != FORMAT:
         raise CpunetError(
             f"{path}: written by another version of cpunet; go on with that one, or begin "
-            "again with --force"
+            "again with `force`"
         )
     return content
 

@@ -91,7 +91,7 @@ def energy_bands(
     else:
         raise CpunetError(
             f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {LEAST} of each at "
-            "the same energies are needed: select more energies (--peak), simulate more, or "
+            "the same energies are needed: select more energies (`peak`), simulate more, or "
             "give more files"
         )
     return bands

@@ -89,7 +89,7 @@ def _check(sim: FloatArray, energy_kev: Values) -> None:
     if len(sim) < MIN_N:
         raise CpunetError(
             f"{len(sim)} simulated pulses for the inverse; {MIN_N} or more are needed: "
-            "select more energies (--peak) or simulate more"
+            "select more energies (`peak`) or simulate more"
         )
     if energy_kev.shape != (len(sim),):
         raise CpunetError(

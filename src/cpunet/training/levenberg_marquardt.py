@@ -124,7 +124,7 @@ def levenberg_marquardt(
     if not math.isfinite(cost):
         raise CpunetError(
             "the fit of the response diverged; check that the sets hold single pulses of one "
-            "detector (cpunet info), or train on other energies (--peak)"
+            "detector (cpunet info), or train on other energies (`peak`)"
         )
     # the last derivatives may be those before the last step, which can be a long one
     jacobian = problem.jacobian(vector, residuals)

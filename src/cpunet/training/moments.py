@@ -129,7 +129,7 @@ class Moments:
         if usable.sum() < MIN_N:
             raise TooFewPulsesError(
                 f"{int(usable.sum())} measured pulses can be used; {MIN_N} or more are "
-                "needed: select more energies (--peak) or give more files"
+                "needed: select more energies (`peak`) or give more files"
             )
         least = _least(log_amplitude[usable])
         aligned, slopes, log_amplitude = aligned[usable], slopes[usable], log_amplitude[usable]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -17,13 +18,12 @@ from cpunet.memory import keep_freed_memory
 from cpunet.outputs import folder_written_aside, refuse_inputs
 from cpunet.pulses.channels import ALL, Outcome, Pair, one_by_one, own_folder, paired
 from cpunet.pulses.loading import (
-    load_measured,
-    load_simulated,
+    load_pulses,
     require_both_sides,
     require_same_sampling,
 )
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
@@ -124,10 +124,7 @@ def train(
 
     if sides[1].table != ALL:
         run = one(sides, target, init, resume)
-        if target is not None:
-            words = ("cpunet validate", target, "--sim", sides[0].path, "--data", sides[1].path)
-            report = target.with_name(f"{target.name}-report")
-            log.info(" ".join(map(str, ("next:", *words, "--out", report))))
+        _tell_next(*sides, target)
         return run
     if target is None:
         raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
@@ -139,7 +136,19 @@ def train(
         start = own_folder(Path(init), name, INFO) if isinstance(init, str | Path) else init
         return one(pair, folder, start, resume and unfinished_name(folder).exists())
 
-    return one_by_one(paired(*sides), target, channel)
+    runs = one_by_one(paired(*sides), target, channel)
+    _tell_next(*sides, target)
+    return runs
+
+
+def _tell_next(sim: PulseFile, data: PulseFile, out: Path | None) -> None:
+    """Say how to validate runs of files."""
+    if out is None or sim.pulses is not None or data.pulses is not None:
+        return
+    words = ["cpunet", "validate", out, "--sim", sim.path, "--data", data.path, "--out"]
+    of_all = ["--data-table", ALL] if data.table == ALL else []
+    report = out.with_name(f"{out.name}-report")
+    log.info(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
 
 
 def _workplace(
@@ -176,8 +185,8 @@ def _job(
 ) -> TrainingJob:
     """Read and prepare both sides, and warn of what makes a training on them doubtful."""
     selection = parse_selection(peak, recipe.peaks)
-    sim = load_simulated(pair[0], recipe, selection)
-    data = load_measured(pair[1], recipe, selection)
+    sim = load_pulses(pair[0], "simulated", recipe, selection)
+    data = load_pulses(pair[1], "measured", recipe, selection)
     require_same_sampling(sim, data)
     require_both_sides(sim, data, selection)
     for finding in compare_sides(sim, data, selection):

@@ -85,7 +85,7 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
     ]
     about = (
         "Position and width of the single-site peak of A/E in ranges of energy: a Gaussian "
-        "with a tail below it. “cpunet export --to legend-pars” writes these lines."
+        "with a tail below it. “cpunet export legend” writes these lines."
     )
     if found.get("multi_site"):
         about += (

@@ -16,8 +16,7 @@ from cpunet.matrices import one_thread_for_matrices
 from cpunet.progress import stage
 from cpunet.pulses.loading import (
     InputSet,
-    load_measured,
-    load_simulated,
+    load_pulses,
     require_same_sampling,
 )
 from cpunet.pulses.peaks import parse_selection
@@ -167,8 +166,8 @@ def _load_both(
     max_pulses: int,
 ) -> tuple[InputSet, InputSet]:
     selection = validation_selection(names, ren.recipe)
-    sim_set = load_simulated(sim, ren.recipe, selection, most=max_pulses)
-    data_set = load_measured(data, ren.recipe, selection, most=max_pulses)
+    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, most=max_pulses)
+    data_set = load_pulses(data, "measured", ren.recipe, selection, most=max_pulses)
     require_same_sampling(sim_set, data_set)
     if not np.isclose(sim_set.dt_ns, ren.dt_ns):
         raise CpunetError(

@@ -23,8 +23,7 @@ from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     InputSet,
-    load_measured,
-    load_simulated,
+    load_pulses,
     require_both_sides,
     require_same_sampling,
 )
@@ -117,8 +116,8 @@ def tune(
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
     selection = parse_selection(peak, recipe.peaks)
-    simulated = load_simulated(sides[0], recipe, selection)
-    measured = load_measured(sides[1], recipe, selection)
+    simulated = load_pulses(sides[0], "simulated", recipe, selection)
+    measured = load_pulses(sides[1], "measured", recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
     held_out = HeldOut.of(simulated, measured, sides[1], recipe, seed)

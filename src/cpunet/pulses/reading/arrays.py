@@ -116,6 +116,6 @@ def _waveform_name(options: PulseFile, arrays: Arrays) -> str:
     if len(named) > 1:
         raise CpunetError(
             f"{options.path}: {len(named)} arrays of two dimensions ({shortened(named)}); "
-            "choose one with --table (--sim-table, --data-table)"
+            "choose one with `table` (`sim_table`, `data_table`)"
         )
     return named[0]

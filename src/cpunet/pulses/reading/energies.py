@@ -121,7 +121,7 @@ def resolve_energies(
         units = f"in {column.units}" if column.units else "without units"
         raise CpunetError(
             f"{path}: column {energy} is {units}, no energy in keV; "
-            "add --kev-per-adc (1 if it is in keV)"
+            "add `kev_per_adc` (1 if it is in keV)"
         )
     return rule
 
@@ -133,7 +133,7 @@ def _calibrated(
     if units in ENERGY_UNITS:
         if kev_per_adc is not None:
             raise CpunetError(
-                f"{path}: column {name} is in {units} already; drop --kev-per-adc"
+                f"{path}: column {name} is in {units} already; drop `kev_per_adc`"
             )
         return Energies(f"column {name} [{units}]", ENERGY_UNITS[units], column)
     if kev_per_adc is not None:
@@ -236,7 +236,7 @@ def resolve_sampling(
         if dt_ns is None:
             why = "is not in the file" if column is None else f"({name}) has no units"
             raise CpunetError(
-                f"{path}: the sampling period {why}; give --dt-ns{hint and f' ({hint})'}"
+                f"{path}: the sampling period {why}; give `dt_ns`{hint and f' ({hint})'}"
             )
         return Sampling(path, dt_ns)
     if len(column) != 1:
@@ -249,7 +249,7 @@ def resolve_sampling(
         )
     if dt_ns is not None and not np.isclose(found, dt_ns, rtol=_TOLERANCE, atol=0):
         raise CpunetError(
-            f"{path}: sampled every {found:g} ns, but --dt-ns says {dt_ns:g}; drop --dt-ns"
+            f"{path}: sampled every {found:g} ns, but `dt_ns` says {dt_ns:g}; drop `dt_ns`"
         )
     # A single value, a scalar or an array of length 1, applies to all events.
     varying = None if len(column) == 1 else column

@@ -129,7 +129,7 @@ def _channel(options: PulseFile, n_channels: int) -> int:
             return 0
         raise CpunetError(
             f"{options.path}: {n_channels} channels ({shortened(known)}); "
-            "choose one with --table (--sim-table, --data-table)"
+            "choose one with `table` (`sim_table`, `data_table`)"
         )
     if options.table not in known:
         raise CpunetError(

@@ -277,13 +277,13 @@ def _no_waveforms(path: Path, file: h5py.File) -> CpunetError:
     if not arrays:
         return CpunetError(
             f"{path}: no waveforms in it; it holds {shortened(_tables(file))}",
-            "give a file of traces (their energies may be here: --data-energy FILE:COLUMN)",
+            "give a file of traces (their energies may be here: `data_energy` FILE:COLUMN)",
         )
     many = "an array" if len(arrays) == 1 else f"{len(arrays)} arrays"
     return CpunetError(
         f"{path}: no table of waveforms in it, but {many} of two dimensions "
         f"({shortened(arrays)})",
-        "if it holds traces, name it by --table (--sim-table, --data-table); give --dt-ns",
+        "if it holds traces, name it by `table` (`sim_table`, `data_table`); give `dt_ns`",
     )
 
 
@@ -297,7 +297,7 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
     if len(tables) > 1:
         raise CpunetError(
             f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
-            "choose one with --table (--sim-table, --data-table)"
+            "choose one with `table` (`sim_table`, `data_table`)"
         )
     if len(found) == 1:
         return found[0]
@@ -307,7 +307,7 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
             return by_name[name]
     raise CpunetError(
         f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "
-        "choose one with --table (--sim-table, --data-table)"
+        "choose one with `table` (`sim_table`, `data_table`)"
     )
 
 

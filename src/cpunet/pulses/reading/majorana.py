@@ -97,7 +97,7 @@ def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
         if len(known) > 1:
             raise CpunetError(
                 f"{options.path}: {len(known)} detectors ({shortened(known)}); choose one with "
-                f"--table, or all with --table {WAVEFORMS}"
+                f"`table`, or all with `table` {WAVEFORMS}"
             )
         return np.arange(n)
     if options.table not in known:

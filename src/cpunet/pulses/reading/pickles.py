@@ -187,7 +187,7 @@ class PickleSource(PulseSource):
     def __init__(self, options: PulseFile) -> None:
         if options.table is not None:
             raise CpunetError(
-                f"{options.path}: a file of pickled pulses has no tables; leave out --table"
+                f"{options.path}: a file of pickled pulses has no tables; leave out `table`"
             )
         self._seen = _Seen(options.path)
         first = next(self._seen.pulses(), None)

@@ -1,4 +1,4 @@
-"""The jobs behind the commands: truth, provenance, progress, devices."""
+"""Training: truth, provenance, progress, devices."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     InputSet,
-    load_measured,
-    load_simulated,
+    load_pulses,
     require_same_sampling,
 )
 from cpunet.pulses.peaks import parse_selection
@@ -68,7 +67,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def sim_set(files) -> InputSet:
     selection = parse_selection("SEP,DEP", RECIPE.peaks)
-    return load_simulated(files[0], RECIPE, selection)
+    return load_pulses(files[0], "simulated", RECIPE, selection)
 
 
 def test_provenance_counts_and_fingerprints(files, sim_set):
@@ -83,17 +82,17 @@ def test_provenance_counts_and_fingerprints(files, sim_set):
 
 def test_measured_pulses_are_cut_and_simulated_ones_are_not(files):
     selection = parse_selection("FEP", RECIPE.peaks)
-    told = load_measured(files[1], RECIPE, selection).provenance()
+    told = load_pulses(files[1], "measured", RECIPE, selection).provenance()
     assert {window.name for window in told.cuts.windows} >= {"tail_slope", "baseline"}
 
 
 def test_measured_pulses_given_as_simulated_ones_are_doubted(files, caplog):
     selection = parse_selection("FEP", RECIPE.peaks)
-    load_simulated(files[1], RECIPE, selection)
+    load_pulses(files[1], "simulated", RECIPE, selection)
     assert caplog.messages[0].startswith("data.lh5: these pulses decay")
     caplog.clear()
-    load_simulated(files[0], RECIPE, selection)
-    load_measured(files[1], RECIPE, selection)
+    load_pulses(files[0], "simulated", RECIPE, selection)
+    load_pulses(files[1], "measured", RECIPE, selection)
     assert not caplog.messages
 
 

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.loading import load_measured, load_simulated
+from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
@@ -196,8 +196,8 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     # networks with noise outside are prepared alike
     paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
     chosen = parse_selection("FEP", paper.peaks)
-    sim = load_simulated(files.sim, paper, chosen).prepared.pulses
-    measured = load_measured(data, paper, chosen)
+    sim = load_pulses(files.sim, "simulated", paper, chosen).prepared.pulses
+    measured = load_pulses(data, "measured", paper, chosen)
     sides = Sides(sim, measured.prepared.pulses, data, measured)
     outside, entry = outside_noise(sides, paper)
     assert outside is not None

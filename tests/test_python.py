@@ -270,7 +270,7 @@ def test_the_page_runs_on_a_stand(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", [*words, "--events", "FEP=400,SEP=80,DEP=80"])
     with pytest.raises(SystemExit):
         main()
-    page = (Path(__file__).resolve().parents[2] / "docs" / "python.md").read_text()
+    page = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text()
     names: dict[str, object] = {}
     for code in re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
         exec(compile(code, "python.md", "exec"), names)
