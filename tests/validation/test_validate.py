@@ -109,7 +109,6 @@ def test_what_is_compared(whole) -> None:
     assert ranges["FEP"]["data"]["sideband"] == 0
     assert {"noise", "noise_spectrum"} <= set(whole.metrics["verdicts"]["table"]["SEP"]["ren"])
     assert whole.metrics["noise"]["SEP"]["ren"]["rms_ratio"] == pytest.approx(1, abs=0.1)
-    assert whole.metrics["linearity"]["edge_rms"]["median"] < 1e-4  # the chain is linear
     assert set(whole.metrics["drift_slices"]) == {"FEP", "SEP", "DEP"}
     assert [line.split(":")[0] for line in whole.metrics["verdicts"]["summary"]] == [
         "REN, FEP",

@@ -30,7 +30,6 @@ from cpunet.validation.energy_ranges import (
     range_survivals,
     validation_selection,
 )
-from cpunet.validation.linearity import linearity_residual
 from cpunet.validation.methods import fit_baseline_methods, translate_all
 from cpunet.validation.peak_details import PeakDetails, peak_details
 from cpunet.validation.peak_sets import PeakSets, current_amplitudes, peak_sets
@@ -38,7 +37,6 @@ from cpunet.validation.scoring import ByMethod, score_peak, survivals
 from cpunet.validation.truth import Responses
 from cpunet.validation.verdicts import summaries, verdict_table
 
-PAIRS = 200  # pairs of pulses in the test of linearity
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 
 
@@ -136,7 +134,6 @@ def evaluate(
         "ae_energy": ae_against_energy(sim_set, data_set, amplitudes, recipe),
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
-        "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
         "rivals": {
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
@@ -245,18 +242,6 @@ def period_of(path: Path) -> str | None:
 def _short(path: Path) -> str:
     """Name of a file and its folder, which do not depend on where a study is stored."""
     return "/".join(path.absolute().parts[-2:])
-
-
-def _linearity(ren: REN, peak: PeakSets, seed: int) -> dict[str, Any]:
-    """Difference between the translation of a sum and the sum of the translations."""
-    found = linearity_residual(
-        lambda windows: ren.apply(windows, noise=False),
-        peak.raw.waveforms,
-        np.random.default_rng(seed),
-        PAIRS,
-        edge_samples=ren.recipe.scores.edge_samples,
-    )
-    return {"peak": peak.name} | found
 
 
 def _noise(spectra: Mapping[str, Any]) -> dict[str, Any]:

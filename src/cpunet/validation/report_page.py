@@ -55,7 +55,6 @@ MANY = 4  # a larger number of figures is collapsed
 DETAILS = {
     "ae_details": "A/E in detail",
     "drift_slices": "Slices of rise time, 1 to 90 %",
-    "linearity": "Linearity",
     "noise": "Noise",
 }
 
@@ -79,7 +78,7 @@ def write_page(
         method); or ``missing`` with the reason why the peak is not scored.
         ``verdicts``: ``summary``, a list of sentences, and ``table``, see
         `verdicts.verdict_table`.  ``ae_survival``, ``ae_details``,
-        ``drift_slices``, ``linearity``, ``noise``: nested values, shown as tables.
+        ``drift_slices``, ``noise``: nested values, shown as tables.
         ``compared``: names and values of the compared inputs.  ``training``: how the network
         was trained.  ``rejections``: counts by reason, possibly nested.  ``ae_energy``: result
         of `ae_energy.against_energy`.
