@@ -15,9 +15,9 @@ from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.translation.translator import IREN, REN
+from cpunet.validation.ae_drift_time import ae_figure
 from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.validation.ae_energy_figure import ae_energy_figure
-from cpunet.validation.ae_figures import ae_figure, roc_figure, two_dimensional_figure
 from cpunet.validation.baseline_spectra import spectrum_of_noise
 from cpunet.validation.comparisons import Comparison
 from cpunet.validation.evaluation import Evaluation
@@ -32,6 +32,7 @@ from cpunet.validation.run_figures import (
     loss_curves,
     mean_pulses,
     parameter_histograms,
+    roc_figure,
 )
 from cpunet.validation.slice_figure import slice_figure
 
@@ -106,8 +107,6 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         made["superpulses"] = _superpulses(details, peak)
     if "missing" not in details.ae_against_time:
         made["A over E"] = _ae(details, name)
-    if "missing" not in details.plane:
-        made["A over E and drift time"] = _plane(details, name)
     if "missing" not in scores["noise"]["data"]:
         shown = ("frequency_mhz", "data", "ren")
         noise = {method: n for method, n in scores["noise"].items() if method in shown}
@@ -181,13 +180,6 @@ def _roc(found: Evaluation, peaks: list[str]) -> Drawing:
         for peak in peaks
     }
     return partial(roc_figure, ae, DEP)
-
-
-def _plane(details: PeakDetails, name: str) -> Drawing:
-    table = dict(details.plane)
-    shown = ("data", "raw", "ren", "truth")
-    table["counts"] = {m: c for m, c in table["counts"].items() if m in shown}
-    return partial(two_dimensional_figure, table, name)
 
 
 def _forward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:

@@ -113,7 +113,7 @@ def evaluate(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    details = _details(scored, values, recipe, seed)
+    details = _details(scored, values)
     kept = survivals(values, seed)
     known = None if run.fit is None else run.fit.remains
     metrics = {
@@ -124,9 +124,6 @@ def evaluate(
             "survival by energy range": range_survivals(
                 sim_set, data_set, amplitudes, kept, recipe
             ),
-            "A/E and drift time together": {
-                name: of_peak.plane_scores() for name, of_peak in details.items()
-            },
             "A/E against drift time": {
                 name: of_peak.ae_against_time for name, of_peak in details.items()
             },
@@ -188,16 +185,13 @@ def _scores(
 
 
 def _details(
-    scored: Sequence[PeakSets],
-    values: Mapping[str, ByMethod],
-    recipe: Recipe,
-    seed: int,
+    scored: Sequence[PeakSets], values: Mapping[str, ByMethod]
 ) -> dict[str, PeakDetails]:
     """Further comparisons of each scored peak."""
-    details, bootstraps = {}, recipe.scores.bootstraps
+    details = {}
     with stage("Comparing in detail", len(scored)) as bar:
         for peak in scored:
-            details[peak.name] = peak_details(peak, values[peak.name], bootstraps, seed)
+            details[peak.name] = peak_details(peak, values[peak.name])
             bar.update(1)
     return details
 

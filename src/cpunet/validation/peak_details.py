@@ -1,4 +1,4 @@
-"""Comparisons beyond distributions: slices of rise time, A/E, two dimensions."""
+"""Comparisons beyond distributions: slices of rise time, A/E against drift time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cpunet.errors import CpunetError
 from cpunet.plotting import NO_NOISE
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import Values
-from cpunet.validation.ae_details import ae_against_drift_time, two_dimensional
+from cpunet.validation.ae_drift_time import ae_against_drift_time
 from cpunet.validation.drift_slices import (
     Slices,
     slice_edges,
@@ -23,8 +23,6 @@ from cpunet.validation.scoring import ByMethod
 
 # samples of a superpulse before and after half maximum
 BEFORE, AFTER = 100, 150
-# entries of the two-dimensional comparison in tables; counts are only for the figure
-_TWO_DIMENSIONAL = ("iou", "iou_std", "missing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,23 +35,17 @@ class PeakDetails:
         Mean pulses by method, of methods with pulses.
     slices
         Superpulses by method; empty if they cannot be made.
-    slice_table, ae_against_time, plane
-        Results of `slice_table`, `ae_against_drift_time` and `two_dimensional`, or
-        ``missing`` with the reason.
+    slice_table, ae_against_time
+        Results of `slice_table` and `ae_against_drift_time`, or ``missing`` with the reason.
     """
 
     means: Mapping[str, MeanPulse] = field(default_factory=dict)
     slices: Mapping[str, Slices] = field(default_factory=dict)
     slice_table: Mapping[str, Any] = field(default_factory=dict)
     ae_against_time: Mapping[str, Any] = field(default_factory=dict)
-    plane: Mapping[str, Any] = field(default_factory=dict)
-
-    def plane_scores(self) -> dict[str, Any]:
-        """The two-dimensional comparison without its counts."""
-        return {key: self.plane[key] for key in _TWO_DIMENSIONAL if key in self.plane}
 
 
-def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -> PeakDetails:
+def peak_details(peak: PeakSets, values: ByMethod) -> PeakDetails:
     """Compare a peak's pulses in slices of rise time, and A/E with drift time.
 
     Parameters
@@ -63,8 +55,6 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
     values
         Parameters by method, see `cpunet.validation.scoring.score_peak`; methods
         without noise are left out.
-    bootstraps, seed
-        Number and seed of the bootstraps for the errors.
     """
     noisy = {m: v for m, v in values.items() if not m.endswith(NO_NOISE)}
     amplitude = {m: v["current_amplitude"] for m, v in noisy.items()}
@@ -75,7 +65,6 @@ def peak_details(peak: PeakSets, values: ByMethod, bootstraps: int, seed: int) -
         slices=slices,
         slice_table=table,
         ae_against_time=ae_against_drift_time(amplitude, time),
-        plane=two_dimensional(amplitude, time, bootstraps=bootstraps, seed=seed),
     )
 
 

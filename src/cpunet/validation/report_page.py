@@ -40,7 +40,6 @@ FIRST = 2  # figures of mean pulses at the top of the page, and of noise
 # section of a figure by the end of its name; all others are under Details
 PLACES = {
     "A over E survival": "ae",
-    "A over E and drift time": "ae_drift",
     "A over E": "ae_drift",
     "mean pulse": "first",
     "superpulses": "slices",
@@ -115,7 +114,7 @@ def write_page(
         ae=joined(
             [
                 _gallery(placed["ae"]),
-                _folded("A/E and drift time of every peak, as figures", placed["ae_drift"]),
+                _folded("A/E against drift time of every peak, as figures", placed["ae_drift"]),
             ]
         ),
         ae_energy=ae_energy,

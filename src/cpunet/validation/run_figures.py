@@ -40,6 +40,8 @@ CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
 AVERAGED = 10  # records in the moving average
 DRIFT_BINS = 12  # of drift time, with as many pulses each
 COLUMNS = 4  # panels of further parameters in a row
+ROC_POINTS = 201  # points per curve
+ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
 # Panels of the loss figure: losses with their label and colour.
 LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Cycle and identity": {
@@ -276,6 +278,43 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
         xlim=(time_ns[0], time_ns[-1]),
     )
     linear_within(below, 1.0)
+    return figure
+
+
+@styled
+def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figure:
+    """Survival of other peaks after low-A/E cuts, against the survival of the DEP.
+
+    Parameters
+    ----------
+    ae
+        A/E of single pulses by peak and method, the measured ones under ``"data"``;
+        non-finite values are left out.
+    dep
+        Name of the peak of single-site events.
+    """
+    others = [peak for peak in ae if peak != dep]
+    methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
+    palette = colours(methods)
+    figure = Figure(figsize=(3.4 * max(len(others), 1) + 0.6, 3.8))
+    panels = figure.subplots(1, max(len(others), 1), sharey=True, squeeze=False)[0]
+    accepted = np.linspace(0.0, 1.0, ROC_POINTS)
+    for axes, peak in zip(panels, others, strict=False):
+        for method in sorted(methods, key=lambda name: name == "ren"):
+            single, other = (
+                ae[name][method][np.isfinite(ae[name][method])] for name in (dep, peak)
+            )
+            if not (single.size and other.size):
+                continue
+            cuts = np.quantile(single, 1 - accepted)
+            left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
+            look = line_look(method, palette[method])
+            axes.plot(100 * accepted, 100 * left, label=label(method), **look)
+        axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
+    # useful cuts leave few multi-site events
+    panels[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
+    panels[0].yaxis.set_major_formatter("{x:g}")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""A/E against and with the drift time, and by ranges of energy, against plain counting."""
+"""A/E against the drift time, and by ranges of energy, against plain counting."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from scipy.special import ndtri
 
 from cpunet.errors import CpunetError
 from cpunet.validation.a_over_e import sideband_survival
-from cpunet.validation.ae_details import ae_against_drift_time, two_dimensional
-from cpunet.validation.ae_figures import ae_figure, roc_figure, two_dimensional_figure
+from cpunet.validation.ae_drift_time import ae_against_drift_time, ae_figure
 from cpunet.validation.range_survival import peak_survival, survival_by_range
+from cpunet.validation.run_figures import roc_figure
 from synthetic import require_drawn
 
 
@@ -87,52 +87,6 @@ def test_data_without_events_have_no_bins():
         "no measured pulse has an amplitude"
         in ae_against_drift_time(nothing, nothing)["missing"]
     )
-    with pytest.raises(CpunetError, match="data: 5 amplitudes beside 4 drift times"):
-        two_dimensional(nothing, {"data": np.ones(4)})
-
-
-def test_overlap_in_two_dimensions_is_that_of_a_plain_histogram():
-    amplitude, time = by_method(np.random.default_rng(4), {"data": 900, "ren": 1100})
-    amplitude["ren"] += 0.0005
-    time["ren"][:5] = np.nan
-    table = two_dimensional(amplitude, time, bootstraps=20)
-    edges = [np.r_[-np.inf, table[key], np.inf] for key in ("amplitude_edges", "time_edges_ns")]
-    shares = []
-    for method, n in (("data", 900), ("ren", 1100)):
-        known = np.isfinite(time[method])
-        counts = np.histogram2d(amplitude[method][known], time[method][known], edges)[0]
-        assert counts[1:-1, 1:-1].astype(int).tolist() == table["counts"][method]
-        shares.append(np.append(counts.ravel(), (~known).sum()) / n)
-    expected = 100 * np.minimum(*shares).sum() / np.maximum(*shares).sum()
-    assert table["iou"]["ren"] == pytest.approx(expected)
-    assert table["undefined"] == {"data": 0, "ren": 5}
-    json.dumps(table, allow_nan=False)
-
-
-def test_a_wrong_dependence_shows_in_two_dimensions_only():
-    rng = np.random.default_rng(5)
-    right = by_method(rng, {"data": 4000, "ren": 4000}, slope=-6e-6)
-    wrong = by_method(rng, {"raw": 4000}, slope=6e-6)
-    table = two_dimensional(right[0] | wrong[0], right[1] | wrong[1], bootstraps=20)
-    assert table["iou"]["raw"] < table["iou"]["ren"] - 20
-
-
-@pytest.mark.parametrize("n", [400, 4000])
-def test_the_ceiling_is_what_new_data_score(n):
-    rng = np.random.default_rng(6)
-    scores, ceilings = [], []
-    for _ in range(40):
-        table = two_dimensional(*by_method(rng, {"data": n, "ren": n}), bootstraps=20, seed=rng)
-        scores.append(table["iou"]["ren"])
-        ceilings.append(table["iou"]["ceiling"])
-    assert 0 < np.mean(ceilings) - np.mean(scores) < 4  # as is documented
-
-
-def test_few_events_have_no_overlap():
-    amplitude, time = by_method(np.random.default_rng(7), {"data": 900, "ren": 39})
-    assert two_dimensional(amplitude, time) == {
-        "missing": "ren has 39 events (at least 40 are needed for two bins an axis)"
-    }
 
 
 def test_survival_of_a_line_is_that_of_its_own_events():
@@ -219,15 +173,6 @@ def test_figures_draw_what_is_in_the_tables():
     require_drawn(figure)
     drawn = figure.axes[0].lines[0].get_ydata()
     assert drawn.tolist() == [row["median"] for row in table["methods"]["data"]]
-
-    amplitude["raw"] = amplitude["raw"] + 100
-    both = two_dimensional(amplitude, time, bootstraps=10)
-    figure = two_dimensional_figure(both, "SEP")
-    require_drawn(figure)
-    said = [[text.get_text() for text in axes.texts] for axes in figure.axes[:3]]
-    assert said == [[], ["no event in the\nrange of the data"], []]
-    mesh = figure.axes[0].collections[0].get_array()
-    assert mesh.sum() == pytest.approx(100 * np.sum(both["counts"]["data"]) / 900)
 
 
 def test_curves_of_survival_are_the_analytic_ones():
