@@ -6,14 +6,144 @@ Run with ``python benchmarks/remains.py FILE --kev-per-adc 0.0649 --picture rema
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rich.console import Console
 
+from cpunet.electronics.baseline_tails import read_baselines
 from cpunet.electronics.remains import Remains
+from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.plotting import COLOURS, DATA_FILL, styled
+from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
-from cpunet.validation.remains_figure import Slopes, remains_figure
+
+Values = npt.NDArray[np.float64]
+
+SHOWN = 12  # traces
+EMPTY = 0.5  # errors: traces with smaller remains count as empty
+SIGMA_PER_MAD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Slopes of baselines in keV per decay time, an independent measure of the remains.
+
+    Parameters
+    ----------
+    before, after
+        Slopes before and after subtraction of the estimated remains of each trace.
+    empty
+        Mask of the traces with negligible remains, whose slopes are noise.
+    """
+
+    before: Values
+    after: Values
+    empty: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, raw: Pulses, remains: Remains) -> Slopes:
+        """Slopes of the raw traces whose remains can be estimated."""
+        kev = remains.measure(raw)
+        told = np.isfinite(kev)
+        flat = remains.subtracted_from(raw)
+        before, after = (
+            read_baselines(
+                traces.waveforms[told, : remains.samples].astype(float),
+                remains.dt_ns,
+                remains.decay_us,
+            )[1]
+            / remains.adc_per_kev
+            for traces in (raw, flat)
+        )
+        return cls(before, after, np.abs(kev[told]) < EMPTY * remains.error_kev)
+
+    @property
+    def spreads(self) -> tuple[float, float]:
+        """Robust standard deviations after subtraction, and of the empty traces."""
+        return _robust_std(self.after), _robust_std(self.before[self.empty])
+
+
+def _robust_std(values: Values) -> float:
+    return SIGMA_PER_MAD * float(np.median(np.abs(values - np.median(values))))
+
+
+@styled
+def remains_figure(raw: Pulses, remains: Remains) -> Figure:
+    """Distribution of the remains with the law, slopes before and after, and some traces.
+
+    Parameters
+    ----------
+    raw
+        Raw traces.
+    remains
+        Remains estimated from these traces, or from others of the same channel.
+    """
+    figure = Figure(figsize=(11, 3.6))
+    sizes, slopes, traces = figure.subplots(1, 3)
+    kev = remains.measure(raw)
+    _sizes(sizes, kev[np.isfinite(kev)], remains.fit.law, remains.error_kev)
+    _slopes(slopes, Slopes.of(raw, remains))
+    _traces(traces, raw, remains, kev)
+    return figure
+
+
+def _sizes(axes: Axes, kev: Values, law: RemainsLaw, error_kev: float) -> None:
+    at = np.geomspace(error_kev, 0.95 * max(law.energies_kev), 60)
+    shares = [100 * (kev > size).mean() for size in at]
+    axes.loglog(at, shares, color=COLOURS["data"], drawstyle="steps-post", label="measured")
+    label = f"law, {law.rate_khz:.2f} kHz, {law.decay_us:.1f} µs"
+    axes.loglog(at, 100 * law.share_above(at), color=COLOURS["ren"], label=label)
+    _label_sizes(axes, len(kev))
+
+
+def _label_sizes(axes: Axes, traces: int) -> None:
+    axes.set_ylim(max(30 / traces, 0.01), 100)
+    axes.set_xlabel("remainder at the first sample (keV)")
+    axes.set_ylabel("traces above (%)")
+    axes.legend()
+
+
+def _slopes(axes: Axes, slopes: Slopes) -> None:
+    spread, noise = slopes.spreads
+    edges = np.linspace(-8 * noise, 16 * noise, 97).tolist()
+    axes.hist(slopes.before, edges, color=DATA_FILL, label="as measured")
+    after = f"without remains, spread {spread:.2f} keV"
+    axes.hist(slopes.after, edges, histtype="step", color=COLOURS["ren"], label=after)
+    axes.plot([], [], " ", label=f"empty baselines: {noise:.2f} keV")
+    axes.set_yscale("log")
+    axes.set_ylim(0.7, 10 * len(slopes.before) ** 0.7)
+    axes.set_xlabel("remainder according to the slope (keV)")
+    axes.set_ylabel("traces")
+    axes.legend(loc="upper right")
+
+
+def _traces(axes: Axes, raw: Pulses, remains: Remains, kev: Values) -> None:
+    large = np.flatnonzero(np.nan_to_num(kev) > 20 * remains.error_kev)
+    chosen = large[np.argsort(kev[large])][:: max(1, len(large) // SHOWN)][:SHOWN]
+    flat = remains.subtracted_from(raw[chosen])
+    time_us = np.arange(remains.samples) * remains.dt_ns * 1e-3
+    for traces, colour, label in (
+        (raw.waveforms[chosen], DATA_FILL, "as measured"),
+        (flat.waveforms, COLOURS["ren"], "without remains"),
+    ):
+        above = _in_kev(traces, remains)
+        axes.plot(time_us, above[:, : remains.samples].T, color=colour, lw=0.8)
+        axes.plot([], [], color=colour, label=label)
+    axes.set_xlabel("time (µs)")
+    axes.set_ylabel("above an empty baseline (keV)")
+    axes.set_yscale("symlog", linthresh=10)
+    axes.set_ylim(bottom=-10)
+    axes.legend(loc="lower right")
+
+
+def _in_kev(traces: FloatArray, remains: Remains) -> Values:
+    return np.asarray((traces - remains.baseline_adc) / remains.adc_per_kev, float)
 
 
 def main() -> None:

@@ -98,14 +98,6 @@ def all_undrawn() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True, scope="session")
-def few_sums() -> Iterator[None]:
-    """Scores compare the translations of a few sums: two hundred take seconds each time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cpunet.validation.evaluation.PAIRS", 20)
-        yield
-
-
 @pytest.fixture(scope="session")
 def reference_data() -> Path:
     """Folder of the optional reference data; the test skips without it."""

@@ -23,8 +23,12 @@ from cpunet.validation.comparisons import Comparison
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.peak_details import PeakDetails
 from cpunet.validation.peak_sets import PeakSets
-from cpunet.validation.pulse_figures import DataPulse, single_pulse_figure, spectrum_figure
-from cpunet.validation.remains_figure import sizes_figure
+from cpunet.validation.pulse_figures import (
+    DataPulse,
+    single_pulse_figure,
+    spectrum_figure,
+    tails_figure,
+)
 from cpunet.validation.run_figures import (
     cycle_figure,
     drift_figure,
@@ -75,9 +79,7 @@ def _remains(told: Mapping[str, Any]) -> dict[str, Drawing]:
     """Sizes of remains with their law, if a training found any and kept them."""
     if not (told.get("rate_khz") and "sizes" in told):
         return {}
-    wanted = ("rate_khz", "rate_error_khz", "decay_us", "error_kev", "traces")
-    known = {name: told[name] for name in wanted}
-    return {REMAINS: partial(sizes_figure, known, told["sizes"], told["drawn"]["energies_kev"])}
+    return {REMAINS: partial(tails_figure, told, told["sizes"], told["drawn"]["energies_kev"])}
 
 
 def _drift(peak: PeakSets, ren: REN) -> dict[str, Drawing]:

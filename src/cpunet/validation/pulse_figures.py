@@ -1,4 +1,4 @@
-"""Figures of energies and of single pulses, as in the paper (Bhimani et al. 2026).
+"""Figures of energies, single pulses and pile-up tails (Bhimani et al. 2026 for the former).
 
 It is unknown which simulated and which measured pulses come from the same position.  A
 simulated pulse is therefore shown beside the measured one nearest to its translation.
@@ -6,20 +6,20 @@ simulated pulse is therefore shown beside the measured one nearest to its transl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import blended_transform_factory
 
 from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
-from cpunet.errors import CpunetError
-from cpunet.plotting import DATA_FILL, GROUP, colours, label, linear_within, styled
+from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.plotting import COLOURS, DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.half_maximum import align_half_maximum
-from cpunet.validation.nearest import nearest_pulses
+from cpunet.pulses.half_maximum import BLOCK, align_half_maximum
 
 Values = npt.NDArray[np.float64]
 
@@ -44,17 +44,9 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
         simulation.
     peaks
         Energy of each line in keV, by name.
-
-    Raises
-    ------
-    CpunetError
-        If no energy is finite.
     """
     finite = {m: values[np.isfinite(values)] for m, values in energy_kev.items()}
-    everything = np.concatenate([np.empty(0), *finite.values()])
-    if not everything.size:
-        raise CpunetError("no pulse has an energy to draw; give a calibration")
-    low, high = _drawn_range(everything)
+    low, high = _drawn_range(np.concatenate([*finite.values()]))
     width = max(BIN_KEV, (high - low) / MAX_BINS)
     edges = np.arange(np.floor(low / width), np.floor(high / width) + 2) * width
     palette = colours(finite)
@@ -97,6 +89,9 @@ def _drawn_range(energy_kev: Values) -> tuple[float, float]:
 def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
     """The pulse with the smallest RMS difference from another, aligned at half maximum.
 
+    Noise contributes to the difference.  Pulses with less than half of the compared samples
+    in their record are left out.
+
     Parameters
     ----------
     windows
@@ -110,11 +105,6 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
         Row of the pulse, and its RMS difference from 100 samples before the crossing to 150
         after it, in pulse heights.
 
-    Raises
-    ------
-    CpunetError
-        If the target or all pulses lack a crossing of half the maximum.
-
     Examples
     --------
     >>> time = np.arange(400.0)
@@ -122,13 +112,18 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
     >>> nearest(pulses, pulses[1])[0]
     1
     """
-    wanted = align_half_maximum(target[np.newaxis], BEFORE, AFTER)
-    if not np.isfinite(wanted).any():
-        raise CpunetError("the pulse to compare with never crosses half of its maximum")
-    found = nearest_pulses(wanted, windows, 1, BEFORE, least=0.5)
-    if not found.index.size:
-        raise CpunetError("no measured pulse crosses half of its maximum; check the file")
-    return int(found.index[0, 0]), float(found.rms[0, 0])
+    wanted = align_half_maximum(target[np.newaxis], BEFORE, AFTER).astype(float)
+    squares = np.empty(len(windows))
+    for first in range(0, len(windows), BLOCK):
+        rows = slice(first, first + BLOCK)
+        aligned = align_half_maximum(windows[rows], BEFORE, AFTER)
+        apart = np.square(aligned - wanted)
+        known = np.isfinite(apart)
+        mean = np.where(known, apart, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        enough = np.isfinite(aligned).sum(axis=1) >= 0.5 * np.isfinite(wanted).sum()
+        squares[rows] = np.where(enough & known.any(axis=1), mean, np.inf)
+    row = int(squares.argmin())
+    return row, float(np.sqrt(squares[row]))
 
 
 class DataPulse(NamedTuple):
@@ -164,18 +159,11 @@ class DataPulse(NamedTuple):
     ) -> Self:
         """Choose the measured window nearest to a simulated pulse.
 
-        The simulated pulse is that of ``"ren"``, or else of ``"truth"``, or else the first.
+        The simulated pulse is that of ``"ren"``, or else of ``"truth"`` or ``"raw"``.
         `data` are measured windows of shape ``(n, length)``; for the other parameters see
         `single_pulse_figure`.
-
-        Raises
-        ------
-        CpunetError
-            If there are no pulses, or if the pulse or all data lack an edge or a tail.
         """
-        if not pulses:
-            raise CpunetError("no pulse to draw; give one by method")
-        target = next((name for name in TARGETS if name in pulses), next(iter(pulses)))
+        target = next(name for name in TARGETS if name in pulses)
         row, rms = nearest(data, pulses[target])
         slope = fitted_tail_slope(data, dt_ns, samples_before)
         return cls(row, rms, target, data[row], slope)
@@ -210,18 +198,13 @@ def single_pulse_figure(
         Sample of the windows' alignment, after which the tail begins.
     title
         Title of the figure, for example ``"SEP, event 12"``.
-
-    Raises
-    ------
-    CpunetError
-        If one of the pulses has no edge.
     """
     shown = {"data": data.window} | dict(pulses)
     slope = data.slope_per_ms
     windows = {m: np.asarray(w, np.float32)[np.newaxis] for m, w in shown.items()}
     figure = Figure(figsize=(9.5, 7.6))
     grid = figure.subplots(3, 2, sharey="row", sharex="col", height_ratios=(4, 4, 3))
-    _draw(list(grid[0]), windows, dt_ns)  # refuses a pulse without an edge
+    _draw(list(grid[0]), windows, dt_ns)
     corrected = {
         m: without_decay(w, 0.0 if m == UNDECAYED else slope, dt_ns, samples_before).astype(
             np.float32
@@ -233,7 +216,8 @@ def single_pulse_figure(
     grid[0, 0].set(ylabel="Pulse height", title="As prepared")
     grid[0, 1].set(title="Edge", xlim=ZOOM_NS)
     grid[1, 0].set(ylabel="Pulse height,\nplateau = 1")
-    grid[1, 0].set_title(f"Corrected for a decay of {_decay(slope)}")
+    decay = f"{-1e3 / slope:.3g} µs" if slope else "none"
+    grid[1, 0].set_title(f"Corrected for a decay of {decay}")
     grid[1, 1].set_title("Edge, corrected")
     grid[2, 0].set_ylabel("Corrected: method −\ndata pulse [%]")
     for axes in grid[2]:
@@ -249,9 +233,51 @@ def single_pulse_figure(
     return figure
 
 
-def _mark_peaks(axes: Axes, peaks: Mapping[str, float], span: tuple[float, float]) -> None:
-    from matplotlib.transforms import blended_transform_factory
+@styled
+def tails_figure(
+    summary: Mapping[str, Any],
+    sizes: Mapping[str, Sequence[float]],
+    energies_kev: Sequence[float],
+) -> Figure:
+    """Sizes of the pile-up tails with their law, from the values stored with a training.
 
+    Parameters
+    ----------
+    summary
+        Result of `Remains.describe`.
+    sizes
+        ``kev``: sizes in keV; ``percent_above``: percentages of the traces above each.
+    energies_kev
+        Quantiles of the energies of earlier pulses in keV.
+    """
+    figure = Figure(figsize=(5.2, 3.4))
+    axes = figure.subplots()
+    kev = np.asarray(sizes["kev"], float)
+    # binomial error of a fraction of n traces
+    share, n = np.asarray(sizes["percent_above"], float) / 100, max(summary["traces"], 1)
+    error = np.sqrt(share * (1 - share) / n)
+    axes.fill_between(
+        kev, 100 * (share - error), 100 * (share + error), color=COLOURS["data"], alpha=0.3
+    )
+    axes.loglog(kev, 100 * share, color=COLOURS["data"], label=f"measured, {n:,} traces")
+    law = RemainsLaw(
+        float(summary["rate_khz"]), float(summary["decay_us"]), tuple(energies_kev)
+    )
+    axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
+    twice = 2 * summary["error_kev"]
+    axes.axvline(twice, color="0.6", lw=0.8, ls=":", label="twice the error of a size")
+    axes.set_title(
+        f"{summary['rate_khz']:.2f} ± {summary['rate_error_khz']:.2f} kHz, "
+        f"decay {summary['decay_us']:.1f} µs"
+    )
+    axes.set_ylim(max(30 / n, 0.01), 100)
+    axes.set_xlabel("remainder at the first sample (keV)")
+    axes.set_ylabel("traces above (%)")
+    axes.legend()
+    return figure
+
+
+def _mark_peaks(axes: Axes, peaks: Mapping[str, float], span: tuple[float, float]) -> None:
     place = blended_transform_factory(axes.transData, axes.transAxes)
     inside = sorted((e, name) for name, e in peaks.items() if span[0] <= e <= span[1])
     previous, level = -np.inf, 0
@@ -266,7 +292,7 @@ def _mark_peaks(axes: Axes, peaks: Mapping[str, float], span: tuple[float, float
 def _draw(panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float) -> None:
     palette = colours(windows)
     for method, window in windows.items():
-        time_ns, pulse = _aligned(method, window, dt_ns)
+        time_ns, pulse = _aligned(window, dt_ns)
         # a broad grey line, so that a method which agrees does not hide the data
         look: dict[str, Any] = (
             {"color": "0.65", "linewidth": 3.5}
@@ -283,11 +309,11 @@ def _draw_differences(
     panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float
 ) -> None:
     palette = colours(windows)
-    time_ns, data = _aligned("data", windows["data"], dt_ns)
+    time_ns, data = _aligned(windows["data"], dt_ns)
     for method, window in windows.items():
         if method == "data":
             continue
-        difference = 100 * (_aligned(method, window, dt_ns)[1] - data)
+        difference = 100 * (_aligned(window, dt_ns)[1] - data)
         for axes in panels:
             axes.plot(
                 time_ns, difference, color=palette[method], linewidth=1.0, gid=GROUP + method
@@ -297,16 +323,8 @@ def _draw_differences(
     linear_within(panels[0], LINEAR)
 
 
-def _aligned(method: str, window: FloatArray, dt_ns: float) -> tuple[Values, FloatArray]:
+def _aligned(window: FloatArray, dt_ns: float) -> tuple[Values, FloatArray]:
     """Time from the crossing in ns and the pulse, NaN outside its record."""
     length = window.shape[1]
-    pulse = align_half_maximum(window, length, length)[0]
-    if not np.isfinite(pulse).any():
-        raise CpunetError(
-            f"the pulse of “{label(method)}” never crosses half of its maximum; choose another"
-        )
-    return (np.arange(2 * length) - length) * dt_ns, pulse
-
-
-def _decay(slope_per_ms: float) -> str:
-    return f"{-1e3 / slope_per_ms:.3g} µs" if slope_per_ms else "none"
+    time_ns = (np.arange(2 * length) - length) * dt_ns
+    return time_ns, align_half_maximum(window, length, length)[0]
