@@ -30,9 +30,8 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
-from cpunet.validation.paired import PairedScores, pair_squares, scores_of_squares
 from cpunet.validation.report import Report
-from cpunet.validation.truth import Responses
+from cpunet.validation.truth import PairedScores, Responses, pair_squares, scores_of_squares
 
 Values = npt.NDArray[np.float64]
 DT_NS = 16.0

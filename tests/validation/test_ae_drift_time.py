@@ -1,4 +1,4 @@
-"""A/E against the drift time, and by ranges of energy, against plain counting."""
+"""A/E against the drift time, against plain counting and analytic quantiles."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from cpunet.errors import CpunetError
-from cpunet.validation.a_over_e import sideband_survival
 from cpunet.validation.ae_drift_time import ae_against_drift_time, ae_figure
-from cpunet.validation.range_survival import peak_survival, survival_by_range
 from cpunet.validation.run_figures import roc_figure
 from synthetic import require_drawn
 
@@ -79,91 +76,6 @@ def test_a_bin_with_few_events_is_missing():
     table = ae_against_drift_time(amplitude, time, bins=1)
     assert "(at least 10 are needed)" in table["methods"]["raw"][0]["missing"]
     require_drawn(ae_figure(table, "SEP"))
-
-
-def test_data_without_events_have_no_bins():
-    nothing = {"data": np.full(5, np.nan)}
-    assert (
-        "no measured pulse has an amplitude"
-        in ae_against_drift_time(nothing, nothing)["missing"]
-    )
-
-
-def test_survival_of_a_line_is_that_of_its_own_events():
-    rng = np.random.default_rng(8)
-    n_line, n_flat = 40_000, 60_000
-    energy = np.r_[rng.normal(2103.5, 1, n_line), rng.uniform(2050, 2150, n_flat)]
-    amplitude = np.r_[rng.random(n_line) + 0.2, rng.random(n_flat)]
-    amplitude[:10] = np.nan
-    found = peak_survival(
-        amplitude, energy, 0.7, (2098.5, 2108.5), [(2060, 2090), (2117, 2147)]
-    )
-    assert found["survival"] == pytest.approx(50, abs=1)
-    assert found["scale"] == pytest.approx(10 / 60)
-    assert found["undefined"] == 10
-    in_peak = (energy >= 2098.5) & (energy < 2108.5) & np.isfinite(amplitude)
-    assert found["peak"] == in_peak.sum()
-    assert found["peak_pass"] == (amplitude[in_peak] >= 0.7).sum()
-    survival, std = sideband_survival(
-        found["peak_pass"], found["peak"], found["sideband_pass"], found["sideband"], 1 / 6
-    )
-    assert found["survival"] == pytest.approx(survival)
-    assert found["survival_std"] == pytest.approx(std)
-    json.dumps(found, allow_nan=False)
-
-
-def test_a_continuum_has_nothing_subtracted():
-    found = peak_survival(
-        np.array([0.1, 0.5, 0.6, 0.9]), np.array([2039.0, 2039, 2004, 2074]), 0.5, (2004, 2074)
-    )
-    assert (found["peak"], found["peak_pass"], found["scale"]) == (3, 2, 0)
-    assert found["survival"] == pytest.approx(200 / 3)
-
-
-def test_no_error_is_zero_where_all_or_none_survive():
-    energies = np.full(8, 2039.0)
-    for cut in (0.0, 2.0):
-        for sidebands in ([], [(1990, 2000)]):  # without events
-            found = peak_survival(np.ones(8), energies, cut, (2004, 2074), sidebands)
-            assert 5 < found["survival_std"] < 15
-
-
-@pytest.mark.parametrize(
-    ("cut", "peak", "sidebands", "reason"),
-    [
-        (0.5, (100, 110), [], "no events from 100 to 110 keV"),
-        (np.nan, (2000, 2010), [], "there is no cut"),
-        (0.5, (2000, 2010), [(2010, 2012)], "the sidebands leave no events of 3"),
-    ],
-)
-def test_without_events_there_is_a_reason(cut, peak, sidebands, reason):
-    energies = np.array([2005.0, 2005, 2005, 2011])
-    found = peak_survival(np.ones(4), energies, cut, peak, sidebands)
-    assert reason in found["missing"]
-    assert "survival" not in found
-
-
-@pytest.mark.parametrize(
-    ("peak", "sidebands"), [((5, 5), []), ((0, 10), [(8, 20)]), ((0, 10), [(30, 20)])]
-)
-def test_ranges_that_mean_nothing_are_refused(peak, sidebands):
-    with pytest.raises(CpunetError, match="range"):
-        peak_survival(np.ones(3), np.ones(3), 0.5, peak, sidebands)
-
-
-def test_every_range_and_method_with_its_own_cut():
-    amplitude = {"data": np.array([0.4, 0.6]), "ren": np.array([0.4, 0.6])}
-    energy = dict.fromkeys(amplitude, np.array([10.0, 10.0]))
-    table = survival_by_range(
-        amplitude,
-        energy,
-        {"data": 0.5, "ren": 0.3},
-        {"line": ((9, 11), [(20, 30)])},
-        {"continuum": (5, 15)},
-    )
-    assert list(table) == ["line", "continuum"]
-    assert table["line"]["data"]["survival"] == 50
-    assert table["continuum"]["ren"]["survival"] == 100
 
 
 def test_figures_draw_what_is_in_the_tables():

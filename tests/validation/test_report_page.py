@@ -222,7 +222,7 @@ def test_many_figures_are_folded(tmp_path):
 
 
 def test_paper_carries_figures_of_all_peaks_and_no_long_tables(tmp_path):
-    names = ["SEP drift_time", "SEP superpulses", "SEP A over E and drift time", "losses"]
+    names = ["SEP drift_time", "SEP superpulses", "SEP A over E", "losses"]
     metrics = {"noise": {"a": 1.0}, "training": {"peak": "FEP"}}
     write_report(tmp_path, metrics, {name: figure() for name in names}, [])
     html = (tmp_path / "report.html").read_text()

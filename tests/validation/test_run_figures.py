@@ -17,7 +17,7 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.recipes import load_recipe
 from cpunet.validation import run_figures
 from cpunet.validation.comparisons import compare
-from cpunet.validation.mean_pulse import MeanPulse
+from cpunet.validation.slices import MeanPulse
 from synthetic import require_drawn
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
@@ -132,7 +132,7 @@ def test_histograms_of_one_event_and_of_none_are_drawn():
 
 
 def mean_pulse(windows: np.ndarray) -> MeanPulse:
-    return MeanPulse.of_aligned(align_half_maximum(windows, 100, 150), 100)
+    return MeanPulse.of(align_half_maximum(windows, 100, 150))
 
 
 def test_mean_pulse_differences_are_in_percent_of_the_charge():

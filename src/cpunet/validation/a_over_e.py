@@ -9,21 +9,25 @@ Prepared pulses are normalised, so that `parameters.current_amplitude` is A/E al
 The slight dependence of A/E on the energy, which experiments correct for before the cut,
 is left in: its physics is the same in data and simulation, and the survival is no test of it.
 Only the low side is cut; events near the contacts have a high A/E and need another cut.
+
+Under a gamma line there is background, mostly Compton events of other lines, which the cut
+removes more or less than the events of the line.  For the survival by ranges of energy it is
+estimated from sidebands and subtracted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.errors import CpunetError
 from cpunet.validation.resampling import resampled_quantiles
 
 Values = npt.NDArray[np.float64]
-PeakTable = dict[str, dict[str, float | None]]
+Range = tuple[float, float]
+ByPeak = Mapping[str, Mapping[str, Values]]
 
 ACCEPTANCE = 0.9  # fraction of the DEP that survives
 MIN_N = 20  # events of the DEP: two below the cut
@@ -31,8 +35,7 @@ DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
 
 
-@dataclass(frozen=True)
-class PeakSurvival:
+class PeakSurvival(NamedTuple):
     """Survival of one peak after the cut.
 
     Attributes
@@ -46,14 +49,14 @@ class PeakSurvival:
     std: float
 
 
-@dataclass(frozen=True)
-class Survival:
+class Survival(NamedTuple):
     """The cut and the survival of each peak.
 
     Attributes
     ----------
     cut, cut_std
-        Lowest A/E that survives, in pulse heights per sample, and its error.
+        Lowest A/E that survives, in pulse heights per sample, and its error; NaN if fewer
+        than 20 events of the DEP have an A/E.
     peaks
         Survival of the other peaks.
     """
@@ -97,11 +100,6 @@ def ae_survival(
     Survival
         Cut, and survival in percent by peak.
 
-    Raises
-    ------
-    CpunetError
-        If fewer than 20 events of the DEP have a finite amplitude.
-
     Examples
     --------
     Of 99 equidistant values the cut is the 10th, and 90 of the 99 survive:
@@ -111,14 +109,9 @@ def ae_survival(
     >>> round(found.cut, 6), round(found.peaks["SEP"].survival, 2)
     (10.0, 90.91)
     """
-    if bootstraps < 2:
-        raise CpunetError(f"bootstraps is {bootstraps}; a spread needs 2 or more")
     dep = dep_ae[np.isfinite(dep_ae)]
     if dep.size < MIN_N:
-        raise CpunetError(
-            f"{dep.size} events of the double-escape peak have an A/E; "
-            f"a cut needs {MIN_N} or more"
-        )
+        return Survival(np.nan, np.nan, dict.fromkeys(others, PeakSurvival(np.nan, np.nan)))
     rng = np.random.default_rng(seed)
     # for this quantile the acceptance of new events is exact on average for any sample size
     cut = float(np.quantile(dep, 1 - ACCEPTANCE, method="weibull"))
@@ -131,22 +124,20 @@ def ae_survival(
 
 
 def survival_table(
-    data: Mapping[str, Values],
-    methods: Mapping[str, Mapping[str, Values]],
+    ae: ByPeak,
     *,
     bootstraps: int = BOOTSTRAPS,
     seed: int | np.random.Generator = 0,
-) -> dict[str, PeakTable]:
+) -> dict[str, Any]:
     """Survival of each peak in data and simulations, each after its own cut.
 
     Since each dataset has its own cut, a wrong scale of A/E alone makes no difference.
 
     Parameters
     ----------
-    data
-        Measured A/E by peak.
-    methods
-        A/E by method and peak: ``{"raw": …, "ren": …}`` and any others.
+    ae
+        A/E by peak and method, the measured ones under ``"data"``.  Methods that lack a peak
+        are left out.
     bootstraps, seed
         Number and seed of the bootstraps for the errors of the cuts.
 
@@ -169,34 +160,121 @@ def survival_table(
         ``sigma``
             difference divided by its error.
 
-    Raises
-    ------
-    CpunetError
-        If the data lack the DEP, or a method lacks a peak of the data.
+        Or ``missing`` with the reason, without the DEP.
     """
-    if DEP not in data:
-        raise CpunetError(f"the data lack peak {DEP}; the A/E cut needs it")
-    for method, peaks in methods.items():
-        if absent := data.keys() - peaks.keys():
-            raise CpunetError(f"{method}: peak {min(absent)} is missing; translate it too")
+    if DEP not in ae:
+        return {"missing": f"the data lack peak {DEP}; the A/E cut needs it"}
     rng = np.random.default_rng(seed)
-    sets = {"data": data, **methods}
-    found: dict[str, Survival | None] = {}
-    for method, peaks in sets.items():
-        others = {name: peaks[name] for name in data if name != DEP}
-        enough = np.isfinite(peaks[DEP]).sum() >= MIN_N
-        found[method] = (
-            ae_survival(peaks[DEP], others, bootstraps=bootstraps, seed=rng) if enough else None
+    methods = [
+        m for m in next(iter(ae.values())) if all(m in of_peak for of_peak in ae.values())
+    ]
+    methods.sort(key=lambda method: method != "data")
+    found = {
+        method: ae_survival(
+            ae[DEP][method],
+            {name: of_peak[method] for name, of_peak in ae.items() if name != DEP},
+            bootstraps=bootstraps,
+            seed=rng,
         )
-    table: dict[str, PeakTable] = {}
-    for name in data:
-        finite = {m: int(np.isfinite(peaks[name]).sum()) for m, peaks in sets.items()}
+        for method in methods
+    }
+    table: dict[str, Any] = {}
+    for name, of_peak in ae.items():
+        finite = {m: int(np.isfinite(of_peak[m]).sum()) for m in methods}
+        rows = _cut_rows(found) if name == DEP else _survival_rows(name, found)
         table[name] = {
-            "events": {**finite},
-            "missing": {m: len(peaks[name]) - finite[m] for m, peaks in sets.items()},
-            **(_cut_rows(found) if name == DEP else _survival_rows(name, found)),
+            "events": finite,
+            "missing": {m: len(of_peak[m]) - finite[m] for m in methods},
+        } | {
+            row: {m: float(v) if np.isfinite(v) else None for m, v in numbers.items()}
+            for row, numbers in rows.items()
         }
     return table
+
+
+def peak_survival(
+    amplitude: Values,
+    energy_kev: Values,
+    cut: float,
+    peak: Range,
+    sidebands: Sequence[Range] = (),
+) -> dict[str, Any]:
+    """Survival of a gamma line after a low-A/E cut, with its background subtracted.
+
+    Without sidebands, as for a range of the continuum, nothing is subtracted.
+
+    Parameters
+    ----------
+    amplitude, energy_kev
+        Current amplitude and energy in keV of each event, shape ``(n,)``.
+    cut
+        Lowest amplitude that survives.
+    peak
+        Range of the line in keV: lower end (included) and upper end (excluded).
+    sidebands
+        Ranges in keV beside the line that contain only background.
+
+    Returns
+    -------
+    dict
+        JSON-ready: ``survival`` and ``survival_std`` in percent (without the error of the
+        cut); ``peak``, ``peak_pass``, ``sideband``, ``sideband_pass``, the numbers of events
+        in the ranges and of those that survive; ``scale``, the width of the peak's range over
+        that of the sidebands; ``undefined``, events in the ranges without a finite amplitude,
+        which are not counted.  If the survival is undefined, ``missing`` with the reason.
+    """
+    finite = np.isfinite(amplitude)
+    in_peak = _within(energy_kev, [peak])
+    beside = _within(energy_kev, sidebands)
+    survives = finite & (np.where(finite, amplitude, -np.inf) >= cut)
+    counts = {
+        "peak": int((finite & in_peak).sum()),
+        "peak_pass": int((survives & in_peak).sum()),
+        "sideband": int((finite & beside).sum()),
+        "sideband_pass": int((survives & beside).sum()),
+    }
+    width = sum(high - low for low, high in sidebands)
+    scale = (peak[1] - peak[0]) / width if width else 0.0
+    result: dict[str, Any] = {
+        **counts,
+        "scale": scale,
+        "undefined": int((~finite & (in_peak | beside)).sum()),
+    }
+    return result | _survival(counts, scale, peak, cut)
+
+
+def survival_by_range(
+    amplitude: Mapping[str, Values],
+    energy_kev: Mapping[str, Values],
+    cuts: Mapping[str, float],
+    lines: Mapping[str, tuple[Range, Sequence[Range]]],
+    continua: Mapping[str, Range],
+) -> dict[str, dict[str, Any]]:
+    """`peak_survival` of every line and range, by method.
+
+    Parameters
+    ----------
+    amplitude, energy_kev, cuts
+        Amplitudes, energies in keV and cut by method; each method has its own cut (see
+        `ae_survival`), NaN if it has none.
+    lines
+        Range and sidebands of each gamma line in keV, by name.
+    continua
+        Ranges of the continuum in keV, by name.
+
+    Returns
+    -------
+    dict
+        Results of `peak_survival` by name and method.
+    """
+    ranges = dict(lines) | {name: (span, ()) for name, span in continua.items()}
+    return {
+        name: {
+            method: peak_survival(values, energy_kev[method], cuts[method], span, sidebands)
+            for method, values in amplitude.items()
+        }
+        for name, (span, sidebands) in ranges.items()
+    }
 
 
 def sideband_survival(
@@ -228,22 +306,12 @@ def sideband_survival(
         events (binomial if `scale` is 0), without the error of the cut.  NaN if no event of
         the peak is left.
 
-    Raises
-    ------
-    CpunetError
-        If more events survive than there are, or a number is negative.
-
     Examples
     --------
     >>> survival, std = sideband_survival(150, 400, 100, 200, scale=0.5)
     >>> round(survival, 2), round(std, 2)
     (33.33, 3.47)
     """
-    if not (0 <= peak_pass <= peak and 0 <= side_pass <= side and scale >= 0):
-        raise CpunetError(
-            f"{peak_pass} of {peak} events in the peak and {side_pass} of {side} beside it, "
-            f"scaled by {scale}, cannot survive; give counts of 0 or more"
-        )
     total = peak - scale * side
     if total <= 0:
         return float("nan"), float("nan")
@@ -275,27 +343,50 @@ def _peak_survival(values: Values, cut: float, cuts: Values) -> PeakSurvival:
     return PeakSurvival(100 * passing / n, error)
 
 
-def _cut_rows(found: Mapping[str, Survival | None]) -> PeakTable:
+def _cut_rows(found: Mapping[str, Survival]) -> dict[str, dict[str, float]]:
     return {
-        "cut": {m: s.cut if s else None for m, s in found.items()},
-        "cut_std": {m: s.cut_std if s else None for m, s in found.items()},
+        "cut": {m: s.cut for m, s in found.items()},
+        "cut_std": {m: s.cut_std for m, s in found.items()},
     }
 
 
-def _survival_rows(name: str, found: Mapping[str, Survival | None]) -> PeakTable:
-    values = {m: s.peaks[name].survival if s else np.nan for m, s in found.items()}
-    errors = {m: s.peaks[name].std if s else np.nan for m, s in found.items()}
+def _survival_rows(name: str, found: Mapping[str, Survival]) -> dict[str, dict[str, float]]:
+    values = {m: s.peaks[name].survival for m, s in found.items()}
+    errors = {m: s.peaks[name].std for m, s in found.items()}
     methods = [m for m in found if m != "data"]
     difference = {m: values[m] - values["data"] for m in methods}
     std = {m: float(np.hypot(errors[m], errors["data"])) for m in methods}
-    rows = {
+    return {
         "survival": values,
         "survival_std": errors,
         "difference": difference,
         "difference_std": std,
         "sigma": {m: difference[m] / std[m] for m in methods},
     }
-    return {
-        row: {m: v if np.isfinite(v) else None for m, v in numbers.items()}
-        for row, numbers in rows.items()
-    }
+
+
+def _within(energy_kev: Values, ranges: Sequence[Range]) -> npt.NDArray[np.bool_]:
+    inside = np.zeros(len(energy_kev), bool)
+    for low, high in ranges:
+        inside |= (energy_kev >= low) & (energy_kev < high)
+    return inside
+
+
+def _survival(
+    counts: Mapping[str, int], scale: float, peak: Range, cut: float
+) -> dict[str, Any]:
+    if not np.isfinite(cut):
+        return {"missing": "there is no cut: too few events of the double-escape peak"}
+    if not counts["peak"]:
+        return {"missing": f"no events from {peak[0]:g} to {peak[1]:g} keV"}
+    survival, std = sideband_survival(
+        counts["peak_pass"], counts["peak"], counts["sideband_pass"], counts["sideband"], scale
+    )
+    if not np.isfinite(survival):
+        return {
+            "missing": f"the sidebands leave no events of {counts['peak']} "
+            f"from {peak[0]:g} to {peak[1]:g} keV"
+        }
+    if not scale or not std:
+        std = 100 * survival_error(counts["peak_pass"], counts["peak"])
+    return {"survival": survival, "survival_std": std}

@@ -18,11 +18,10 @@ from cpunet.translation.translator import IREN, REN
 from cpunet.validation.ae_drift_time import ae_figure
 from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
 from cpunet.validation.ae_energy_figure import ae_energy_figure
-from cpunet.validation.baseline_spectra import spectrum_of_noise
 from cpunet.validation.comparisons import Comparison
-from cpunet.validation.evaluation import Evaluation
-from cpunet.validation.peak_details import PeakDetails
-from cpunet.validation.peak_sets import PeakSets
+from cpunet.validation.evaluation import Evaluation, PeakDetails
+from cpunet.validation.noise import spectrum_of_noise
+from cpunet.validation.peaks import PeakSets
 from cpunet.validation.pulse_figures import (
     DataPulse,
     single_pulse_figure,
@@ -38,7 +37,7 @@ from cpunet.validation.run_figures import (
     parameter_histograms,
     roc_figure,
 )
-from cpunet.validation.slice_figure import slice_figure
+from cpunet.validation.slices import slice_figure
 
 # methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
@@ -105,10 +104,8 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
     row = _drawable(peak)
     if row is not None:
         made["single pulse"] = _single_pulse(peak, row, found)
-    if details.slices:
-        made["superpulses"] = _superpulses(details, peak)
-    if "missing" not in details.ae_against_time:
-        made["A over E"] = _ae(details, name)
+    made["superpulses"] = _superpulses(details, peak)
+    made["A over E"] = _ae(details, name)
     if "missing" not in scores["noise"]["data"]:
         shown = ("frequency_mhz", "data", "ren")
         noise = {method: n for method, n in scores["noise"].items() if method in shown}

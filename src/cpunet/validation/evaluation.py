@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +13,67 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
+from cpunet.plotting import NO_NOISE
 from cpunet.progress import stage
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.parameters import Values
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from cpunet.translation.translator import IREN, REN
-from cpunet.validation.energy_ranges import (
-    ae_against_energy,
-    range_survivals,
-    validation_selection,
-)
+from cpunet.validation.a_over_e import DEP, Range, survival_by_range, survival_table
+from cpunet.validation.ae_drift_time import ae_against_drift_time
+from cpunet.validation.ae_energy import against_energy
 from cpunet.validation.methods import fit_baseline_methods, translate_all
-from cpunet.validation.peak_details import PeakDetails, peak_details
-from cpunet.validation.peak_sets import PeakSets, current_amplitudes, peak_sets
-from cpunet.validation.scoring import ByMethod, score_peak, survivals
+from cpunet.validation.peaks import (
+    ByMethod,
+    PeakSets,
+    current_amplitudes,
+    peak_sets,
+    score_peak,
+)
+from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
 from cpunet.validation.truth import Responses
 from cpunet.validation.verdicts import summaries, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
+# numbers of the noise that are shown beside each other; its spectrum is with the scores
+NOISE = ("n", "samples", "rms", "rms_std", "missing")
+AGAINST_DATA = ("rms_ratio", "sigma", "worst_band_sigma", "spectrum_sigma")
+
+
+@dataclass(frozen=True, eq=False)
+class PeakDetails:
+    """Comparisons of one peak beyond distributions, each with a figure.
+
+    Parameters
+    ----------
+    means, slices
+        Mean pulses by method, of all pulses and in slices of rise time.
+    ae_against_time
+        Result of `ae_against_drift_time`.
+    """
+
+    means: Mapping[str, MeanPulse]
+    slices: Mapping[str, Slices]
+    ae_against_time: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, peak: PeakSets, values: ByMethod) -> PeakDetails:
+        """Compare the pulses with noise, of which these are the parameters."""
+        noisy = {m: v for m, v in values.items() if not m.endswith(NO_NOISE)}
+        rise, amplitude, time = (
+            {m: v[name] for m, v in noisy.items()}
+            for name in ("rise_01_90", "current_amplitude", "drift_time")
+        )
+        means, slices = aligned_means(peak.by_method(), rise)
+        return cls(means, slices, ae_against_drift_time(amplitude, time))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,31 +142,62 @@ def evaluate(
     made = translate_all(ren, others, sim_set, responses, seed)
     amplitudes = current_amplitudes(sim_set, data_set, made)
     sets = [peak_sets(name, recipe, sim_set, data_set, made, amplitudes) for name in names]
-    values, peaks = _scores(sets, recipe, seed)
+    values: dict[str, ByMethod] = {}
+    peaks: dict[str, Any] = {}
+    with stage("Scoring", len(sets)) as bar:
+        for peak in sets:
+            values[peak.name], peaks[peak.name] = score_peak(peak, recipe, seed)
+            bar.update(1)
     scored = [peak for peak in sets if values[peak.name]]
     if not scored:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    details = _details(scored, values)
-    kept = survivals(values, seed)
+    details: dict[str, PeakDetails] = {}
+    with stage("Comparing in detail", len(scored)) as bar:
+        for peak in scored:
+            details[peak.name] = PeakDetails.of(peak, values[peak.name])
+            bar.update(1)
+    kept = survival_table(
+        {
+            name: {method: v["current_amplitude"] for method, v in values[name].items()}
+            for name in details
+        },
+        seed=seed,
+    )
+    data_kev, sim_kev = (side.prepared.pulses.energy_kev for side in (data_set, sim_set))
+    energies = {method: data_kev if method == "data" else sim_kev for method in amplitudes}
     known = None if run.fit is None else run.fit.remains
     metrics = {
         "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
-            "survival by energy range": range_survivals(
-                sim_set, data_set, amplitudes, kept, recipe
-            ),
+            "survival by energy range": _range_survivals(amplitudes, energies, kept, recipe),
             "A/E against drift time": {
                 name: of_peak.ae_against_time for name, of_peak in details.items()
             },
         },
-        "ae_energy": ae_against_energy(sim_set, data_set, amplitudes, recipe),
-        "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
-        "noise": {name: _noise(peaks[name]["noise"]) for name in details},
+        "ae_energy": against_energy(
+            {method: amplitudes[method] for method in ("data", "ren")},
+            energies,
+            {name: span for name, (span, _) in _lines(recipe).items()},
+        ),
+        "drift_slices": {
+            name: slice_table(of_peak.slices, data_set.dt_ns)
+            for name, of_peak in details.items()
+        },
+        "noise": {
+            name: {
+                method: {
+                    key: value for key, value in found.items() if key in NOISE + AGAINST_DATA
+                }
+                for method, found in peaks[name]["noise"].items()
+                if method != "frequency_mhz"
+            }
+            for name in details
+        },
         "rivals": {
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
@@ -148,7 +215,10 @@ def evaluate(
             "data": data_set.prepared.rejections,
         },
     }
-    metrics["verdicts"] = {"summary": _summary(metrics), "table": verdict_table(metrics)}
+    metrics["verdicts"] = {
+        "summary": [words["ren"] for words in summaries(metrics).values() if "ren" in words],
+        "table": verdict_table(metrics),
+    }
     return Evaluation(ren, iren, run, sim_set, data_set, sets, values, details, metrics)
 
 
@@ -171,29 +241,52 @@ def _load_both(
     return sim_set, data_set
 
 
-def _scores(
-    sets: Sequence[PeakSets], recipe: Recipe, seed: int
-) -> tuple[dict[str, ByMethod], dict[str, Any]]:
-    """Parameters by peak and method, and the scores of each peak."""
-    values: dict[str, ByMethod] = {}
-    scores: dict[str, Any] = {}
-    with stage("Scoring", len(sets)) as bar:
-        for peak in sets:
-            values[peak.name], scores[peak.name] = score_peak(peak, recipe, seed)
-            bar.update(1)
-    return values, scores
+def validation_selection(names: Sequence[str], recipe: Recipe) -> EnergySelection:
+    """Select named peaks and ranges, together with all sidebands and continua."""
+    chosen = parse_selection(",".join(names), recipe.peaks)
+    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    more += recipe.scores.continuum_kev.values()
+    return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
-def _details(
-    scored: Sequence[PeakSets], values: Mapping[str, ByMethod]
-) -> dict[str, PeakDetails]:
-    """Further comparisons of each scored peak."""
-    details = {}
-    with stage("Comparing in detail", len(scored)) as bar:
-        for peak in scored:
-            details[peak.name] = peak_details(peak, values[peak.name])
-            bar.update(1)
-    return details
+def _range_survivals(
+    amplitudes: Mapping[str, Values],
+    energies: Mapping[str, Values],
+    ae_survival: Mapping[str, Any],
+    recipe: Recipe,
+) -> dict[str, Any]:
+    """A/E survival of gamma lines, sideband-subtracted, and of continua, after known cuts."""
+    cuts = ae_survival.get(DEP, {}).get("cut")
+    if not cuts:
+        return {"missing": f"there is no A/E cut: {ae_survival['missing']}"}
+    return survival_by_range(
+        {method: values for method, values in amplitudes.items() if method in cuts},
+        energies,
+        {method: np.nan if cut is None else cut for method, cut in cuts.items()},
+        {name: line for name, line in _lines(recipe).items() if name != DEP},
+        recipe.scores.continuum_kev,
+    )
+
+
+def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
+    """Range and sidebands of each peak."""
+    near, far = recipe.scores.sideband_kev
+    widest = max(peak.half_width_kev for peak in recipe.peaks.values())
+    if widest > near:
+        raise CpunetError(
+            f"recipe {recipe.name}: sidebands from {near:g} keV beside a line overlap its "
+            f"range of {widest:g} keV; give a larger scores.sideband_kev"
+        )
+    return {
+        name: (
+            (peak.energy_kev - peak.half_width_kev, peak.energy_kev + peak.half_width_kev),
+            [
+                (peak.energy_kev - far, peak.energy_kev - near),
+                (peak.energy_kev + near, peak.energy_kev + far),
+            ],
+        )
+        for name, peak in recipe.peaks.items()
+    }
 
 
 def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, Any]:
@@ -236,20 +329,3 @@ def period_of(path: Path) -> str | None:
 def _short(path: Path) -> str:
     """Name of a file and its folder, which do not depend on where a study is stored."""
     return "/".join(path.absolute().parts[-2:])
-
-
-def _noise(spectra: Mapping[str, Any]) -> dict[str, Any]:
-    """RMS of the noise by method, without the spectrum."""
-    sizes, judged = ("n", "samples", "rms", "rms_std"), ("rms_ratio", "sigma")
-    shown = (*sizes, *judged, "worst_band_sigma", "spectrum_sigma", "missing")
-    return {
-        method: {key: found[key] for key in shown if key in found}
-        for method, found in spectra.items()
-        if method != "frequency_mhz"
-    }
-
-
-def _summary(metrics: Mapping[str, Any]) -> list[str]:
-    """First lines of the report: verdict on the translation by peak."""
-    found = summaries(metrics)
-    return [of_peak["ren"] for of_peak in found.values() if "ren" in of_peak]

@@ -36,8 +36,7 @@ from cpunet.translation.learned_remains import wanted_remains
 from cpunet.translation.options import LEARNED
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
-from cpunet.validation.paired import pair_squares
-from cpunet.validation.truth import Responses
+from cpunet.validation.truth import Responses, pair_squares
 
 log = logging.getLogger(__name__)
 

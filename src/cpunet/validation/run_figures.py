@@ -32,7 +32,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.validation.comparisons import Comparison, histogram
-from cpunet.validation.mean_pulse import MeanPulse
+from cpunet.validation.slices import BEFORE, MeanPulse
 
 Values = npt.NDArray[np.float64]
 
@@ -255,7 +255,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     palette = colours(sets)
     means = {method: averaged.mean for method, averaged in sets.items()}
     data = sets["data"]
-    time_ns = (np.arange(len(data.mean)) - data.before) * dt_ns
+    time_ns = (np.arange(len(data.mean)) - BEFORE) * dt_ns
     figure = Figure(figsize=(5.6, 4.8))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     # the translation last, so that it is on top

@@ -12,19 +12,16 @@ well before the start of nine out of ten measured pulses, and the others are lef
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
-from cpunet.errors import CpunetError
 from cpunet.plotting import colours, group, label, styled
 from cpunet.pulses.container import FloatArray
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Values = npt.NDArray[np.float64]
 
@@ -65,11 +62,6 @@ def baseline_spectra(
         ``spectrum_sigma``, which corrects the latter for the number of bands; or ``missing``
         with the reason.
 
-    Raises
-    ------
-    CpunetError
-        If the data are missing, or the numbers of pulses and start samples differ.
-
     Examples
     --------
     >>> rng = np.random.default_rng(1)
@@ -79,10 +71,9 @@ def baseline_spectra(
     >>> round(found["ren"]["rms_ratio"], 1), found["ren"]["sigma"] > 5
     (1.1, True)
     """
-    if "data" not in windows:
-        raise CpunetError("the measured pulses are missing; their noise is the reference")
-    free = {method: _free(pulses, begins, method) for method, pulses in windows.items()}
-    samples = min(samples, _stretch(free["data"]))
+    free = {method: begins[method] - MARGIN for method in windows}
+    known = free["data"][np.isfinite(free["data"])]
+    samples = min(samples, int(np.quantile(known, EARLY_SHARE)) if known.size else 0)
     if samples < MIN_SAMPLES:
         few = f"{max(samples, 0)} samples before measured pulses begin"
         early = f"{few}; {MIN_SAMPLES} are needed"
@@ -114,8 +105,6 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     peak
         Name of the gamma line, for the title.
     """
-    from matplotlib.figure import Figure
-
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
     palette = colours(methods)
     frequency = np.asarray(found["frequency_mhz"])
@@ -144,22 +133,6 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     above.legend()
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
-
-
-def _free(windows: FloatArray, begins: Mapping[str, Values], method: str) -> Values:
-    """Number of samples of each window before its pulse; NaN if unknown."""
-    known = begins.get(method, np.empty(0))
-    if known.shape != (len(windows),):
-        raise CpunetError(
-            f"{method}: {len(windows)} pulses beside {known.size} beginnings; give one for each"
-        )
-    return known - MARGIN
-
-
-def _stretch(free: Values) -> int:
-    """Number of samples before the pulse in all measured pulses but the earliest."""
-    known = free[np.isfinite(free)]
-    return int(np.quantile(known, EARLY_SHARE)) if known.size else 0
 
 
 def _band_edges(samples: int) -> Values:

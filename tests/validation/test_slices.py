@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from cpunet.errors import CpunetError
 from cpunet.pulses.half_maximum import align_half_maximum
-from cpunet.validation.drift_slices import (
+from cpunet.validation.slices import (
+    AFTER,
+    BEFORE,
     Slices,
     slice_edges,
+    slice_figure,
     slice_residuals,
     slice_table,
     sliced,
 )
-from cpunet.validation.slice_figure import slice_figure
 from synthetic import require_drawn
 
 DT = 16.0
-BEFORE, AFTER = 60, 80
 
 
 def pulses(rng, n, width=5.0, noise=0.002):
@@ -33,13 +33,13 @@ def pulses(rng, n, width=5.0, noise=0.002):
     return windows.astype(np.float32), drift[:, 0] * DT
 
 
-def superpulses(windows, times, edges, before, after) -> Slices:
-    return sliced(align_half_maximum(windows, before, after), times, edges, before)
+def superpulses(windows, times, edges) -> Slices:
+    return sliced(align_half_maximum(windows, BEFORE, AFTER), times, edges)
 
 
 def drawn(rng, n, edges, **kwargs) -> Slices:
     windows, times = pulses(rng, n, **kwargs)
-    return superpulses(windows, times, edges, BEFORE, AFTER)
+    return superpulses(windows, times, edges)
 
 
 def test_edges_hold_equally_many_and_ignore_what_is_not_finite():
@@ -49,11 +49,6 @@ def test_edges_hold_equally_many_and_ignore_what_is_not_finite():
     assert counts.tolist() == [800] * 5
 
 
-def test_times_without_one_are_refused():
-    with pytest.raises(CpunetError, match="no measured pulse has a rise time"):
-        slice_edges(np.full(3, np.nan))
-
-
 def test_superpulses_are_those_of_a_plain_loop():
     rng = np.random.default_rng(1)
     windows, times = pulses(rng, 90)
@@ -61,7 +56,7 @@ def test_superpulses_are_those_of_a_plain_loop():
     times[:3] = [np.nan, 399.0, 1501.0]
     times[3] = 1500.0  # the last edge is included
     windows[4], times[4] = 0.0, 600.0
-    found = superpulses(windows, times, edges, BEFORE, AFTER)
+    found = superpulses(windows, times, edges)
     assert found.left_out["no_time"] == 1
     assert found.left_out["outside"] == 1 + sum((times < 400) | (times > 1500)) - 1
     assert found.left_out["unaligned"] == 1
@@ -78,7 +73,7 @@ def test_superpulses_are_those_of_a_plain_loop():
 def test_the_mean_of_many_equal_pulses_is_each_of_them():
     pulse = np.linspace(0, 0.97, 20, dtype=np.float32)
     many = np.tile(pulse, (20_000, 1))
-    (found,) = sliced(many, np.ones(20_000), np.array([0.0, 2.0]), 10).pulses
+    (found,) = sliced(many, np.ones(20_000), np.array([0.0, 2.0])).pulses
     np.testing.assert_allclose(found.mean, pulse, atol=1e-7)
     np.testing.assert_allclose(found.error, 0, atol=1e-9)
 
@@ -87,7 +82,7 @@ def test_without_a_difference_z_is_that_of_chance():
     rng = np.random.default_rng(2)
     edges = np.linspace(20, 120, 4) * DT
     sets = [
-        slice_table({"data": drawn(rng, 150, edges), "ren": drawn(rng, 200, edges)}, DT, 50)[
+        slice_table({"data": drawn(rng, 150, edges), "ren": drawn(rng, 200, edges)}, DT)[
             "slices"
         ]["ren"]
         for _ in range(60)
@@ -104,29 +99,29 @@ def test_without_a_difference_z_is_that_of_chance():
 def test_a_known_difference_is_found_where_it_is():
     windows, times = pulses(np.random.default_rng(3), 400, noise=1e-5)
     edges = slice_edges(times, 4)
-    data = superpulses(windows, times, edges, BEFORE, AFTER)
+    data = superpulses(windows, times, edges)
     other = windows.copy()
     long = times >= edges[3]
     # a step of 1 % of the height after the edge, in the slowest slice only
     other[long, 180:] += 0.01
-    found = superpulses(other, times, edges, BEFORE, AFTER)
-    table = slice_table({"data": data, "ren": found}, DT, 50)
+    found = superpulses(other, times, edges)
+    table = slice_table({"data": data, "ren": found}, DT)
     rows = table["slices"]["ren"]
     assert [row["rms"] for row in rows[:3]] == [0, 0, 0]
     assert rows[3]["largest"] == pytest.approx(1.0, abs=0.15)
     assert rows[3]["largest_at_ns"] > 20 * DT
     # the crossing lies at sample 150-152, and the higher maximum moves it a little
-    assert rows[3]["rms"] == pytest.approx(100 * 0.01 * np.sqrt(21 / 101), rel=0.2)
+    assert rows[3]["rms"] == pytest.approx(100 * 0.01 * np.sqrt(72 / 201), rel=0.2)
     json.dumps(table, allow_nan=False)
 
 
 def test_few_pulses_are_missing_with_the_reason():
     windows, times = pulses(np.random.default_rng(4), 60)
     edges = slice_edges(times, 2)
-    data = superpulses(windows, times, edges, BEFORE, AFTER)
+    data = superpulses(windows, times, edges)
     early, late = np.flatnonzero(times < edges[1]), np.flatnonzero(times > edges[1])
     few = np.concatenate([early[:9], late])
-    method = superpulses(windows[few], times[few], edges, BEFORE, AFTER)
+    method = superpulses(windows[few], times[few], edges)
     rows = slice_table({"data": data, "raw": method}, DT)["slices"]["raw"]
     assert rows[0]["missing"] == "9 pulses beside 30 measured ones (at least 10 are needed)"
     assert "missing" not in rows[1]
@@ -136,24 +131,12 @@ def test_few_pulses_are_missing_with_the_reason():
 def test_nothing_in_a_slice_is_no_failure():
     windows, times = pulses(np.random.default_rng(5), 40)
     edges = slice_edges(times, 2)
-    data = superpulses(windows, times, edges, BEFORE, AFTER)
-    none = superpulses(windows, times + 1e6, edges, BEFORE, AFTER)
+    data = superpulses(windows, times, edges)
+    none = superpulses(windows, times + 1e6, edges)
     table = slice_table({"data": data, "raw": none}, DT)
     assert table["left_out"]["raw"]["outside"] == 40
     assert all(row["n"] == 0 and "missing" in row for row in table["slices"]["raw"])
     require_drawn(slice_figure({"data": data, "raw": none}, DT, "SEP"))
-
-
-def test_what_does_not_fit_is_refused():
-    windows, times = pulses(np.random.default_rng(6), 40)
-    data = superpulses(windows, times, slice_edges(times, 2), BEFORE, AFTER)
-    for other in (
-        superpulses(windows, times, slice_edges(times, 3), BEFORE, AFTER),
-        superpulses(windows, times, data.edges, BEFORE + 1, AFTER),
-        superpulses(windows, times, data.edges, BEFORE, AFTER + 1),
-    ):
-        with pytest.raises(CpunetError, match="cannot be compared"):
-            slice_residuals(data, other)
 
 
 def test_the_figure_has_a_column_for_each_slice():

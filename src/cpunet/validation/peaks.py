@@ -1,27 +1,35 @@
-"""The pulses of one peak by method, for a validation."""
+"""The pulses of one peak by method, and their scores."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.errors import CpunetError
 from cpunet.plotting import NO_NOISE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import Values, current_amplitude
+from cpunet.pulses.parameters import PARAMETERS, Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
+from cpunet.validation.comparisons import Comparison, compare
 from cpunet.validation.methods import Translations
-from cpunet.validation.paired import PairedScores, scores_of_squares
+from cpunet.validation.noise import baseline_spectra
+from cpunet.validation.truth import PairedScores, scores_of_squares
+from cpunet.validation.two_sample import classifier_auc
 from cpunet.validation.when_asked import WhenAsked
 
 MIN_N = 10  # minimum number of pulses of a distribution
+TESTED = 1000  # pulses per side in the classifier test: resolves an AUC to 0.013
 
 Rows = npt.NDArray[np.int64]
+ByMethod = dict[str, dict[str, Values]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +73,12 @@ class PeakSets:
         """Sampling period in ns."""
         return self.simulated.dt_ns
 
+    def rows(self, method: str) -> Rows:
+        """Rows of the pulses with noise of one method in its whole dataset."""
+        if method == "data":
+            return self.data_rows
+        return self.sim_rows if method == "raw" else self._prepared(self.made.whole[method])
+
     def by_method(self) -> WhenAsked[Pulses]:
         """Pulses with noise by method: the data, then from the simplest method to the truth.
 
@@ -74,23 +88,16 @@ class PeakSets:
             "data": lambda: self.data,
             "raw": lambda: self.raw,
         }
-        for name, whole in self.made.whole.items():
-            rows = self._whole(whole)
-            if len(rows) >= MIN_N or name == "ren":
-                makers[name] = partial(self._noisy, name, rows)
+        for name in self.made.whole:
+            if len(self.rows(name)) >= MIN_N or name == "ren":
+                makers[name] = partial(self._noisy, name)
         return WhenAsked(makers)
-
-    def amplitudes_of(self, method: str) -> Values:
-        """Current amplitudes of the pulses with noise of one method, see `by_method`."""
-        rows = {"data": self.data_rows, "raw": self.sim_rows}
-        chosen = rows[method] if method in rows else self._whole(self.made.whole[method])
-        return self.amplitudes[method][chosen]
 
     def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
         """Parameters of the noise-free pulses of the baseline methods and of the truth."""
         found = {}
         for name, kept in self.made.clean.items():
-            rows = self._whole(kept.whole)
+            rows = self._prepared(kept.whole)
             if name not in ("raw", "ren") and len(rows) >= MIN_N:
                 found[f"{name}{NO_NOISE}"] = {k: v[rows] for k, v in kept.parameters.items()}
         return found
@@ -129,11 +136,11 @@ class PeakSets:
         few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_N]
         return f"{' and '.join(few)} pulses (at least {MIN_N} are needed)" if few else None
 
-    def _whole(self, flags: npt.NDArray[np.bool_]) -> Rows:
+    def _prepared(self, flags: npt.NDArray[np.bool_]) -> Rows:
         return self.sim_rows[flags[self.sim_rows]]
 
-    def _noisy(self, name: str, rows: Rows) -> Pulses:
-        return Pulses.of(self.made.noisy[name][rows], dt_ns=self.dt_ns)
+    def _noisy(self, name: str) -> Pulses:
+        return Pulses.of(self.made.noisy[name][self.rows(name)], dt_ns=self.dt_ns)
 
 
 def current_amplitudes(
@@ -175,3 +182,111 @@ def peak_sets(
     sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
     rows = [np.flatnonzero(selection.select(side.energy_kev)) for side in (sim, data)]
     return PeakSets(name, sim, data, rows[0], rows[1], made, amplitudes)
+
+
+def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:
+    """Compare the pulses of a peak, method by method.
+
+    Parameters
+    ----------
+    peak
+        Pulses of the peak.
+    recipe
+        Recipe of the run.
+    seed
+        Seed of bootstraps and folds.
+
+    Returns
+    -------
+    values
+        Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, or only those
+        of `PARAMETERS` for methods without noise.  Empty if the peak is not scored.
+    scores
+        Entry of the peak in ``metrics.json``, ready for JSON.
+    """
+    scores: dict[str, Any] = {
+        "n_sim": len(peak.sim_rows),
+        "n_data": len(peak.data_rows),
+        "not_prepared": peak.not_prepared(),
+    }
+    missing = peak.missing()
+    if missing is not None:
+        return {}, scores | {"parameters": {}, "missing": missing}
+    pulses = peak.by_method()
+    values = {
+        method: all_parameters(
+            of_method,
+            recipe.preparation,
+            recipe.scores,
+            amplitudes=peak.amplitudes[method][peak.rows(method)],
+        )
+        for method, of_method in pulses.items()
+    } | peak.noise_free_parameters()
+    chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
+    scores["two_sample"] = classifier_tests(pulses, chief, seed)
+    scores["parameters"] = _compared(chief, recipe, seed)
+    further = {
+        method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
+        for method, of_method in values.items()
+        if not method.endswith(NO_NOISE)
+    }
+    scores["further"] = _compared(further, recipe, seed)
+    align, dt_ns = recipe.preparation.samples_before, peak.dt_ns
+    scores["noise"] = baseline_spectra(
+        {
+            method: of_method.waveforms[:, : recipe.preparation.baseline_samples].copy()
+            for method, of_method in pulses.items()
+        },
+        {method: align + values[method]["t01"] / dt_ns for method in pulses},
+        recipe.preparation.baseline_samples,
+        dt_ns,
+    )
+    paired = peak.paired_scores()
+    if paired is not None:
+        scores["paired"] = paired
+    return values, scores
+
+
+def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Comparison]:
+    methods = {method: of_method for method, of_method in values.items() if method != "data"}
+    return compare(values["data"], methods, recipe.scores, seed)
+
+
+def classifier_tests(
+    pulses: Mapping[str, Pulses], values: ByMethod, seed: int
+) -> dict[str, Any]:
+    """Classifier test between each method and the data, for one peak.
+
+    Parameters
+    ----------
+    pulses
+        Prepared pulses with noise by method, including ``"data"``.
+    values
+        Pulse-shape parameters of the pulses.
+    seed
+        Seed of the folds.
+
+    Returns
+    -------
+    dict
+        Fields of `cpunet.validation.two_sample.TwoSample` by method, or ``missing`` with the
+        reason.
+    """
+    tested: dict[str, Any] = {}
+    data = pulses["data"].waveforms
+    for method, others in pulses.items():
+        if method == "data":
+            continue
+        try:
+            result = classifier_auc(
+                data,
+                others.waveforms,
+                seed=seed,
+                features=(values["data"], values[method]),
+                largest=TESTED,
+            )
+        except CpunetError as error:
+            tested[method] = {"missing": str(error)}
+        else:
+            tested[method] = asdict(result)
+    return tested

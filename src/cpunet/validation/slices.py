@@ -1,0 +1,302 @@
+"""Mean pulses in slices of rise time: where in the detector a translation is wrong.
+
+Pulses of one slice come from the same regions of the detector and differ by their sites
+and by noise.  Their mean, aligned at half maximum, is the slice's mean pulse.  Its standard
+error is known, so a difference between simulation and data can be distinguished from chance.
+
+Pulses are ordered by their rise time from 1 to 90 % (``rise_01_90``), which starts with the
+pulse and ends while it still rises.  The paper's drift time ends at the maximum, which on a
+flat top depends on the noise and would smear the slices.
+
+The slices are bounded by quantiles of the rise times of the *data*.  Each method is sliced
+by its own rise times: a method with the wrong response has different events in a slice, which
+counts against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from cpunet.plotting import GROUP, colours, label, line_look, linear_within, styled
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.half_maximum import align_half_maximum
+
+Values = npt.NDArray[np.float64]
+
+BEFORE, AFTER = 100, 150  # samples of a mean pulse before and after half maximum
+SLICES = 4
+MIN_N = 10  # minimum pulses of a slice for an error of its mean
+EDGE_SAMPLES = 100  # about half maximum, in which differences are evaluated
+LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
+
+
+@dataclass(frozen=True, eq=False)
+class MeanPulse:
+    """The mean of pulses aligned at half maximum.
+
+    Attributes
+    ----------
+    mean, error
+        Mean and its standard error, shape ``(before + after,)``, in pulse heights; NaN where
+        fewer than 2 pulses contribute.  Errors of neighbouring samples are correlated.
+    n
+        Number of pulses in the mean.
+    """
+
+    mean: Values
+    error: Values
+    n: int
+
+    @classmethod
+    def of(cls, aligned: FloatArray) -> Self:
+        """Average pulses from `align_half_maximum`; those not aligned are left out.
+
+        Sums are in float64: those of ten thousand float32 are off by a part of their error.
+        """
+        count = np.isfinite(aligned).sum(axis=0)
+        mean = np.nansum(aligned, axis=0, dtype=float) / np.maximum(count, 1)
+        squares = np.nansum((aligned - mean) ** 2, axis=0)
+        error = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
+        mean, error = (np.where(count >= 2, values, np.nan) for values in (mean, error))
+        return cls(mean, error, int(np.isfinite(aligned).any(axis=1).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """The mean pulses of a dataset by rise time, and the number of pulses left out.
+
+    Attributes
+    ----------
+    pulses, edges
+        Mean pulse of each slice, and the edges of the slices in ns.
+    left_out
+        Number of pulses left out by reason: ``no_time``, ``outside`` the edges, ``unaligned``
+        (no crossing).
+    """
+
+    pulses: tuple[MeanPulse, ...]
+    edges: Values
+    left_out: dict[str, int]
+
+
+class Residual(NamedTuple):
+    """Mean pulse of a method minus that of the data, with its error, in pulse heights."""
+
+    difference: Values
+    error: Values
+
+    @property
+    def z(self) -> Values:
+        r"""Pull :math:`z = (\bar{x} - \bar{x}_{\mathrm{data}}) / \sigma`; NaN without error."""
+        known = self.error > 0
+        return np.where(known, self.difference / np.where(known, self.error, 1), np.nan)
+
+
+def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
+    """Edges of slices with equal numbers of measured pulses.
+
+    Parameters
+    ----------
+    rise_time
+        Rise times of the measured pulses in ns; NaN and infinity are ignored.
+    slices
+        Number of slices; one more edge is returned, in ns.
+
+    Examples
+    --------
+    >>> slice_edges(np.arange(101.0), slices=4)
+    array([  0.,  25.,  50.,  75., 100.])
+    """
+    finite = rise_time[np.isfinite(rise_time)]
+    return np.quantile(finite, np.linspace(0, 1, slices + 1))
+
+
+def aligned_means(
+    windows: Mapping[str, Pulses], rise_time: Mapping[str, Values]
+) -> tuple[dict[str, MeanPulse], dict[str, Slices]]:
+    """Mean pulse of all pulses and of each slice, by method.
+
+    Pulses are aligned once for both, one method at a time.
+
+    Parameters
+    ----------
+    windows
+        Prepared pulses by method, the measured ones under ``"data"``.
+    rise_time
+        Their rise times in ns.
+    """
+    edges, means, slices = slice_edges(rise_time["data"]), {}, {}
+    for method, times in rise_time.items():
+        aligned = align_half_maximum(windows[method].waveforms, BEFORE, AFTER)
+        means[method] = MeanPulse.of(aligned)
+        slices[method] = sliced(aligned, times, edges)
+    return means, slices
+
+
+def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
+    """Mean pulse of each slice.
+
+    Parameters
+    ----------
+    aligned
+        Pulses aligned by `align_half_maximum`, shape ``(n, samples)``.
+    rise_time
+        Rise time of each pulse in ns, shape ``(n,)``.
+    edges
+        Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
+    """
+    timed = np.isfinite(rise_time)
+    inside = timed & (rise_time >= edges[0]) & (rise_time <= edges[-1])
+    place = np.searchsorted(edges[1:-1], rise_time, side="right")
+    found = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
+    left_out = {
+        "no_time": int((~timed).sum()),
+        "outside": int((timed & ~inside).sum()),
+        "unaligned": int(inside.sum()) - sum(pulse.n for pulse in found),
+    }
+    return Slices(found, edges, left_out)
+
+
+def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]:
+    """Differences between the mean pulses of a method and those of the data.
+
+    Returns
+    -------
+    tuple
+        Residual of each slice; None where a side has fewer than 10 pulses.
+    """
+    return tuple(
+        None
+        if min(measured.n, other.n) < MIN_N
+        else Residual(other.mean - measured.mean, np.hypot(other.error, measured.error))
+        for measured, other in zip(data.pulses, method.pulses, strict=True)
+    )
+
+
+def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> dict[str, Any]:
+    """Deviations of each method's mean pulses from those of the data.
+
+    Parameters
+    ----------
+    sets
+        Mean pulses by method, the measured ones under ``"data"``.
+    dt_ns
+        Sampling period in ns.
+
+    Returns
+    -------
+    dict
+        JSON-ready:
+
+        ``edges_ns``
+            edges of the slices.
+        ``left_out``
+            number of pulses in no slice, by method and reason.
+        ``slices``
+            by method a list with, for each slice, ``n`` and ``n_data``; ``rms`` of the
+            residual and ``rms_error``, its expectation by chance, both in percent of full
+            charge; the ``largest`` residual in percent and its time from the crossing,
+            ``largest_at_ns``; ``mean_abs_z`` and ``rms_z``, mean absolute pull and RMS pull
+            (0.80 and 1 if there is no difference).  Or ``missing`` with the reason.
+    """
+    data = sets["data"]
+    return {
+        "edges_ns": [float(edge) for edge in data.edges],
+        "left_out": {method: dict(slices.left_out) for method, slices in sets.items()},
+        "slices": {
+            method: _rows(data, slices, dt_ns)
+            for method, slices in sets.items()
+            if method != "data"
+        },
+    }
+
+
+@styled
+def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
+    """Superpulses (top) and residuals with error bands (bottom), one column per slice.
+
+    Parameters
+    ----------
+    sets
+        Superpulses by method, the measured ones under ``"data"``; drawn in this order, later
+        ones on top.
+    dt_ns
+        Sampling period in ns.
+    peak
+        Name of the gamma line, for the title.
+    """
+    data = sets["data"]
+    n = len(data.pulses)
+    figure = Figure(figsize=(2.0 + 2.7 * n, 4.9))
+    grid = figure.subplots(2, n, sharex=True, sharey="row", height_ratios=(3, 2), squeeze=False)
+    time_ns = dt_ns * np.arange(-BEFORE, len(data.pulses[0].mean) - BEFORE, dtype=float)
+    palette = colours(sets)
+    for i, axes in enumerate(grid[0]):
+        low, high = data.edges[i : i + 2]
+        axes.set_title(f"{low:.0f} … {high:.0f} ns")
+        for method, slices in sets.items():
+            if slices.pulses[i].n:
+                look = line_look(method, palette[method])
+                axes.plot(time_ns, slices.pulses[i].mean, label=label(method), **look)
+        counts = ", ".join(str(slices.pulses[i].n) for slices in sets.values())
+        axes.text(0.97, 0.03, f"n = {counts}", ha="right", transform=axes.transAxes, size=8)
+    for method, slices in sets.items():
+        for axes, residual in zip(grid[1], slice_residuals(data, slices), strict=True):
+            if method == "data" or residual is None:
+                continue
+            middle, error = 100 * residual.difference, 100 * residual.error
+            look = {"color": palette[method], "gid": GROUP + method}
+            axes.plot(time_ns, middle, linewidth=1.0, **look)
+            axes.fill_between(time_ns, middle - error, middle + error, alpha=0.3, lw=0, **look)
+    for axes in grid[1]:
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.set_xlabel("Time from half maximum [ns]")
+    linear_within(grid[1, 0], LINEAR)
+    grid[1, 0].set_ylabel(f"Method − data\n[% of full charge,\nlinear within ± {LINEAR:g}]")
+    grid[0, 0].set_ylabel("Pulse height")
+    handles, names = grid[0, 0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        loc="outside upper left",
+        ncols=len(names),
+        title=f"{peak}: superpulses in slices of rise time 1–90 %; bands: ±1 standard error",
+        alignment="left",
+    )
+    grid[0, 0].set_xlim(time_ns[0], time_ns[-1])
+    return figure
+
+
+def _rows(data: Slices, method: Slices, dt_ns: float) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    residuals = slice_residuals(data, method)
+    for residual, own, measured in zip(residuals, method.pulses, data.pulses, strict=True):
+        row: dict[str, Any] = {"n": own.n, "n_data": measured.n}
+        if residual is None:
+            few = f"{own.n} pulses beside {measured.n} measured ones"
+            rows.append(row | {"missing": f"{few} (at least {MIN_N} are needed)"})
+            continue
+        near = slice(BEFORE - EDGE_SAMPLES, BEFORE + EDGE_SAMPLES + 1)
+        difference, error, z = (v[near] for v in (*residual, residual.z))
+        known, pulls = np.isfinite(difference), z[np.isfinite(z)]
+        worst = int(np.nanargmax(np.abs(difference)))
+        row |= {
+            "rms": 100 * _rms(difference[known]),
+            "rms_error": 100 * _rms(error[known]),
+            "largest": 100 * float(difference[worst]),
+            "largest_at_ns": float((worst + near.start - BEFORE) * dt_ns),
+            "mean_abs_z": float(np.abs(pulls).mean()) if pulls.size else None,
+            "rms_z": _rms(pulls) if pulls.size else None,
+        }
+        rows.append(row)
+    return rows
+
+
+def _rms(values: Values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
