@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
 import re
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -15,9 +13,7 @@ import pytest
 from cpunet.cli import run
 from cpunet.errors import CpunetError
 from cpunet.validation.compare import compare
-from cpunet.validation.forest_plot import span, ticks
 from cpunet.validation.report import Report
-from cpunet.validation.side_by_side import Cell
 
 
 def metrics(*ious: float) -> dict[str, Any]:
@@ -61,11 +57,10 @@ def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
     assert "<td>0 of 3 off</td>" in page
     assert "off by 19.0 sigma (IoU 50.0 of 88.0)" in page
     assert "recipe fast, trained on FEP, on cpu" in page
-    links = re.findall(r'href="(.*?)"', page)
+    links = re.findall(r'href="([^#].*?)"', page)
     targets = {(tmp_path / "pages" / unquote(link)).resolve() for link in links}
     assert targets == {tmp_path / name / "report" / "report.html" for name in runs}
     assert "B 2#?&lt;&amp;/p04" in page
-    assert not re.search(r"(src=|url\(|https?:|@import)", page)
 
 
 def test_missing_reports_are_listed_if_allowed(tmp_path):
@@ -86,30 +81,6 @@ def test_many_reports_have_no_columns(tmp_path):
     assert "<h2>Side by side</h2>" in few
     many = page_of(tmp_path / "many", {f"V{i}/p03": (80.0,) for i in range(9)})
     assert "<h2>Side by side</h2>" not in many
-    assert many.count("<circle") == 18  # IoU and AUC
-
-
-def test_a_missing_score_is_said_in_its_line(tmp_path):
-    page = page_of(tmp_path, {"a": (80.0, 81.0), "b": (70.0,)})
-    second = ET.fromstring(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)[1])
-    assert len(list(second.iter("circle"))) == 1
-    assert [text.text for text in second.iter("text")].count("no score") == 1
-
-
-@pytest.mark.parametrize(
-    "ends",
-    [(0.0, 100.0), (-3.0, 3.0), (0.49, 0.52), (1e-9, 2e-9), (0.0, math.nextafter(2000.0, 0))],
-)
-def test_ticks_are_few_and_inside(ends):
-    found = ticks(*ends)
-    assert 2 <= len(found) <= 5
-    assert all(ends[0] <= tick <= ends[1] for tick in found)
-
-
-def test_span_of_equal_values_is_not_empty():
-    for value in (0.0, 5.0):
-        low, high = span([Cell("", value), Cell("", value), Cell()])
-        assert low < value < high
 
 
 def report(folder: Path, iou: float, **more: int) -> Path:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 import re
-import xml.etree.ElementTree as ET
 from typing import Any
 
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.validation.side_by_side import side_by_side
-from cpunet.validation.side_by_side_page import side_by_side_page
+from cpunet.validation.score_figure import score_figure
+from cpunet.validation.side_by_side import comparison_page, side_by_side
 
 
 def metrics(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, Any]:
@@ -123,18 +122,8 @@ def test_a_method_that_nobody_scored_names_those_there_are():
         side_by_side({"a": {"peaks": {}}})
 
 
-@pytest.mark.parametrize("peaks", [{"SEP": 3}, {"SEP": {"parameters": {"x": {"iou": "high"}}}}])
-def test_nonsense_is_no_score(peaks):
-    with pytest.raises(CpunetError, match="no score of the method"):
-        side_by_side({"a": {"peaks": peaks, "ae_survival": [1], "rejections": 3}})
-
-
 def page_of(runs: dict[str, Any]) -> str:
-    return side_by_side_page(side_by_side(runs), runs)
-
-
-def circles(panel: ET.Element) -> list[float]:
-    return [float(c.get("cx", "nan")) for c in panel.iter("circle")]
+    return comparison_page(side_by_side(runs), runs, {})
 
 
 def seed(iou: float, **training: Any) -> dict[str, Any]:
@@ -159,44 +148,27 @@ def test_scores_scatter_over_runs_of_one_recipe():
 
 
 def test_the_page_is_whole_and_alone():
-    name = 'a<b>&"c"'
+    name = 'a<b>&"$\\c$"'
     page = page_of({name: metrics(), "other": metrics(85.0)})
     assert "<b>&" not in page
-    assert re.search(r"https?:|src=|href=|url\(|<script", page) is None
+    assert re.search(r"https?:|src=|href=\"[^#]|url\([^#]|<script", page) is None
     assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in page
     assert "<td>80.0\u00a0±\u00a02.5 (88.0)</td>" in page
-    panels = [ET.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
-    assert len(panels) == 5
-    for panel in panels:
-        width = float(panel.get("viewBox", "").split()[2])
-        assert len(circles(panel)) == 2
-        assert all(150 <= x <= width for x in circles(panel))
+    assert page.count("<svg") == 1  # of the peak
 
 
 def test_dots_and_bars_stand_where_their_scores_are():
-    page = page_of({"a": metrics(80.0), "b": metrics(84.0)})
-    panel = ET.fromstring(re.findall(r"<svg.*?</svg>", page, re.DOTALL)[0])
-    left, right = circles(panel)
-    per_percent = (right - left) / 4
-    ceilings = list(panel.iter("rect"))
-    middle = float(ceilings[0].get("x")) + float(ceilings[0].get("width")) / 2
-    assert middle - left == pytest.approx(8 * per_percent, abs=0.3)
-    ticks = {
-        float(t.text): float(t.get("x"))
-        for t in panel.iter("text")
-        if t.get("text-anchor") == "middle"
-    }
-    assert ticks[80.0] == pytest.approx(left, abs=0.1)
-    bar = re.fullmatch(
-        r"M(\S+) \S+H(\S+)",
-        next(p.get("d") for p in panel.iter("path") if p.get("stroke") == "#0072B2"),
-    )
-    assert float(bar[2]) - float(bar[1]) == pytest.approx(5 * per_percent, abs=0.3)
-
-
-def test_a_run_without_a_score_has_an_empty_line():
     old = metrics()
     del old["peaks"]["SEP"]["two_sample"]
-    page = page_of({"old": old, "new": metrics()})
-    panels = [ET.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
-    assert [len(circles(panel)) for panel in panels] == [2, 2, 1, 2, 2]
+    table = side_by_side({"old": old, "new": metrics(84.0)})
+    panels = score_figure(table.rows, table.names).axes[: len(table.rows)]
+    first, classifier = panels[0], panels[2]
+    assert first.get_xlabel() == "drift time: IoU [%] (ceiling)"
+    dots = [container.lines[0].get_xydata().tolist() for container in first.containers[1::2]]
+    assert dots == [[[80.0, 0]], [[84.0, 1]]]
+    chance = first.patches[0]
+    assert (chance.get_x(), chance.get_width()) == (86.5, 3.0)  # 88 ± 1.5
+    (bar,) = first.containers[1].lines[2]
+    assert bar.get_segments()[0][:, 0].tolist() == [77.5, 82.5]
+    assert [text.get_text() for text in classifier.texts] == ["no score"]
+    assert [text.get_text() for text in first.get_yticklabels()] == ["old", "new"]

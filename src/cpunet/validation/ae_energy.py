@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.optimize
+from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.errors import CpunetError
+from cpunet.plotting import GROUP, colours, group, label, styled
 from cpunet.validation.a_over_e import DEP
 
 Values = npt.NDArray[np.float64]
@@ -53,13 +54,6 @@ class SiteFit:
     n: int
 
 
-def energy_bands(lines_kev: Mapping[str, Range]) -> list[Range]:
-    """Ranges of 50 keV, and first that of the double-escape peak, if it is among the lines."""
-    bands = [lines_kev[DEP]] if DEP in lines_kev else []
-    lows = np.arange(LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV).tolist()
-    return bands + [(low, low + WIDTH_KEV) for low in lows]
-
-
 def against_energy(
     amplitude: Mapping[str, Values],
     energy_kev: Mapping[str, Values],
@@ -85,14 +79,11 @@ def against_energy(
         is 1 at 1592.5 keV, ``per_mev_percent`` with its error, and ``chi_square`` for
         ``degrees`` of freedom; ``scale``, the A/E at 1592.5 keV; ``resolution`` with ``a``,
         ``b`` and ``c`` of ``sqrt(a + (b/E)**c)``.
-
-    Raises
-    ------
-    CpunetError
-        If the arrays of a method differ in length.
     """
     lines = list(lines_kev.values())
-    single_site = energy_bands(lines_kev)
+    single_site = [span for name, span in lines_kev.items() if name == DEP]
+    lows = np.arange(LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV).tolist()
+    single_site += [(low, low + WIDTH_KEV) for low in lows]
     all_bands = single_site + [span for span in lines if span not in single_site]
     for bands in (single_site, all_bands):
         points = {
@@ -160,13 +151,47 @@ def site_fit(
     )
 
 
+@styled
+def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
+    """Relative shift and relative width of the single-site peak of A/E against energy.
+
+    Parameters
+    ----------
+    methods
+        ``methods`` of `against_energy`.
+    """
+    figure = Figure(figsize=(6.4, 5.6))
+    above, below = figure.subplots(2, 1, sharex=True)
+    palette = colours(methods)
+    for method, found in methods.items():
+        points, colour = found["points"], palette[method]
+        energy, mean, error, sigma, sigma_error = (
+            np.array([point[name] for point in points], float)
+            for name in ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
+        )
+        scale, line, law = found["scale"], found["mean"], found["resolution"]
+        look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
+        for axes, value, spread in (
+            (above, mean / scale - 1, error / scale),
+            (below, sigma / mean, sigma_error / mean),
+        ):
+            group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
+        along = np.linspace(energy.min(), energy.max(), 100)
+        text = f"{label(method)}: {line['per_mev_percent']:+.3f} ± "
+        text += f"{line['per_mev_error_percent']:.3f} % per MeV"
+        fit = {"color": colour, "gid": GROUP + method}
+        above.plot(along, 100 * (line["a"] * along + line["b"] - 1), label=text, **fit)
+        width = np.sqrt(law["a"] + (law["b"] / along) ** law["c"])
+        below.plot(along, 100 * width, **fit)
+    above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
+    below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
+    above.legend()
+    return figure
+
+
 def _points(
     amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
 ) -> list[SiteFit]:
-    if amplitude.shape != energy_kev.shape:
-        raise CpunetError(
-            f"{len(amplitude)} amplitudes beside {len(energy_kev)} energies; give one for each"
-        )
     beside = np.ones(len(energy_kev), bool)
     for low, high in lines:
         beside &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
@@ -234,17 +259,13 @@ def _seen(values: Values) -> tuple[float, float] | None:
     """Position of the highest peak, and its width from its upper side."""
     if len(values) < MIN_N:
         return None
-    centre = _densest(values)
+    # the middle of the shortest interval with a fifth of the sorted values
+    n = max(20, len(values) // 5)
+    first = int((values[n - 1 :] - values[: len(values) - n + 1]).argmin())
+    centre = float(np.median(values[first : first + n]))
     above = values[values > centre] - centre
     width = float(np.quantile(above, 0.68)) if len(above) >= 10 else 0.0
     return (centre, width) if width > 0 else None
-
-
-def _densest(values: Values) -> float:
-    """Middle of the shortest interval with a fifth of the sorted values."""
-    n = max(20, len(values) // 5)
-    first = int((values[n - 1 :] - values[: len(values) - n + 1]).argmin())
-    return float(np.median(values[first : first + n]))
 
 
 def _nll(parameters: Values, x: Values) -> float:
@@ -270,25 +291,14 @@ def _nll(parameters: Values, x: Values) -> float:
 
 def _errors(best: Values, x: Values) -> Values | None:
     """Errors of mean and log sigma from second differences of the likelihood."""
-    n, step = len(best), 1e-3 * np.ones(len(best))
-    eye = np.diag(step)
-    hessian = np.array(
-        [
-            [
-                (
-                    _nll(best + eye[i] + eye[j], x)
-                    - _nll(best + eye[i] - eye[j], x)
-                    - _nll(best - eye[i] + eye[j], x)
-                    + _nll(best - eye[i] - eye[j], x)
-                )
-                / (4 * step[i] * step[j])
-                for j in range(n)
-            ]
-            for i in range(n)
-        ]
-    )
+    step, signs = 1e-3, ((1, 1), (1, -1), (-1, 1), (-1, -1))
+    moves = step * np.eye(len(best))
+    hessian = [
+        [sum(s * r * _nll(best + s * one + r * other, x) for s, r in signs) for other in moves]
+        for one in moves
+    ]
     try:
-        covariance = np.linalg.inv(hessian)
+        covariance = np.linalg.inv(np.array(hessian) / (4 * step * step))
     except np.linalg.LinAlgError:
         return None
     variances = np.diag(covariance)[:2]

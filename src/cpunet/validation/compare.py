@@ -13,7 +13,13 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.tables import text_table
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
-from cpunet.validation.side_by_side import FEW, Metrics, SideBySide, side_by_side
+from cpunet.validation.side_by_side import (
+    FEW,
+    Metrics,
+    SideBySide,
+    comparison_page,
+    side_by_side,
+)
 
 REPORT = "report"  # folder of a demonstration that contains the metrics
 
@@ -53,14 +59,12 @@ class Comparison:
         """
         path = Path(path)
         _refuse(path, [*self.folders.values()], force=force)
-        from cpunet.validation.side_by_side_page import side_by_side_page
-
         links = {
             name: quote(os.path.relpath(folder / PAGE, path.parent))
             for name, folder in self.folders.items()
             if folder is not None and (folder / PAGE).is_file()
         }
-        page = side_by_side_page(self.table, self.metrics, links, self.missing)
+        page = comparison_page(self.table, self.metrics, links, self.missing)
         with written_aside(path) as aside:
             aside.write_text(page, encoding="utf-8")
 

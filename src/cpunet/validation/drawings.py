@@ -16,11 +16,11 @@ from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.ae_drift_time import ae_figure
-from cpunet.validation.ae_energy_figure import FIGURE as AE_ENERGY
-from cpunet.validation.ae_energy_figure import ae_energy_figure
+from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.comparisons import Comparison
 from cpunet.validation.evaluation import Evaluation, PeakDetails
 from cpunet.validation.noise import spectrum_of_noise
+from cpunet.validation.page import AE_ENERGY
 from cpunet.validation.peaks import PeakSets
 from cpunet.validation.pulse_figures import (
     DataPulse,

@@ -210,7 +210,7 @@ class Report:
 
     def write(self, folder: Path) -> None:
         """Write the report into an existing folder, see `save`."""
-        from cpunet.validation.report_page import write_page
+        from cpunet.validation.page import write_page
 
         if self.drawn is None:
             raise CpunetError(f"{self.folder}: is a report already", "copy the folder")

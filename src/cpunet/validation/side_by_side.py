@@ -1,63 +1,23 @@
-"""Scores of several validations as rows of one table, and whether they are comparable."""
+"""Scores of several validations as rows of one table and as a page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.validation.verdicts import number, part
+from cpunet.plotting import label
+from cpunet.tables import NO_VALUE
+from cpunet.validation.score_figure import Cell, Row, score_figure
+from cpunet.validation.verdicts import judged_scores, number, part, summary
 
 Metrics = Mapping[str, Any]
 
 FEW = 8  # runs whose scores fit beside each other; more have an overview and panels
-NO_VALUE = "–"
 CEILING = " (ceiling)"
-
-
-@dataclass(frozen=True)
-class Cell:
-    """Score of one run with its error, and its expectation by chance with the spread.
-
-    Attributes
-    ----------
-    text
-        Score as displayed, with error and ceiling.
-    value
-        Score; None where a run has none.
-    digits
-        Format of the score.
-    """
-
-    text: str = NO_VALUE
-    value: float | None = None
-    error: float | None = None
-    expected: float | None = None
-    expected_std: float | None = None
-    digits: str = ""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One score of every run.
-
-    Attributes
-    ----------
-    peak, score
-        Name of the peak and of the score.
-    cells
-        Scores in the order of the runs.
-    best
-        Indices of the runs with the best score; empty if fewer than two have a score.
-    """
-
-    peak: str
-    score: str
-    cells: tuple[Cell, ...]
-    best: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -96,8 +56,7 @@ def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide
     Parameters
     ----------
     runs
-        Content of ``metrics.json`` by the name of the run.  Scores missing in older files
-        have no value.
+        Content of ``metrics.json`` by the name of the run.
     method
         Method that is scored: ``ren``, ``raw``, a baseline method or ``truth``.
 
@@ -126,17 +85,81 @@ def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide
         for row in _peak_rows(peak, list(runs.values()), method)
     ]
     if not rows:
-        known = _union(_methods(metrics) for metrics in runs.values())
+        parameters = (
+            parameter
+            for metrics in runs.values()
+            for peak in part(metrics, "peaks").values()
+            for parameter in part(peak, "parameters").values()
+        )
+        known = [m for m in _union(part(p, "iou") for p in parameters) if m != "ceiling"]
         raise CpunetError(
             f"{', '.join(runs)}: no score of the method {method}; "
             + (f"there are {', '.join(known)}" if known else "nothing is scored there")
         )
-    told = [part(metrics, "compared") for metrics in runs.values()]
-    compared = {n: tuple(str(one.get(n, NO_VALUE)) for one in told) for n in _union(told)}
+    inputs = [part(metrics, "compared") for metrics in runs.values()]
+    compared = {n: tuple(str(one.get(n, NO_VALUE)) for one in inputs) for n in _union(inputs)}
     over_runs = _over_runs(list(runs.values()), method, rows)
     return SideBySide(
         tuple(runs), method, tuple(rows), tuple(_notes(runs)), compared, over_runs
     )
+
+
+def comparison_page(
+    table: SideBySide,
+    runs: Mapping[str, Metrics],
+    links: Mapping[str, str],
+    missing: Collection[str] = (),
+) -> str:
+    """Return the comparison as self-contained HTML.
+
+    Parameters
+    ----------
+    table
+        Result of `side_by_side`.
+    runs
+        Content of ``metrics.json`` by the name of the run.
+    links
+        Address of the report of each run, if there is one.
+    missing
+        Names of the runs that have no report.
+    """
+    # matplotlib, with the page, takes longer than to print a table
+    from cpunet.html_pages import figure_html, rendered
+
+    groups = [name.rpartition("/")[0] for name in table.names]  # as DETECTOR/PERIOD
+    starts = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
+    peaks = {row.peak: [r for r in table.rows if r.peak == row.peak] for row in table.rows}
+    return rendered(
+        "compare.html",
+        title=f"{label(table.method)}: {len(table.names)} runs compared",
+        table=table,
+        few=len(table.names) <= FEW,
+        overview=[_overview(name, runs[name], table.method) for name in table.names],
+        links=links,
+        missing=missing,
+        panels=[
+            figure_html(f"{peak} scores", score_figure(rows, table.names, starts))
+            for peak, rows in peaks.items()
+        ],
+    )
+
+
+def _overview(name: str, metrics: Metrics, method: str) -> dict[str, Any]:
+    """Line of one run: how many scores are off, how it was trained, verdicts in words."""
+    off, judged = judged_scores(metrics, method)
+    training = part(metrics, "training")
+    known = [
+        f"{words} {training[key]}"
+        for key, words in (("recipe", "recipe"), ("peak", "trained on"), ("device", "on"))
+        if isinstance(training.get(key), (str, int, float))
+    ]
+    return {
+        "name": name,
+        "text": f"{off} of {judged} off" if judged else "not judged",
+        "marked": off > 2 and off > 0.2 * judged,  # one or two can be off by chance
+        "about": ", ".join(known),
+        "lines": [summary(metrics, peak, method) for peak in part(metrics, "peaks")],
+    }
 
 
 def _over_runs(runs: Sequence[Metrics], method: str, rows: Sequence[Row]) -> SideBySide | None:
@@ -245,8 +268,10 @@ def _notes(runs: Mapping[str, Metrics]) -> list[str]:
     first, *others = runs
     found: dict[str, list[str]] = {}
     for other in others:
-        if crystals := _crystals(runs[first], runs[other]):
-            found.setdefault(f"are of different detectors, {crystals}.", []).append(other)
+        one, two = (part(runs[name], "compared").get("detector") for name in (first, other))
+        if one and two and one != two:
+            words = f"are of different detectors, {one} and {two}."
+            found.setdefault(words, []).append(other)
         if apart := _differences(runs[first], runs[other]):
             words = f"were scored on different pulses ({', '.join(apart)}): their scores "
             found.setdefault(f"{words}differ for that reason, too.", []).append(other)
@@ -258,38 +283,22 @@ def _notes(runs: Mapping[str, Metrics]) -> list[str]:
     ]
 
 
-def _crystals(one: Metrics, other: Metrics) -> str:
-    """The two detectors, if the runs are of different ones."""
-    names = [part(metrics, "compared").get("detector") for metrics in (one, other)]
-    return f"{names[0]} and {names[1]}" if all(names) and names[0] != names[1] else ""
-
-
 def _differences(one: Metrics, other: Metrics) -> list[str]:
-    peaks = [part(metrics, "peaks") for metrics in (one, other)]
-    apart = ["peaks"] if peaks[0].keys() != peaks[1].keys() else []
-    for key, called in (("n_data", "measured"), ("n_sim", "simulated")):
-        for peak in peaks[0].keys() & peaks[1].keys():
-            counts = [part(p, peak).get(key) for p in peaks]
-            if counts[0] != counts[1]:
-                apart.append(f"number of {called} pulses")
-                break
-    for side, called in (("data", "measured"), ("sim", "simulated")):
-        lost = [part(metrics, "rejections").get(side) for metrics in (one, other)]
-        if lost[0] != lost[1]:
-            apart.append(f"rejections of {called} pulses")
+    a, b = (part(metrics, "peaks") for metrics in (one, other))
+    apart = ["peaks"] if a.keys() != b.keys() else []
+    apart += [
+        f"number of {called} pulses"
+        for key, called in (("n_data", "measured"), ("n_sim", "simulated"))
+        if any(part(a, peak).get(key) != part(b, peak).get(key) for peak in a.keys() & b.keys())
+    ]
+    apart += [
+        f"rejections of {called} pulses"
+        for side, called in (("data", "measured"), ("sim", "simulated"))
+        if part(one, "rejections").get(side) != part(other, "rejections").get(side)
+    ]
     return apart
 
 
-def _methods(metrics: Metrics) -> list[str]:
-    found = [
-        parameter_methods
-        for peak in part(metrics, "peaks")
-        for name in part(metrics, "peaks", peak, "parameters")
-        for parameter_methods in part(metrics, "peaks", peak, "parameters", name, "iou")
-    ]
-    return [method for method in dict.fromkeys(found) if method != "ceiling"]
-
-
-def _union(names: Any) -> list[str]:
+def _union(names: Iterable[Iterable[str]]) -> list[str]:
     """All names in the order of their first occurrence."""
     return list(dict.fromkeys(name for some in names for name in some))

@@ -1,0 +1,360 @@
+"""The page of a validation, and its figures as files.
+
+The page is self-contained: figures and script are embedded, and its content security policy
+blocks all requests.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from cpunet.html_pages import asset, figure_html, figure_png, joined, part, rendered
+from cpunet.plotting import NO_NOISE, colours, label
+from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.tables import NO_VALUE, number, with_std
+from cpunet.validation.ae_energy import REFERENCE_KEV
+from cpunet.validation.report import PAGE
+from cpunet.validation.score_figure import peak_figure
+
+FIRST = 2  # figures of mean pulses at the top of the page, and of noise
+AE_ENERGY = "A over E and energy"  # figure with a section of its own
+# section of a figure by the end of its name; all others are under Details
+PLACES = {
+    "A over E survival": "ae",
+    "A over E": "ae_drift",
+    "mean pulse": "first",
+    "superpulses": "slices",
+    "noise": "noise",
+    "single pulse": "pulses",
+    "further parameters": "further",
+    **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
+}
+MANY = 4  # a larger number of figures is collapsed
+
+
+def write_page(
+    folder: Path,
+    metrics: Mapping[str, Any],
+    figures: Mapping[str, Figure],
+    notes: Sequence[str],
+) -> None:
+    """Write a PNG per figure and ``report.html`` into a folder.
+
+    Parameters
+    ----------
+    folder
+        An existing folder, see `outputs.folder_written_aside`.
+    metrics
+        Content of ``metrics.json``.
+    figures
+        Figures by name; the names become file names and captions.
+    notes
+        Paragraphs of plain text for the top of the page.
+    """
+    drawn = {}
+    for name, figure in figures.items():
+        stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
+        (folder / f"{stem}.png").write_bytes(figure_png(figure))
+        drawn[name] = figure_html(name.replace("_", " "), figure)
+    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
+    ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
+    placed = _placed(drawn, metrics.get("training", {}).get("peak"))
+    scores = joined(
+        peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()
+    )
+    html = rendered(
+        "report.html",
+        title="CPU-Net validation",
+        compared={name: number(v) for name, v in metrics.get("compared", {}).items()},
+        first=_gallery(placed["first"]),
+        notes=notes,
+        verdicts=verdicts_html(metrics.get("verdicts", {})),
+        methods=_methods([*drawn.values(), scores]),
+        scores=scores,
+        distributions=_grid(placed["distributions"]),
+        further=_folded("Further parameters", _grid(placed["further"]), screen=True),
+        slices=_grid(placed["slices"]),
+        pulses=part("grid", "single", placed["pulses"]),
+        survival=survival_html(metrics.get("ae_survival", {})),
+        ae=joined(
+            [
+                _gallery(placed["ae"]),
+                _folded("Survival by ranges of energy", ranges_table(ranges), screen=True),
+                _folded("A/E against drift time, as figures", _grid(placed["ae_drift"])),
+            ]
+        ),
+        ae_energy=ae_energy,
+        multi_site=metrics.get("ae_energy", {}).get("multi_site"),
+        noise=joined(
+            [
+                _gallery(placed["noise"]),
+                _folded("Its size", noise_table(metrics.get("noise", {})), screen=True),
+            ]
+        ),
+        figures=_gallery(placed["others"]),
+        rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
+        training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
+        script=Markup(asset("report.js")),
+    )
+    (folder / PAGE).write_text(html, encoding="utf-8")
+
+
+def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
+    """Figures by their place on the page, see `PLACES`.
+
+    Mean pulses and noise are shown for a few peaks, preferably not those of the training.
+    """
+    trained = tuple(f"{peak} " for peak in [trained_on, *str(trained_on).split(",")])
+    names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
+    for name in drawn:
+        end = next((end for end in PLACES if name.replace("_", " ").endswith(end)), None)
+        names[PLACES[end] if end else "others"].append(name)
+    for place in ("first", "noise"):
+        held_out = [name for name in names[place] if not name.startswith(trained)]
+        few = (held_out or names[place])[:FIRST]
+        names["others"] += [name for name in names[place] if name not in few]
+        names[place] = few
+    return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
+
+
+def _methods(drawn: Iterable[str]) -> list[dict[str, str]]:
+    """Name, label and colour of each method that is drawn, for the page's legend."""
+    names = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn)))
+    return [{"name": m, "label": label(m), "colour": c} for m, c in colours(names).items()]
+
+
+def _folded(title: str, content: Markup, *, screen: bool = False) -> Markup:
+    return part("folded", title, content, screen=screen) if content.strip() else Markup()
+
+
+def _gallery(drawn: Sequence[Markup]) -> Markup:
+    if len(drawn) <= MANY:
+        return _grid(drawn)
+    return _folded(f"{len(drawn)} figures, also as PNG beside this page", _grid(drawn))
+
+
+def _grid(drawn: Sequence[Markup]) -> Markup:
+    return part("grid", "figures", drawn)
+
+
+def verdicts_html(verdicts: Mapping[str, Any]) -> Markup:
+    """Return the verdicts in plain words; nothing without verdicts."""
+    if not verdicts:
+        return Markup()
+    rows = [
+        [peak, label(method), _spelt(quantity), _sigma(found["sigma"]), found["words"]]
+        for peak, methods in verdicts.get("table", {}).items()
+        for method, quantities in methods.items()
+        for quantity, found in quantities.items()
+    ]
+    head = ["Peak", "Method", "Quantity", "σ", "In words"]
+    table = _table(head, rows, words={0, 1, 2, 4})
+    return joined(
+        [
+            part("points", verdicts["summary"]),
+            part("folded", "Each verdict", table, screen=True),
+        ]
+    )
+
+
+def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
+    """Return the section of one peak: numbers of events and tables."""
+    chief, others = scores.get("parameters", {}), scores.get("further", {})
+    n_sim, n_data = (number(scores.get(name)) for name in ("n_sim", "n_data"))
+    parts = [
+        part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses"),
+        part("p", f"Not scored: {scores['missing']}.")
+        if "missing" in scores
+        else _grid([figure_html(f"{peak} scores", peak_figure(peak, scores))]),
+    ]
+    if chief:
+        parts.append(part("folded", "Scores as a table", _parameter_table(chief)))
+    if others:
+        title = f"Further parameters: {len(others)}"
+        parts.append(part("folded", title, _parameter_table(others), screen=True))
+    if scores.get("not_prepared"):
+        counts = (f"{label(m)}: {n}" for m, n in scores["not_prepared"].items())
+        text = "Simulated pulses left out because, once translated, they cannot be prepared "
+        parts.append(part("p", f"{text}like data: {'; '.join(counts)}."))
+    tables = []
+    if tested := scores.get("two_sample", {}):
+        head = ["Distinguished from data by a classifier", "AUC", "Same with shuffled labels"]
+        rows = [
+            [label(method), NO_VALUE, found["missing"]]
+            if "missing" in found
+            else [
+                label(method),
+                with_std(found["auc"], found["auc_std"]),
+                with_std(found["null_mean"], found["null_std"]),
+            ]
+            for method, found in tested.items()
+        ]
+        tables.append(part("folded", "The classifier as a table", _table(head, rows)))
+    if paired := scores.get("paired", {}):
+        head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
+        rows = [
+            [label(method), *(_thousandths(found[key]) for key in ("rmse", "edge_rmse"))]
+            for method, found in paired.items()
+        ]
+        tables.append(_table(head, rows))
+    return joined([*parts, part("grid", "beside", tables)])
+
+
+def survival_html(survival: Mapping[str, Any]) -> Markup:
+    """Return the survival of A/E cuts by peak and method."""
+    if not survival:
+        return part("p", "None recorded.")
+    if "missing" in survival:
+        return part("p", f"Not scored: {survival['missing']}.")
+    rows = []
+    for peak, found in survival.items():
+        title = peak
+        for method, value in found.get("survival", {}).items():
+            if method.endswith(NO_NOISE):
+                continue  # in metrics.json
+            rows.append(
+                [
+                    title,
+                    label(method),
+                    _percent(value, found["survival_std"].get(method)),
+                    _percent(
+                        found["difference"].get(method), found["difference_std"].get(method)
+                    ),
+                    _sigma(found["sigma"].get(method)),
+                ]
+            )
+            title = ""
+    head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
+    return _table(head, rows, words={0, 1})
+
+
+def ranges_table(ranges: Mapping[str, Any]) -> Markup:
+    """Return the survival of A/E cuts by ranges of energy and method."""
+    rows = [
+        [name, label(method), str(found.get("peak", NO_VALUE)), *_survival(found)]
+        for name, methods in ranges.items()
+        if name != "missing"
+        for method, found in methods.items()
+    ]
+    head = ["Range", "Method", "Pulses", "Survival [%]", ""]
+    return _table(head, rows, words={0, 1, 4}) if rows else Markup()
+
+
+def _survival(found: Mapping[str, Any]) -> tuple[str, str]:
+    if "missing" in found:
+        return NO_VALUE, found["missing"]
+    return _percent(found["survival"], found["survival_std"]), ""
+
+
+def noise_table(noise: Mapping[str, Any]) -> Markup:
+    """Return the RMS of the noise before the pulse by peak and method."""
+    rows = [
+        [peak, label(method), *(number(found.get(key)) for key in ("n", "samples")),
+         with_std(found.get("rms"), found.get("rms_std")),
+         *(number(found.get(key)) for key in ("rms_ratio", "sigma", "spectrum_sigma"))]
+        for peak, methods in noise.items()
+        for method, found in methods.items()
+    ]  # fmt: skip
+    head = ["Peak", "Method", "Pulses", "Samples", "RMS [height]", "Over the data's", "In σ"]
+    return _table([*head, "Spectrum in σ"], rows, words={0, 1}) if rows else Markup()
+
+
+def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
+    """Return a table of the lines, and the figure."""
+    if "methods" not in found:
+        return part("gap", found["missing"]) if found else Markup()
+    rows = []
+    for method, one in found["methods"].items():
+        line, law = one["mean"], one["resolution"]
+        rows.append(
+            [
+                label(method),
+                with_std(line["per_mev_percent"], line["per_mev_error_percent"]),
+                f"{line['chi_square']:.1f} / {line['degrees']}",
+                f"{100 * np.sqrt(law['a']):.2f}",
+                f"{law['b']:.2f}",
+                f"{law['at_reference_percent']:.2f}",
+            ]
+        )
+    head = [
+        "Method",
+        "Slope [% per MeV]",
+        "χ² / degrees",
+        "Width at all energies [%]",
+        "Noise [keV]",
+        f"Width at {REFERENCE_KEV:g} keV [%]",
+    ]
+    return joined([_table(head, rows, words={0}), _grid([figure])])
+
+
+def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
+    """Return a table of names and values; nested names are joined: ``data: saturated``."""
+    rows = [[name, number(value)] for name, value in _flat(values)]
+    return _table(list(head), rows) if rows else part("p", "None recorded.")
+
+
+def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
+    """One row per parameter and method with noise, and one with the ceiling."""
+    rows = []
+    for name, values in parameters.items():
+        unit, iou, error = SHAPE_PARAMETERS[name].unit, values["iou"], values["iou_std"]
+        title = name.replace("_", " ").capitalize() + (f" [{unit}]" if unit else "")
+        for method, distance in values["wasserstein"].items():
+            if method.endswith(NO_NOISE):
+                continue  # in metrics.json
+            moved = with_std(distance, values["wasserstein_std"][method])
+            apart = with_std(values["ks"][method], values["ks_std"][method])
+            score = _percent(iou[method], error[method])
+            rows.append([title, label(method), score, moved, apart])
+            title = ""
+        ceiling = _percent(iou["ceiling"], error["ceiling"])
+        moved, apart = (
+            with_std(values[f"{kind}_null"], values[f"{kind}_null_std"])
+            for kind in ("wasserstein", "ks")
+        )
+        rows.append([title, "Ceiling", ceiling, moved, apart])
+    head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS"]
+    return _table(head, rows, words={0, 1})
+
+
+def _thousandths(value: float | None) -> str:
+    return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for name, value in values.items():
+        nested = isinstance(value, Mapping)
+        rows += _flat(value, f"{prefix}{name}: ") if nested else [(f"{prefix}{name}", value)]
+    return rows
+
+
+def _sigma(value: float | None) -> str:
+    return NO_VALUE if value is None else f"{round(value, 1) + 0.0:+.1f}"
+
+
+def _percent(value: float | None, error: float | None) -> str:
+    if value is None:
+        return NO_VALUE
+    value = round(value, 1) + 0.0  # no negative zero
+    return f"{value:.1f}" if error is None else f"{value:.1f} ± {error:.1f}"
+
+
+def _table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], words: set[int] | None = None
+) -> Markup:
+    """Return a table; the columns `words` are aligned as text, all others as numbers."""
+    return part("table", head, rows, words or set())
+
+
+def _spelt(quantity: str) -> str:
+    words = {"auc": "AUC", "wasserstein": "W₁", "ae": "A/E"}
+    return " ".join(words.get(word, word) for word in quantity.split("_"))
