@@ -246,7 +246,7 @@ def _detector(detector: Detector, path: str) -> InfoResult:
         fields = compute_fields(detector)
 
     def draw() -> Figure:
-        from cpunet.validation.detector_figure import detector_figure
+        from cpunet.simulation.detector_figure import detector_figure
 
         return detector_figure(detector, fields)
 
@@ -297,7 +297,7 @@ def _pulses(file: PulseFile, recipe: Recipe) -> InfoResult:
         told, lines = told | more, lines + words
 
     def draw() -> Figure:
-        from cpunet.validation.spectrum_figure import spectrum_figure
+        from cpunet.pulses.spectrum_figure import spectrum_figure
 
         return spectrum_figure(spectrum)
 

@@ -186,20 +186,6 @@ def test_too_few_pulses_are_named():
     assert classifier_auc(windows(rng, 40), windows(rng, 40), seed=0).n_sim == 40
 
 
-def test_bad_shapes_are_named():
-    rng = np.random.default_rng(14)
-    pulses = windows(rng, 50)
-    with pytest.raises(CpunetError, match="equally many samples"):
-        classifier_auc(pulses, pulses[:, :-1], seed=0)
-    with pytest.raises(CpunetError, match="equally many samples"):
-        classifier_auc(pulses[0], pulses[0], seed=0)
-    value = {"drift_time": np.ones(50)}
-    with pytest.raises(CpunetError, match="drift_time is given for one side only"):
-        classifier_auc(pulses, pulses, seed=0, features=(value, {}))
-    with pytest.raises(CpunetError, match=r"drift_time has shape \(49,\)"):
-        classifier_auc(pulses, pulses, seed=0, features=(value, {"drift_time": np.ones(49)}))
-
-
 def test_auc_is_the_fraction_of_ordered_pairs():
     rng = np.random.default_rng(15)
     negatives, positives = rng.integers(0, 9, 30).astype(float), rng.integers(2, 12, 40) * 1.0

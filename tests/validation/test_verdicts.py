@@ -12,7 +12,6 @@ import pytest
 from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
 from cpunet.validation.verdicts import (
-    method_verdicts,
     methods_of,
     number,
     summaries,
@@ -193,35 +192,11 @@ def test_what_is_not_scored_says_why():
     assert "A/E survival not judged (too few events" in line
 
 
-def test_metrics_of_older_versions_are_judged_by_what_they_hold():
-    old = metrics()
-    for parameter in old["peaks"]["SEP"]["parameters"].values():
-        del parameter["wasserstein_null"], parameter["wasserstein_null_std"]
-    del old["ae_survival"], old["peaks"]["SEP"]["two_sample"]
-    assert summary(old, "SEP", "ren") == (
-        "REN, SEP: current amplitude and tail slope agree with the data within errors; "
-        "drift time off by 3.1 sigma (IoU 83.1 of 85.9)"
-    )
-    assert summary(old, "FEP", "ren") == "REN, FEP: not scored"
-    words = verdict_table(old)["SEP"]["ren"]["drift_time_wasserstein"]["words"]
-    assert words == "nothing to compare with"
-    old["ae_survival"] = {"missing": "the data lack peak DEP"}
-    assert "ae_survival" not in method_verdicts(old, "SEP", "ren")
-
-
 def test_methods_without_noise_and_the_ceiling_are_not_judged():
     changed = metrics()
     for parameter in changed["peaks"]["SEP"]["parameters"].values():
         parameter["iou"]["truth_no_noise"] = 30.0
     assert methods_of(changed, "SEP") == ["ren"]
-
-
-@pytest.mark.parametrize(
-    "nonsense", [None, 3, [], "text", {"SEP": 1}, {"SEP": {"parameters": 2}}]
-)
-def test_nonsense_has_no_verdict(nonsense):
-    for methods in verdict_table({"peaks": nonsense, "ae_survival": nonsense}).values():
-        assert methods == {}
 
 
 @pytest.mark.parametrize("value", [True, "3", [3], float("nan"), float("inf"), None])

@@ -26,7 +26,6 @@ from cpunet.validation.two_sample import classifier_auc
 from cpunet.validation.when_asked import WhenAsked
 
 MIN_N = 10  # minimum number of pulses of a distribution
-TESTED = 1000  # pulses per side in the classifier test: resolves an AUC to 0.013
 
 Rows = npt.NDArray[np.int64]
 ByMethod = dict[str, dict[str, Values]]
@@ -283,7 +282,6 @@ def classifier_tests(
                 others.waveforms,
                 seed=seed,
                 features=(values["data"], values[method]),
-                largest=TESTED,
             )
         except CpunetError as error:
             tested[method] = {"missing": str(error)}

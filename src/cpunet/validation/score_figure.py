@@ -82,7 +82,7 @@ def score_figure(
     lines, palette = -(-len(rows) // columns), colours(methods)
     figure = Figure(figsize=(1.6 + 2.7 * columns, lines * (0.9 + 0.18 * len(names))))
     panels = figure.subplots(lines, columns, sharey=True, squeeze=False).flat
-    for axes, row in zip(panels, rows, strict=False):
+    for row, axes in zip(rows, panels, strict=False):
         for place, (cell, method) in enumerate(zip(row.cells, methods, strict=True)):
             if cell.value is None:
                 where = axes.get_yaxis_transform()

@@ -53,15 +53,30 @@ class Verdict:
     words
         Verdict in words: ``agrees within errors``, ``off by 3.1 sigma``, or the reason why
         there is no verdict.
+    numbers
+        The score and its expectation, as quoted.
     """
 
     sigma: float | None
     agrees: bool | None
     words: str
+    numbers: str = ""
+
+    @property
+    def severity(self) -> float:
+        """Deviation of a score that is off; infinite if it is unknown by how much."""
+        if self.agrees:
+            return 0.0
+        return math.inf if self.sigma is None else abs(self.sigma)
 
 
 def verdict(
-    value: float | None, expected: float | None, spread: float | None, worse: Worse
+    value: float | None,
+    expected: float | None,
+    spread: float | None,
+    worse: Worse,
+    numbers: str = "",
+    reason: object = None,
 ) -> Verdict:
     r"""Verdict on one score.
 
@@ -80,6 +95,10 @@ def verdict(
     worse
         Side that is worse than chance: ``"lower"`` (IoU), ``"higher"`` (a distance, an
         AUC) or ``"both"`` (a difference).
+    numbers
+        How to quote ``value`` and ``expected``, in Python's format.
+    reason
+        Why there is no verdict, if known.
 
     Examples
     --------
@@ -90,23 +109,24 @@ def verdict(
     >>> verdict(None, 85.9, 0.9, "lower").words
     'no value'
     """
-    if value is None:
-        return Verdict(None, None, "no value")
-    if expected is None or spread is None:
-        return Verdict(None, None, "nothing to compare with")
+    if value is None or expected is None or spread is None:
+        words = "no value" if value is None else "nothing to compare with"
+        return Verdict(None, None, str(reason or words))
+    quoted = numbers.format(value=value, expected=expected)
     apart = (expected - value) if worse == "lower" else (value - expected)
+    off = abs(apart) if worse == "both" else apart
     if spread <= 0:
         # for example all events in one bin: chance gives exactly one value
-        off = abs(apart) if worse == "both" else apart
-        same = off <= 1e-9 * max(abs(expected), 1.0)
-        return Verdict(0.0, True, WITHIN) if same else Verdict(None, False, "off")
+        if off <= 1e-9 * max(abs(expected), 1.0):
+            return Verdict(0.0, True, WITHIN, quoted)
+        return Verdict(None, False, "off", quoted)
     sigma = apart / spread
-    if (abs(sigma) if worse == "both" else sigma) > AGREES:
-        return Verdict(sigma, False, f"off by {abs(sigma):.1f} sigma")
+    if off / spread > AGREES:
+        return Verdict(sigma, False, f"off by {abs(sigma):.1f} sigma", quoted)
     if worse != "both" and sigma < -TOO_CLOSE:
         words = f"closer than chance by {-sigma:.1f} sigma: are the same events on both sides?"
-        return Verdict(sigma, True, words)
-    return Verdict(sigma, True, WITHIN)
+        return Verdict(sigma, True, words, quoted)
+    return Verdict(sigma, True, WITHIN, quoted)
 
 
 def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[str, Verdict]:
@@ -115,8 +135,7 @@ def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[
     Parameters
     ----------
     metrics
-        Content of ``metrics.json``.  Scores missing in older files have no verdict, with
-        the reason in its words.
+        Content of ``metrics.json``.
     peak, method
         Names of the peak and of the method.
 
@@ -131,43 +150,43 @@ def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[
     """
     found: dict[str, Verdict] = {}
     scores = part(metrics, "peaks", peak)
-    for name in part(scores, "parameters"):
-        one = part(scores, "parameters", name)
+    for name, one in part(scores, "parameters").items():
         found[name] = verdict(
             number(one, "iou", method),
             number(one, "iou", "ceiling"),
             number(one, "iou_std", "ceiling"),
             "lower",
+            "IoU {value:.1f} of {expected:.1f}",
         )
+        unit = f" {PARAMETERS[name].unit}" if name in PARAMETERS else ""
         found[name + _W1] = verdict(
             number(one, "wasserstein", method),
             number(one, "wasserstein_null"),
             number(one, "wasserstein_null_std"),
             "higher",
+            f"W₁ {{value:.3g}}{unit}, by chance {{expected:.3g}}{unit}",
         )
-    tested = part(scores, "two_sample", method)
-    if tested:
+    if tested := part(scores, "two_sample", method):
         auc, mean, std = (number(tested, key) for key in ("auc", "null_mean", "null_std"))
-        found[_AUC] = _with_reason(verdict(auc, mean, std, "higher"), tested.get("missing"))
+        numbers = "AUC {value:.2f}, by chance {expected:.2f}"
+        found[_AUC] = verdict(auc, mean, std, "higher", numbers, tested.get("missing"))
     survival = part(metrics, "ae_survival", peak)
     if "difference" in survival:
         off, std = (number(survival, k, method) for k in ("difference", "difference_std"))
         reason = "too few events of the double-escape peak, or none of this one"
-        found[_SURVIVAL] = _with_reason(verdict(off, 0.0, std, "both"), reason)
-    return found | _noise_verdicts(part(scores, "noise"), method)
-
-
-def _noise_verdicts(noise: Mapping[str, Any], method: str) -> dict[str, Verdict]:
-    own, data = part(noise, method), part(noise, "data")
-    if not own:
-        return {}
-    errors = [number(side, "rms_std") for side in (own, data)]
-    known = [error for error in errors if error is not None]
-    spread = math.hypot(*known) if len(known) == len(errors) else None
-    size = verdict(number(own, "rms"), number(data, "rms"), spread, "both")
-    found = {_NOISE: _with_reason(size, own.get("missing", data.get("missing")))}
-    if (worst := number(own, "spectrum_sigma")) is not None:
-        found[_NOISE + _SPECTRUM] = verdict(worst, 0.0, 1.0, "higher")
+        found[_SURVIVAL] = verdict(off, 0.0, std, "both", "{value:+.1f} points", reason)
+    own, data = part(scores, "noise", method), part(scores, "noise", "data")
+    if own:
+        errors = number(own, "rms_std"), number(data, "rms_std")
+        spread = None if None in errors else math.hypot(*filter(None, errors))
+        ratio = number(own, "rms_ratio")
+        size = "" if ratio is None else f"RMS {ratio:.2f} of the data's"
+        reason = own.get("missing", data.get("missing"))
+        rms = number(own, "rms"), number(data, "rms")
+        found[_NOISE] = verdict(*rms, spread, "both", size, reason)
+        if (worst := number(own, "spectrum_sigma")) is not None:
+            band = "; ".join(filter(None, ("worst band of its spectrum", size)))
+            found[_NOISE + _SPECTRUM] = verdict(worst, 0.0, 1.0, "higher", band)
     return found
 
 
@@ -232,10 +251,9 @@ def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
         elif all(v.agrees for v in known.values()):
             agreeing.append(_called(name))
         else:
-            worst = max(known, key=lambda n: _severity(known[n]))
-            quoted = _quoted(metrics, peak, method, worst)
-            text = f"{_called(name)} {known[worst].words}{quoted}"
-            off.append((_severity(known[worst]), text))
+            worst = max(known.values(), key=lambda v: v.severity)
+            quoted = f" ({worst.numbers})" if worst.numbers else ""
+            off.append((worst.severity, f"{_called(name)} {worst.words}{quoted}"))
     parts = [_agreement(agreeing, len(off))] if agreeing else []
     parts += [text for _, text in sorted(off, key=lambda pair: -pair[0])]
     head = f"{_SHORT.get(method, label(method))}, {peak}"
@@ -267,18 +285,6 @@ def number(metrics: Any, *keys: str) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _with_reason(found: Verdict, reason: object) -> Verdict:
-    if found.agrees is not None or not isinstance(reason, str):
-        return found
-    return Verdict(None, None, reason)
-
-
-def _severity(found: Verdict) -> float:
-    if found.agrees:
-        return 0.0
-    return math.inf if found.sigma is None else abs(found.sigma)
-
-
 def _called(quantity: str) -> str:
     named = {_AUC: "classifier", _SURVIVAL: "A/E survival"}
     return named.get(quantity, quantity.replace("_", " "))
@@ -294,32 +300,6 @@ def _agreement(agreeing: list[str], n_off: int) -> str:
     *first, last = agreeing
     names = f"{', '.join(first)} and {last}" if first else last
     return f"{names} {'agree' if first else 'agrees'} with the data within errors"
-
-
-def _quoted(metrics: Mapping[str, Any], peak: str, method: str, quantity: str) -> str:
-    """The score of a verdict and its expectation by chance."""
-    scores = part(metrics, "peaks", peak)
-    if quantity == _AUC:
-        tested = part(scores, "two_sample", method)
-        return (
-            f" (AUC {number(tested, 'auc'):.2f}, by chance {number(tested, 'null_mean'):.2f})"
-        )
-    if quantity == _SURVIVAL:
-        survival = part(metrics, "ae_survival", peak)
-        return f" ({number(survival, 'difference', method):+.1f} points)"
-    if quantity in (_NOISE, _NOISE + _SPECTRUM):
-        ratio = number(scores, "noise", method, "rms_ratio")
-        worst = [] if quantity == _NOISE else ["worst band of its spectrum"]
-        size = [] if ratio is None else [f"RMS {ratio:.2f} of the data's"]
-        return f" ({'; '.join(worst + size)})" if worst + size else ""
-    name = quantity.removesuffix(_W1)
-    one = part(scores, "parameters", name)
-    if name == quantity:
-        overlap, ceiling = number(one, "iou", method), number(one, "iou", "ceiling")
-        return f" (IoU {overlap:.1f} of {ceiling:.1f})"
-    unit = f" {PARAMETERS[name].unit}" if name in PARAMETERS else ""
-    distance, chance = number(one, "wasserstein", method), number(one, "wasserstein_null")
-    return f" (W₁ {distance:.3g}{unit}, by chance {chance:.3g}{unit})"
 
 
 def judged_scores(metrics: Mapping[str, Any], method: str) -> tuple[int, int]:
