@@ -18,7 +18,7 @@ from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.translation.export import _score_table, export_onnx
+from cpunet.translation.export import export_onnx
 from cpunet.translation.onnx import write_onnx
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.comparisons import compare
@@ -174,12 +174,3 @@ def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
     with pytest.raises(CpunetError, match="differs from the run"):
         write_onnx(wrong, tmp_path / "x")
     assert [p.name for p in tmp_path.iterdir() if p.name != "x"] == []
-
-
-def test_parts_of_a_report_that_are_no_scores_are_left_out():
-    peaks = {
-        "DEP": 3,
-        "SEP": {"parameters": 3},
-        "FEP": {"parameters": {"tail_slope": {"iou": {"ren": 80.04, "raw": None}}, "rise": 1}},
-    }
-    assert _score_table(peaks)[3:] == ["| FEP | tail slope | ren 80.0 |", ""]

@@ -99,7 +99,7 @@ def test_other_pulses_are_added_with_the_noise(run, sim):
     # 0.2 of the height of 1, less by the scale: the tail is higher too
     assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)
     assert np.array_equal(result[5], plain[5])
-    with pytest.raises(CpunetError, match="drawn with the noise"):
+    with pytest.raises(CpunetError, match="drawn with electronic noise"):
         ren.apply(sim, noise=False, remains_kev=left, **energies)
 
 

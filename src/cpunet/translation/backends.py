@@ -16,24 +16,19 @@ from cpunet.electronics.drawn_remains import DrawnRemains
 from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
 from cpunet.electronics.finishing import finish_with_codes
 from cpunet.electronics.second_pulses import SecondPulses
-from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Codes, prepare
+from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.run import Run
-from cpunet.translation.graphs import ChainGraph, Graph, NetworkGraph, example_windows
+from cpunet.translation.onnx import ChainGraph, Graph, NetworkGraph, example_windows
 
 Energies = npt.NDArray[np.float64]
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
-NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
-NO_OTHERS = (
-    "other pulses are drawn with the noise, by energies; leave out remains_kev and second"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +69,9 @@ class Drawn:
             second=None if self.second is None else self.second.of_rows(rows),
         )
 
-    def device(self, default: torch.device) -> torch.device:
-        """Device of the random generator."""
-        return default if self.generator is None else self.generator.device
-
     def seed(self, default: torch.device) -> int:
         """Seed of the electronic noise, from the random generator."""
-        device = self.device(default)
+        device = default if self.generator is None else self.generator.device
         return int(torch.randint(2**62, (), generator=self.generator, device=device))
 
 
@@ -145,11 +136,6 @@ class NetworkBackend(Backend):
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network; its output is a prepared window already."""
-        if drawn.others:
-            raise CpunetError(
-                "a network has what it was shown; other pulses belong to readout chains, so "
-                "leave out remains_kev and second"
-            )
         batch = torch.from_numpy(windows).to(self.device)
         out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
         result: FloatArray = out[:, 0].cpu().numpy()
@@ -209,18 +195,8 @@ class NoisyNetworkBackend(NetworkBackend):
         return self.kept.noise
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Run the network, add noise in proportion to 1/energy, and prepare like data.
-
-        Raises
-        ------
-        CpunetError
-            If noise is requested and an energy is unknown.
-        """
+        """Run the network, add noise in proportion to 1/energy, and prepare like data."""
         energy_kev, second = drawn.energy_kev, drawn.second
-        if drawn.noise and energy_kev is None:
-            raise CpunetError(NO_ENERGY)
-        if not drawn.noise and drawn.others:
-            raise CpunetError(NO_OTHERS)
         clean, codes = super().__call__(
             windows, Drawn(noise=drawn.noise, generator=drawn.generator)
         )
@@ -265,22 +241,12 @@ class ResponseBackend(Backend):
         return self.chain.noise
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Apply the chain, add noise proportional to 1/energy, and prepare like data.
-
-        Raises
-        ------
-        CpunetError
-            If noise is requested and an energy is unknown.
-        """
+        """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         energy_kev, second = drawn.energy_kev, drawn.second
-        if drawn.noise and energy_kev is None:
-            raise CpunetError(NO_ENERGY)
         seed = drawn.seed(self.device)
         added = None
-        if drawn.others:
-            if energy_kev is None or not drawn.noise:
-                raise CpunetError(NO_OTHERS)
+        if drawn.others and energy_kev is not None:
             added = _left(self.remains, records, energy_kev, drawn.remains_kev)
             if second is not None and len(second.row):
                 added += self._second(windows, energy_kev, second, records.shape[1])
@@ -311,11 +277,7 @@ class ResponseBackend(Backend):
         after = max(0, length - n_pre - self.config.samples_after)
         # before the window no charge has moved, after it all charge has been collected
         long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
-        with torch.inference_mode():
-            records = self.network(torch.from_numpy(long).to(self.device)).cpu().numpy()
-        config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
-        dt_ns = float(self.chain.response.dt_ns)
-        clean = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
+        records, clean = self._clean(long)
         source = clean.align_sample[:, np.newaxis] - n_pre + np.arange(length)
         source = source.clip(0, records.shape[1] - 1)
         level = np.take_along_axis(records[clean.index], source, axis=1)
@@ -325,18 +287,22 @@ class ResponseBackend(Backend):
         ]
         return levels, clean.codes
 
+    def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
+        """Records without noise, and the same prepared; flat tops do not count as saturated."""
+        with torch.inference_mode():
+            records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
+        config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
+        pulses = Pulses.of(records, dt_ns=float(self.chain.response.dt_ns))
+        return records, prepare(pulses, config, "measured")
+
     def _second(
         self, windows: FloatArray, energy_kev: Energies, second: SecondPulses, length: int
     ) -> npt.NDArray[np.float64]:
         """Second pulses with shapes of the same batch, at each sample in prepared units."""
         dt_ns = float(self.chain.response.dt_ns)
         # early second pulses need longer records
-        chosen = np.pad(
-            windows[second.partner], ((0, 0), (0, second.reach(dt_ns))), mode="edge"
-        )
-        shapes = self.network(torch.from_numpy(chosen).to(self.device)).cpu().numpy()
-        config = self.config.model_copy(update={"saturation_run": shapes.shape[1] + 1})
-        clean = prepare(Pulses.of(shapes, dt_ns=dt_ns), config, "measured")
+        reach = ((0, 0), (0, second.reach(dt_ns)))
+        shapes, clean = self._clean(np.pad(windows[second.partner], reach, mode="edge"))
         scale = np.full(len(shapes), np.median(clean.scale))
         scale[clean.index] = clean.scale
         return second.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
@@ -353,18 +319,7 @@ class InverseBackend(Backend):
         self.dt_ns = dt_ns
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Invert the response and suppress the noise; deterministic.
-
-        Raises
-        ------
-        CpunetError
-            If other pulses are to be added.
-        """
-        if drawn.others:
-            raise CpunetError(
-                "the inverse gives charge, without other pulses; leave out remains_kev and "
-                "second"
-            )
+        """Invert the response and suppress the noise; deterministic."""
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
@@ -410,12 +365,8 @@ def _left(
     energy_kev: Energies,
     remains_kev: Energies | None,
 ) -> npt.NDArray[np.float64]:
-    """Remains of earlier pulses at each sample of the records, in prepared units."""
-    if remains_kev is None:
+    """Pile-up tails at each sample of the records, in prepared units."""
+    if remains_kev is None or remains is None:
         return np.zeros(records.shape)
-    if remains is None:
-        raise CpunetError(
-            "the run does not tell of remains of earlier pulses; leave out remains_kev"
-        )
     left = remains_kev * remains.height / energy_kev
     return np.asarray(left[:, np.newaxis] * remains.decay(records.shape[1]))

@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
 from cpunet.settings import read_json
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import Run, RunLike, as_run
-from cpunet.translation.graphs import Graph
-from cpunet.translation.onnx import CHECKED, FORMAT, OPSET, TOLERANCE, write_onnx
+from cpunet.translation.onnx import CHECKED, FORMAT, OPSET, TOLERANCE, Graph, write_onnx
 from cpunet.translation.translator import IREN, REN, Translator
 
 
@@ -86,7 +84,10 @@ def export_onnx(
         refuse_existing(path, run.folder, report, force=force)
     kind: type[Translator] = IREN if inverse else REN
     translator = kind.of(run)
-    scores = None if report is None else _scores(report)
+    scores = None
+    if report is not None:
+        remedy = "give the folder that `cpunet validate` made"
+        scores = read_json(report / "metrics.json", remedy)["peaks"]
     noise = translator.backend.noise
     graph = translator.backend.graph(run.recipe.preparation.length)
     with (
@@ -106,25 +107,9 @@ def export_onnx(
 
 
 def _write_noise(path: Path, noise: BaselineNoise) -> None:
-    if noise.kinds is None or noise.lines is None or noise.shares is None:
-        raise ValueError("the noise of a run has kinds")
+    spectra: Any = {"continua": noise.kinds, "lines": noise.lines, "shares": noise.shares}
     with path.open("wb") as stream:
-        np.savez(
-            stream,
-            continua=noise.kinds,
-            lines=noise.lines,
-            shares=noise.shares,
-            samples=noise.samples,
-            dt_ns=noise.dt_ns,
-        )
-
-
-def _scores(report: Path) -> Mapping[str, Any]:
-    path = report / "metrics.json"
-    peaks = read_json(path, "give the folder that `cpunet validate` made").get("peaks")
-    if not isinstance(peaks, dict):
-        raise CpunetError(f"{path}: no scores of peaks; validate again")
-    return peaks
+        np.savez(stream, **spectra, samples=noise.samples, dt_ns=noise.dt_ns)
 
 
 def _card(
@@ -259,18 +244,12 @@ def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
         "| peak | parameter | overlaps |",
         "|---|---|---|",
     ]
-    for peak, content in peaks.items():
-        parameters = content.get("parameters", content) if isinstance(content, dict) else None
-        if not isinstance(parameters, dict):
-            continue
-        for name, values in parameters.items():
-            iou = values.get("iou") if isinstance(values, dict) else None
-            if not isinstance(iou, dict):
-                continue
+    for peak, scores in peaks.items():
+        for name, compared in scores["parameters"].items():
             told = ", ".join(
-                f"{method} {score:.1f}"
-                for method, score in iou.items()
-                if isinstance(score, (int, float))
+                f"{method} {iou:.1f}"
+                for method, iou in compared["iou"].items()
+                if iou is not None
             )
             rows.append(f"| {peak} | {name.replace('_', ' ')} | {told} |")
     return [*rows, ""]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -12,6 +14,7 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened
 from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
@@ -23,7 +26,15 @@ from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, requir
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
-from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
+from cpunet.translation.forms import (
+    AdcTraces,
+    Formed,
+    OutputForm,
+    Windows,
+    adc_scale,
+    wanted_pile_up,
+    wanted_tails,
+)
 from cpunet.translation.noise_blocks import (
     NOISE_ROWS,
     Counts,
@@ -33,15 +44,6 @@ from cpunet.translation.noise_blocks import (
     regrouped,
 )
 from cpunet.translation.options import TranslateOptions
-from cpunet.translation.output_form import Formed, Normalised, OutputForm
-from cpunet.translation.record import (
-    as_json,
-    finished,
-    require_unchanged,
-    run_print,
-    source_print,
-)
-from cpunet.translation.to_adc import AdcForm, adc_scale
 from cpunet.translation.translator import IREN, REN, Translator
 
 log = logging.getLogger(__name__)
@@ -77,18 +79,13 @@ class FileTranslation:
         self.kind: type[Translator] = IREN if options.inverse else REN
         self.translator = self.kind.of(self.run, resolve_device(device))
         self.form = self._form()
-        self._print = run_print(self.run)
-
-    @property
-    def doubts(self) -> list[str]:
-        """What the user should know of the output."""
-        if isinstance(self.form, AdcForm) and self.form.fills_in:
-            window = self.form.config.length
-            return [
-                f"a network knows windows of {window} samples alone; beyond them "
-                "stand baseline and decay without noise"
-            ]
-        return []
+        told = f"{self.run.weights_sha256}{self.run.recipe!r}"
+        self._print = hashlib.sha256(told.encode()).hexdigest()
+        if isinstance(self.form, AdcTraces) and self.form.fills_in:
+            log.warning(
+                f"a network knows windows of {self.form.config.length} samples alone; beyond "
+                "them stand baseline and decay without noise"
+            )
 
     def __call__(
         self,
@@ -141,12 +138,16 @@ class FileTranslation:
         others = _other_columns(pulses)
         with self.writer(out, force=force) as writer:
             counts = self._written(pulses, noise_key, writer, others)
-            self._require_some(source, counts)
-            require_unchanged(source, before)
-            told = counts.told(adc=self.options.adc is not None)
-            record = made | {"counts": told, "cpunet": cpunet.__version__}
-            writer.stamp(TRANSLATION, as_json(record))
-        return told
+            summary = self._summary(source, counts)
+            if source_print(source) != before:
+                raise CpunetError(
+                    f"{source.path}: changed while it was read; translate it once it is "
+                    "complete"
+                )
+            record = made | {"counts": summary, "cpunet": cpunet.__version__}
+            # options given from Python may be numbers of NumPy
+            writer.stamp(TRANSLATION, json.dumps(record, default=np.generic.item))
+        return summary
 
     def in_memory(self, source: PulseFile) -> tuple[Formed, dict[str, Any]]:
         """Translated pulses of a file, and their counts, as those of `__call__`.
@@ -159,8 +160,7 @@ class FileTranslation:
         counts, blocks = Counts(), list(self._blocks(self.opened(source), None))
         for block in blocks:
             counts.add(block)
-        self._require_some(source, counts)
-        return joined(blocks), counts.told(adc=self.options.adc is not None)
+        return joined(blocks), self._summary(source, counts)
 
     def opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate.
@@ -171,7 +171,11 @@ class FileTranslation:
             If it cannot be read, has another sampling period or is of the other side.
         """
         pulses = source.open()
-        self._require_sampling(source, pulses)
+        if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
+            raise CpunetError(
+                f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
+                f"{self.translator.dt_ns:g} ns; resample the pulses"
+            )
         require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
         return pulses
 
@@ -189,21 +193,12 @@ class FileTranslation:
 
     def _form(self) -> OutputForm:
         adc = self.options.adc
-        remains = wanted_remains(self.translator, self.options.remains, raw=adc is not None)
+        tails = wanted_tails(self.translator, self.options.remains, raw=adc is not None)
         pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
         if adc is None or not isinstance(self.translator, REN):
-            return Normalised(self.translator, remains, pile_up)
-        scale = adc_scale(
-            self.run, self.translator, adc_per_kev=adc.adc_per_kev, baseline=adc.baseline
-        )
-        return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains, pile_up)
-
-    def _require_sampling(self, source: PulseFile, pulses: PulseSource) -> None:
-        if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
-            raise CpunetError(
-                f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
-                f"{self.translator.dt_ns:g} ns; resample the pulses"
-            )
+            return Windows(self.translator, tails, pile_up)
+        scale = adc_scale(self.run, self.translator, adc)
+        return AdcTraces(self.translator, *scale, adc, tails, pile_up)
 
     def _remedy(self, pulses: PulseSource) -> str:
         """Advice for pulses of the other side."""
@@ -212,14 +207,16 @@ class FileTranslation:
             return f"translate the {self.kind.takes} ones that they were made of"
         return f"{'leave out' if self.options.inverse else 'give'} `inverse`"
 
-    def _require_some(self, source: PulseFile, counts: Counts) -> None:
-        if counts.translated:
-            return
-        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.rejections.items())
-        raise CpunetError(
-            f"{source.path}: none of {counts.read} pulses can be translated "
-            f"({reasons}); are these {self.translator.takes} pulses?"
-        )
+    def _summary(self, source: PulseFile, counts: Counts) -> dict[str, Any]:
+        """Counts of rows, of which some must be translated."""
+        summary = counts.summary(adc=self.options.adc is not None)
+        if not summary["translated"]:
+            reasons = ", ".join(f"{n} {why}" for why, n in summary["rejections"].items())
+            raise CpunetError(
+                f"{source.path}: none of {summary['read']} pulses can be translated "
+                f"({reasons}); are these {self.translator.takes} pulses?"
+            )
+        return summary
 
     def _written(
         self,
@@ -246,21 +243,15 @@ class FileTranslation:
         """Translate block by block; the noise depends only on the order of the pulses."""
         with stage("Translating", pulses.n_pulses) as bar:
             for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
-                yield self._formed(block, number, noise_key)
-
-    def _formed(self, block: Pulses, number: int, noise_key: str | None) -> Formed:
-        seeds = [
-            noise_seed(self.options.seed, noise_key, number, realisation)
-            for realisation in range(self.options.realisations)
-        ]
-        return interleaved(
-            [
-                self.form(
-                    block, noise=self.options.noise, generator=self.translator.seeded(seed)
+                seeds = (
+                    noise_seed(self.options.seed, noise_key, number, realisation)
+                    for realisation in range(self.options.realisations)
                 )
-                for seed in seeds
-            ]
-        )
+                generators = map(self.translator.seeded, seeds)
+                noise = self.options.noise
+                yield interleaved(
+                    [self.form(block, noise=noise, generator=one) for one in generators]
+                )
 
 
 def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
@@ -281,3 +272,72 @@ def _other_columns(pulses: PulseSource) -> RowColumns:
     for column, reason in others.left_out.items():
         log.warning(f"{pulses.path.name}: column {column} is left out: {reason}")
     return others
+
+
+def source_print(source: PulseFile) -> dict[str, Any]:
+    """Names, sizes and modification times of the input files, and how they are read.
+
+    Pulses in memory have a digest instead.
+
+    Raises
+    ------
+    CpunetError
+        If a file does not exist.
+    """
+    if source.pulses is not None:
+        content = source.pulses.waveforms, source.pulses.energy_kev
+        digest = hashlib.sha256(b"".join(values.tobytes() for values in content))
+        return {"files": [], "sha256": digest.hexdigest()}
+    paths = [source.path]
+    elsewhere = (source.energy or "").rpartition(":")[0]
+    if elsewhere and Path(elsewhere).is_file():
+        paths.append(Path(elsewhere))
+    prints = []
+    for path in paths:
+        try:
+            stat = path.stat()
+        except OSError:
+            raise CpunetError(f"{path}: no such file; check the name") from None
+        prints.append({"name": path.name, "bytes": stat.st_size, "changed": stat.st_mtime_ns})
+    return {
+        "files": prints,
+        "table": source.table,
+        "energy": source.energy,
+        "kev_per_adc": source.kev_per_adc,
+        "dt_ns": source.dt_ns,
+    }
+
+
+def finished(out: Path, wanted: dict[str, Any]) -> dict[str, Any]:
+    """Counts of an existing output that was made as requested.
+
+    Parameters
+    ----------
+    out
+        A translated file.
+    wanted
+        ``source``, ``run`` and ``options``.
+
+    Raises
+    ------
+    CpunetError
+        If it is no finished translation, or was made from another source, with another run or
+        with other options.
+    """
+    try:
+        with opened(out) as file:
+            found = json.loads(file.attrs[TRANSLATION])
+    except (CpunetError, LookupError) as error:
+        raise CpunetError(
+            f"{out}: is no translation that is finished; choose another `out` or give `force`"
+        ) from error
+    for what, value in wanted.items():
+        if found[what] == value:
+            continue
+        other = f"another {what}"
+        if what == "options":
+            theirs = found[what]
+            names = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
+            other = f"other options ({', '.join(names)})"
+        raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
+    return dict(found["counts"])

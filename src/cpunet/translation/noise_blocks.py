@@ -11,7 +11,7 @@ import numpy as np
 from cpunet.electronics.second_pulses import Columns
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection
-from cpunet.translation.output_form import Formed
+from cpunet.translation.forms import Formed
 
 NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 
@@ -111,27 +111,12 @@ class Counts:
         self.codes += np.bincount(formed.codes, minlength=len(self.codes))
         self.saturated += int(formed.saturated.sum())
 
-    @property
-    def read(self) -> int:
-        """Number of all rows."""
-        return int(self.codes.sum())
-
-    @property
-    def translated(self) -> int:
-        """Number of rows with a pulse."""
-        return int(self.codes[Rejection.ACCEPTED])
-
-    @property
-    def rejections(self) -> dict[str, int]:
-        """Numbers of rows without a pulse, by reason."""
+    def summary(self, *, adc: bool) -> dict[str, Any]:
+        """Numbers of rows read, translated and rejected by reason, in ADC also of saturated."""
         rejected = [code for code in np.flatnonzero(self.codes) if code]
-        return {Rejection(int(code)).label: int(self.codes[code]) for code in rejected}
-
-    def told(self, *, adc: bool) -> dict[str, Any]:
-        """Counts as a dictionary, in ADC with the number of saturated rows."""
-        told = {
-            "read": self.read,
-            "translated": self.translated,
-            "rejections": self.rejections,
+        summary = {
+            "read": int(self.codes.sum()),
+            "translated": int(self.codes[Rejection.ACCEPTED]),
+            "rejections": {Rejection(int(c)).label: int(self.codes[c]) for c in rejected},
         }
-        return told | ({"saturated": self.saturated} if adc else {})
+        return summary | ({"saturated": self.saturated} if adc else {})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,6 @@ from cpunet.translation.file_translation import FileTranslation
 from cpunet.translation.many_files import expanded, translate_files
 from cpunet.translation.options import NONE, Adc, TranslateOptions
 from cpunet.translation.translation import Translation
-
-log = logging.getLogger(__name__)
 
 
 def translate(
@@ -125,7 +122,10 @@ def translate(
     if out is None:
         if several or channels:
             raise CpunetError("several files or tables do not stay in memory; give `out`")
-        return _in_memory(as_run(run), files[0], options, device)
+        run = as_run(run)
+        job = FileTranslation(run, options, device)
+        kept, counts = job.in_memory(files[0])
+        return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
     if channels:
         if len(files) > 1:
             raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
@@ -152,34 +152,11 @@ def _files(
         yield from (pulse_file(name, read) for name in names)
 
 
-def _in_memory(
-    run: Run, source: PulseFile, options: TranslateOptions, device: str
-) -> Translation:
-    job = _job(run, options, device)
-    kept, counts = job.in_memory(source)
-    adc = options.adc is not None
-    return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
-
-
 def _to_file(
-    run: Run,
-    source: PulseFile,
-    out: Path,
-    options: TranslateOptions,
-    *,
-    device: str,
-    noise_key: str | None = None,
-    **how: bool,
+    run: Run, source: PulseFile, out: Path, options: TranslateOptions, device: str, **how: Any
 ) -> Translation:
-    counts = _job(run, options, device)(source, out, noise_key=noise_key, **how)
+    counts = FileTranslation(run, options, device)(source, out, **how)
     return Translation(run.name, run.recipe, counts, options.adc is not None, out)
-
-
-def _job(run: Run, options: TranslateOptions, device: str) -> FileTranslation:
-    job = FileTranslation(run, options, device)
-    for doubt in job.doubts:
-        log.warning(doubt)
-    return job
 
 
 def _of_channels(

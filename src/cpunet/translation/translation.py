@@ -23,7 +23,7 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.output_form import Formed
+from cpunet.translation.forms import Formed
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -24,10 +24,11 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run
-from cpunet.translation.backends import NO_ENERGY, Backend, Drawn, Energies, backend_of
+from cpunet.translation.backends import Backend, Drawn, Energies, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
+NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
 
 
@@ -36,7 +37,7 @@ class RejectionWarning(UserWarning):
 
 
 @dataclass(frozen=True, eq=False)
-class Translated:
+class TranslatedPulses:
     """Translated pulses, with the rows of the input.
 
     Parameters
@@ -141,13 +142,38 @@ class Translator:
             If pulses cannot be translated, with their numbers by reason; their rows are NaN.
             `translate_pulses` returns a code for each instead.
         """
-        if isinstance(waveforms, torch.Tensor):
-            array = waveforms.detach().cpu().float().numpy()  # NumPy has no bfloat16
-            result = self._translate_array(array, energy_kev, noise, seed, remains_kev)
-            return torch.from_numpy(result).to(waveforms.device)
-        return self._translate_array(
-            np.asarray(waveforms), energy_kev, noise, seed, remains_kev
+        array = (
+            waveforms.detach().cpu().float().numpy()  # NumPy has no bfloat16
+            if isinstance(waveforms, torch.Tensor)
+            else np.asarray(waveforms)
         )
+        if not array.ndim:
+            raise CpunetError("waveforms is a single number; expected (pulses, samples)")
+        if noise and self.needs_energies and energy_kev is None:
+            raise CpunetError(NO_ENERGY)
+        pulses = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
+        if energy_kev is not None:
+            energies = _one_each("energy_kev", energy_kev, len(pulses))
+            pulses = replace(pulses, energy_kev=energies)
+        left = None
+        if remains_kev is not None:
+            left = _one_each("remains_kev", remains_kev, len(pulses))
+        done = self.translate_pulses(
+            pulses, noise=noise, generator=self.seeded(seed), remains_kev=left
+        )
+        if array.ndim == 1 and not done.valid[0]:
+            raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")
+        if not done.valid.all():
+            warnings.warn(
+                f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
+                f"translated and are rows of NaN: {done.reasons()}",
+                RejectionWarning,
+                stacklevel=2,
+            )
+        result = done.pulses.waveforms[0] if array.ndim == 1 else done.pulses.waveforms
+        if isinstance(waveforms, torch.Tensor):
+            return torch.from_numpy(result).to(waveforms.device)
+        return result
 
     def translate_pulses(
         self,
@@ -157,7 +183,7 @@ class Translator:
         generator: torch.Generator | None = None,
         remains_kev: Energies | None = None,
         second: SecondPulses | None = None,
-    ) -> Translated:
+    ) -> TranslatedPulses:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
         Parameters
@@ -197,7 +223,7 @@ class Translator:
             prepared.pulses.waveforms[rows],
             Drawn(pulses.energy_kev, noise, generator, remains_kev, second).of_rows(index),
         )
-        return Translated(pulses.with_waveforms(waveforms), codes)
+        return TranslatedPulses(pulses.with_waveforms(waveforms), codes)
 
     @property
     def remains(self) -> DrawnRemains | None:
@@ -227,7 +253,23 @@ class Translator:
         windows: FloatArray,
         drawn: Drawn,
     ) -> tuple[FloatArray, Codes]:
-        """Like `apply`, with a `Rejection` for each row."""
+        """Like `apply`, with a `Rejection` for each row.
+
+        Raises
+        ------
+        CpunetError
+            If energies or what is known of other pulses are missing.
+        """
+        if drawn.noise and self.needs_energies and drawn.energy_kev is None:
+            raise CpunetError(NO_ENERGY)
+        if drawn.others and not (drawn.noise and self.needs_energies):
+            raise CpunetError(
+                "other pulses are drawn with electronic noise; leave out remains_kev and second"
+            )
+        if drawn.remains_kev is not None and self.remains is None:
+            raise CpunetError(
+                "the run does not tell of remains of earlier pulses; leave out remains_kev"
+            )
         result = np.empty_like(windows)
         codes = np.zeros(len(windows), np.uint8)
         with torch.inference_mode():
@@ -244,40 +286,6 @@ class Translator:
         else:
             generator.manual_seed(seed)
         return generator
-
-    def _translate_array(
-        self,
-        waveforms: npt.NDArray[np.floating],
-        energy_kev: npt.ArrayLike | None,
-        noise: bool,
-        seed: int | None,
-        remains_kev: npt.ArrayLike | None,
-    ) -> FloatArray:
-        if not waveforms.ndim:
-            raise CpunetError("waveforms is a single number; expected (pulses, samples)")
-        single = waveforms.ndim == 1
-        if noise and self.needs_energies and energy_kev is None:
-            raise CpunetError(NO_ENERGY)
-        pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
-        if energy_kev is not None:
-            energies = _one_each("energy_kev", energy_kev, len(pulses))
-            pulses = replace(pulses, energy_kev=energies)
-        left = None
-        if remains_kev is not None:
-            left = _one_each("remains_kev", remains_kev, len(pulses))
-        done = self.translate_pulses(
-            pulses, noise=noise, generator=self.seeded(seed), remains_kev=left
-        )
-        if single and not done.valid[0]:
-            raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")
-        if not done.valid.all():
-            warnings.warn(
-                f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
-                f"translated and are rows of NaN: {done.reasons()}",
-                RejectionWarning,
-                stacklevel=3,
-            )
-        return done.pulses.waveforms[0] if single else done.pulses.waveforms
 
 
 def _one_each(name: str, energy_kev: npt.ArrayLike, n: int) -> Energies:

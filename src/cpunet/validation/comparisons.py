@@ -29,7 +29,7 @@ Values = npt.NDArray[np.float64]
 ByMethod = dict[str, float | None]
 
 
-class Comparison(TypedDict):
+class Compared(TypedDict):
     """Result of `compare` for one parameter."""
 
     iou: ByMethod
@@ -165,7 +165,7 @@ def compare(
     methods: Mapping[str, Mapping[str, Values]],
     scores: ScoreConfig,
     seed: int,
-) -> dict[str, Comparison]:
+) -> dict[str, Compared]:
     """Compare each parameter of the data with that of every method.
 
     Parameters
@@ -230,10 +230,10 @@ def compare(
 
 def _of_data(
     data: Values, methods: list[str], null: Draws, axis: hist.axis.Regular | None
-) -> Comparison:
+) -> Compared:
     """Ceiling and nulls from the data alone, before any method is added."""
     distances = null_distances(data, null)
-    result = Comparison(
+    result = Compared(
         iou=dict.fromkeys([*methods, "ceiling"]),
         iou_std=dict.fromkeys([*methods, "ceiling"]),
         wasserstein=dict.fromkeys(methods),
@@ -256,7 +256,7 @@ def _of_data(
 
 
 def _add_method(
-    result: Comparison,
+    result: Compared,
     method: str,
     data: Values,
     values: Values,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,12 +13,11 @@ from matplotlib.figure import Figure
 from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
-from cpunet.pulses.parameters import PARAMETERS
-from cpunet.translation.translator import IREN, REN
+from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_drift_time import ae_figure
 from cpunet.validation.ae_energy import ae_energy_figure
-from cpunet.validation.comparisons import Comparison
-from cpunet.validation.evaluation import Evaluation, PeakDetails
+from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise
 from cpunet.validation.page import AE_ENERGY
 from cpunet.validation.peaks import PeakSets
@@ -43,99 +42,100 @@ from cpunet.validation.slices import slice_figure
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
-REMAINS = "remains of earlier pulses"
+TAILS = "remains of earlier pulses"
 DRIFT, IN_DRIFT = "clock and blur of the U-Net", 2048  # pulses in it
-SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
-CYCLES = ("forward cycle", "backward cycle")
+SPECTRUM, LOSSES, ROC = "spectrum", "losses", "A over E survival"
+FORWARD = ("Simulation", "REN (simulation)", "IREN (REN (simulation))")
+BACKWARD = ("Data", "IREN (data)", "REN (IREN (data))")
 
 Drawing = Callable[[], Figure]
+T = TypeVar("T")
 
 
 def drawings(found: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
-    peaks = {name: peak.energy_kev for name, peak in found.ren.recipe.peaks.items()}
+    ren, iren, metrics = found.ren, found.iren, found.metrics
+    peaks = {name: peak.energy_kev for name, peak in ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
     made: dict[str, Drawing] = {SPECTRUM: partial(spectrum_figure, energies, peaks)}
-    made |= _remains(found.metrics["remains"] or {})
-    if methods := found.metrics["ae_energy"].get("methods"):
+    tails = metrics["remains"] or {}
+    if tails.get("rate_khz") and "sizes" in tails:  # if any are known and were kept
+        energies_kev = tails["drawn"]["energies_kev"]
+        made[TAILS] = partial(tails_figure, tails, tails["sizes"], energies_kev)
+    if methods := metrics["ae_energy"].get("methods"):
         made[AE_ENERGY] = partial(ae_energy_figure, methods)
     scored = [peak for peak in found.sets if found.values[peak.name]]
     fullest = max(scored, key=lambda s: min(len(s.sim_rows), len(s.data_rows)))
-    forward, backward = CYCLES
-    made[f"{fullest.name} {forward}"] = _forward(fullest, found.ren, found.iren)
-    made[f"{fullest.name} {backward}"] = _backward(fullest, found.ren, found.iren)
-    made |= _drift(fullest, found.ren)
+    for name, side, there, back, titles in (
+        ("forward cycle", fullest.raw, ren, iren, FORWARD),
+        ("backward cycle", fullest.data, iren, ren, BACKWARD),
+    ):
+        start = side.waveforms[:SHOWN]
+        middle = there.apply(start, noise=False)
+        end = back.apply(middle, noise=False)
+        made[f"{fullest.name} {name}"] = partial(
+            cycle_figure, start, middle, end, titles, ren.dt_ns
+        )
+    drift = getattr(getattr(ren.backend.network, "response", None), "drift", None)
+    if isinstance(drift, DriftUNet):
+        effect = drift.effect(torch.from_numpy(fullest.raw.waveforms[:IN_DRIFT]))
+        made[DRIFT] = partial(drift_figure, *(values.numpy() for values in effect))
     for peak in scored:
         made |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
     if DEP in {peak.name for peak in scored} and len(scored) > 1:
-        made[ROC] = _roc(found, [peak.name for peak in scored])
+        ae = {
+            peak.name: {
+                method: values["current_amplitude"]
+                for method, values in _shown(found.values[peak.name]).items()
+            }
+            for peak in scored
+        }
+        made[ROC] = partial(roc_figure, ae, DEP)
     if found.run.records:
         made[LOSSES] = partial(loss_curves, found.run.records)
     return made
 
 
-def _remains(told: Mapping[str, Any]) -> dict[str, Drawing]:
-    """Sizes of remains with their law, if a training found any and kept them."""
-    if not (told.get("rate_khz") and "sizes" in told):
-        return {}
-    return {REMAINS: partial(tails_figure, told, told["sizes"], told["drawn"]["energies_kev"])}
-
-
-def _drift(peak: PeakSets, ren: REN) -> dict[str, Drawing]:
-    """What a U-Net before the readout does, if there is one."""
-    response = getattr(ren.backend.network, "response", None)
-    drift = getattr(response, "drift", None)
-    if not isinstance(drift, DriftUNet):
-        return {}
-    effect = drift.effect(torch.from_numpy(peak.raw.waveforms[:IN_DRIFT]))
-    return {DRIFT: partial(drift_figure, *(values.numpy() for values in effect))}
+def _shown(by_method: Mapping[str, T], methods: Collection[str] = DRAWN) -> dict[str, T]:
+    return {method: one for method, one in by_method.items() if method in methods}
 
 
 def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
-    name, details = peak.name, found.details[peak.name]
-    scores = found.metrics["peaks"][name]
-    made: dict[str, Drawing] = {
-        parameter: _histograms(name, parameter, found, scores["parameters"][parameter])
-        for parameter in scores["parameters"]
-        if np.isfinite(found.values[name]["data"][parameter]).any()
-    }
-    made |= _further(name, found)
-    made["mean pulse"] = _mean_pulse(details, peak)
+    name, details, dt_ns = peak.name, found.details[peak.name], peak.dt_ns
+    scores, values = found.metrics["peaks"][name], _shown(found.values[name])
+    before, bins = found.run.recipe.preparation.samples_before, found.run.recipe.scores.max_bins
+    made: dict[str, Drawing] = {}
+    further: dict[str, dict[str, Values]] = {}
+    for parameter, data in values["data"].items():
+        by_method = {m: v[parameter] for m, v in values.items() if parameter in v}
+        if not np.isfinite(data).any():
+            continue
+        if parameter in PARAMETERS:
+            axis, compared = data_axis(data, bins), scores["parameters"][parameter]
+            how = (by_method, axis, parameter, name, compared)
+            made[parameter] = partial(parameter_histograms, *how)
+        else:
+            further[parameter] = by_method
+    made["further parameters"] = partial(further_histograms, further, bins, name)
+    made["mean pulse"] = partial(mean_pulses, _shown(details.means), dt_ns, name)
     row = _drawable(peak)
     if row is not None:
-        made["single pulse"] = _single_pulse(peak, row, found)
-    made["superpulses"] = _superpulses(details, peak)
-    made["A over E"] = _ae(details, name)
+        sets = _shown(peak.without_noise(np.array([row])), SINGLE)
+        pulses = {method: windows[0] for method, windows in sets.items()}
+        beside = DataPulse.beside(pulses, peak.data.waveforms, dt_ns, before)
+        title = f"{name}, simulated pulse {row}"
+        made["single pulse"] = partial(
+            single_pulse_figure, pulses, beside, dt_ns, before, title
+        )
+    slices = _shown(details.slices, ("data", "superpulse", "ren"))
+    made["superpulses"] = partial(slice_figure, slices, dt_ns, name)
+    table = dict(details.ae_against_time)
+    table["methods"] = _shown(table["methods"])
+    made["A over E"] = partial(ae_figure, table, name)
     if "missing" not in scores["noise"]["data"]:
-        shown = ("frequency_mhz", "data", "ren")
-        noise = {method: n for method, n in scores["noise"].items() if method in shown}
+        noise = _shown(scores["noise"], ("frequency_mhz", "data", "ren"))
         made["noise"] = partial(spectrum_of_noise, noise, name)
     return made
-
-
-def _histograms(
-    peak: str, parameter: str, found: Evaluation, comparison: Comparison
-) -> Drawing:
-    values = {m: v[parameter] for m, v in found.values[peak].items() if m in DRAWN}
-    axis = data_axis(values["data"], found.ren.recipe.scores.max_bins)
-    return partial(parameter_histograms, values, axis, parameter, peak, comparison)
-
-
-def _further(peak: str, found: Evaluation) -> dict[str, Drawing]:
-    by_method = {m: v for m, v in found.values[peak].items() if m in DRAWN}
-    values = {
-        name: {method: of_method[name] for method, of_method in by_method.items()}
-        for name, data in by_method["data"].items()
-        if name not in PARAMETERS and np.isfinite(data).any()
-    }
-    bins = found.ren.recipe.scores.max_bins
-    drawing = partial(further_histograms, values, bins, peak)
-    return {"further parameters": drawing} if values else {}
-
-
-def _mean_pulse(details: PeakDetails, peak: PeakSets) -> Drawing:
-    means = {m: mean for m, mean in details.means.items() if m in DRAWN}
-    return partial(mean_pulses, means, peak.dt_ns, peak.name)
 
 
 def _drawable(peak: PeakSets) -> int | None:
@@ -146,54 +146,3 @@ def _drawable(peak: PeakSets) -> int | None:
         if all(np.isfinite(edge).any() for edge in edges):
             return int(row)
     return None
-
-
-def _single_pulse(peak: PeakSets, row: int, found: Evaluation) -> Drawing:
-    sets = peak.without_noise(np.array([row]))
-    pulses = {method: sets[method][0] for method in SINGLE if method in sets}
-    before = found.ren.recipe.preparation.samples_before
-    beside = DataPulse.beside(pulses, peak.data.waveforms, peak.dt_ns, before)
-    title = f"{peak.name}, simulated pulse {row}"
-    return partial(single_pulse_figure, pulses, beside, peak.dt_ns, before, title)
-
-
-def _superpulses(details: PeakDetails, peak: PeakSets) -> Drawing:
-    shown = ("data", "superpulse", "ren")
-    sets = {m: slices for m, slices in details.slices.items() if m in shown}
-    return partial(slice_figure, sets, peak.dt_ns, peak.name)
-
-
-def _ae(details: PeakDetails, name: str) -> Drawing:
-    table = dict(details.ae_against_time)
-    table["methods"] = {m: rows for m, rows in table["methods"].items() if m in DRAWN}
-    return partial(ae_figure, table, name)
-
-
-def _roc(found: Evaluation, peaks: list[str]) -> Drawing:
-    ae = {
-        peak: {
-            method: values["current_amplitude"]
-            for method, values in found.values[peak].items()
-            if method in DRAWN
-        }
-        for peak in peaks
-    }
-    return partial(roc_figure, ae, DEP)
-
-
-def _forward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
-    """Simulated pulses translated by REN and back by IREN."""
-    sim = peak.raw.waveforms[:SHOWN]
-    like_data = ren.apply(sim, noise=False)
-    back = iren.apply(like_data, noise=False)
-    titles = ("Simulation", "REN (simulation)", "IREN (REN (simulation))")
-    return partial(cycle_figure, sim, like_data, back, titles, ren.dt_ns)
-
-
-def _backward(peak: PeakSets, ren: REN, iren: IREN) -> Drawing:
-    """Measured pulses translated by IREN and back by REN."""
-    data = peak.data.waveforms[:SHOWN]
-    like_sim = iren.apply(data, noise=False)
-    back = ren.apply(like_sim, noise=False)
-    titles = ("Data", "IREN (data)", "REN (IREN (data))")
-    return partial(cycle_figure, data, like_sim, back, titles, ren.dt_ns)

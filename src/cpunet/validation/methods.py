@@ -32,9 +32,8 @@ from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.forms import drawn_kev, wanted_tails
 from cpunet.translation.options import LEARNED
-from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 from cpunet.validation.truth import Responses, pair_squares
 
@@ -217,7 +216,7 @@ def translate_all(
     true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
     # like the data with which they are compared
-    remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+    remains = wanted_tails(ren, LEARNED) if ren.remains is not None else None
     # the random generators of all methods are in the same state
     noise = None if rivals.noise is None else SameNoise(rivals.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}

@@ -18,7 +18,7 @@ from cpunet.pulses.parameters import PARAMETERS, Values, current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
-from cpunet.validation.comparisons import Comparison, compare
+from cpunet.validation.comparisons import Compared, compare
 from cpunet.validation.methods import Translations
 from cpunet.validation.noise import baseline_spectra
 from cpunet.validation.truth import PairedScores, scores_of_squares
@@ -246,7 +246,7 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
     return values, scores
 
 
-def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Comparison]:
+def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Compared]:
     methods = {method: of_method for method, of_method in values.items() if method != "data"}
     return compare(values["data"], methods, recipe.scores, seed)
 

@@ -31,7 +31,7 @@ from cpunet.pulses.binning import data_axis
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
-from cpunet.validation.comparisons import Comparison, histogram
+from cpunet.validation.comparisons import Compared, histogram
 from cpunet.validation.slices import BEFORE, MeanPulse
 
 Values = npt.NDArray[np.float64]
@@ -156,7 +156,7 @@ def parameter_histograms(
     axis: hist.axis.Regular,
     parameter: str,
     peak: str,
-    comparison: Comparison,
+    comparison: Compared,
 ) -> Figure:
     """Distributions of one parameter: the data filled, each method as a line.
 
@@ -177,12 +177,18 @@ def parameter_histograms(
         Result of `comparisons.compare` for the parameter.
     """
     palette = colours(values)
-    edges = _edges_with_flow(axis)
+    # a bar at either end holds underflow and overflow
+    low, high = axis.edges[[0, -1]]
+    bar = max(high - low, np.spacing(high)) / 25
+    edges = np.concatenate([[low - bar], axis.edges, [high + bar]])
     fractions = {m: histogram(v, axis)[:-1] / max(len(v), 1) for m, v in values.items()}
     figure = Figure(figsize=(5.6, 4.2))
     axes = figure.subplots()
     for method, heights in fractions.items():
-        text = f"{label(method)}{_score(method, comparison)}, {_size(values[method])}"
+        name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
+        score, missing = comparison["iou"].get(name), int(np.isnan(values[method]).sum())
+        text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
+        text += f", n = {len(values[method])}" + (f", {missing} undefined" if missing else "")
         _steps(axes, heights, edges, method, palette[method], text)
     # the outermost bars can be as high as 1 and would flatten everything in between
     top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
@@ -361,24 +367,6 @@ def _steps(
         zorder=1 if is_data else 2,
         gid=GROUP + method,
     )
-
-
-def _edges_with_flow(axis: hist.axis.Regular) -> Values:
-    """Edges of the bins, and of a bar at either end for underflow and overflow."""
-    edges: Values = axis.edges
-    bar = max(edges[-1] - edges[0], np.spacing(edges[-1])) / 25
-    return np.concatenate([[edges[0] - bar], edges, [edges[-1] + bar]])
-
-
-def _score(method: str, comparison: Comparison) -> str:
-    name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
-    score = comparison["iou"].get(name)
-    return "" if score is None else f" ({kind} {score:.1f} %)"
-
-
-def _size(sample: Values) -> str:
-    missing = int(np.isnan(sample).sum())
-    return f"n = {len(sample)}" + (f", {missing} undefined" if missing else "")
 
 
 def _mark_flow(

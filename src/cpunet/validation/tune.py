@@ -39,9 +39,8 @@ from cpunet.training.fit import Sides, match
 from cpunet.training.loop import train
 from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
-from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.forms import drawn_kev, wanted_tails
 from cpunet.translation.options import LEARNED
-from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
 from cpunet.validation.distances import null_distances, wasserstein
 from cpunet.validation.resampling import resampled_twice
@@ -332,7 +331,7 @@ class HeldOut:
             If pulses cannot be translated.
         """
         generator = ren.seeded(self.seed)
-        remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+        remains = wanted_tails(ren, LEARNED) if ren.remains is not None else None
         windows = ren.apply(
             self.sim.waveforms,
             energy_kev=self.sim.energy_kev,

@@ -1,0 +1,432 @@
+"""Forms of translated pulses: normalised windows, or raw traces in ADC counts.
+
+Raw traces are the inverse of the preparation: ``raw = baseline + scale * prepared``, with a
+scale proportional to the energy.  A readout chain produces records of any length with noise
+throughout.  Its noise is added once and nothing is normalised afterwards, so it does not change
+the height of a pulse.  A network produces windows of fixed length.  They are padded with the
+baseline before them and with the decay fitted to their end after them, both without noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.extension import extended
+from cpunet.electronics.second_pulses import Columns, DrawnPileUp, SecondPulses
+from cpunet.errors import CpunetError
+from cpunet.networks.response_layer import PADDING_BEFORE, record_length
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.preparation import Codes, Rejection, prepare
+from cpunet.training.run import Run
+from cpunet.translation.options import LEARNED, NONE, Adc
+from cpunet.translation.translator import BATCH, REN, Translator
+
+HIGHEST = int(np.iinfo(np.uint16).max)
+RISE_SAMPLES = 20  # of the pulse whose height defines the gain
+MIN_ADC = 20.0  # raw traces have a larger median scale
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Formed:
+    """Translated pulses in the form of the output, with the rows of the input.
+
+    Parameters
+    ----------
+    pulses
+        Traces of shape (n, samples).
+    codes
+        A `Rejection` for each row.
+    saturated
+        Mask of the rows that reach an end of the digitiser's range, shape (n,).
+    truth
+        What is known of each trace, arrays of shape (n,) with their units: ``remains_kev``
+        with remains of earlier pulses; ``n_piled``, ``piled_kev`` and ``piled_ns`` with second
+        pulses, see `SecondPulses.largest`; ``realisation`` with several.
+    """
+
+    pulses: Pulses
+    codes: Codes
+    saturated: npt.NDArray[np.bool_]
+    truth: Columns = field(default_factory=dict)
+
+    @property
+    def columns(self) -> Columns:
+        """Columns to be stored beside the pulses."""
+        return {"rejection": (self.codes, ""), **self.truth}
+
+
+class OutputForm(Protocol):
+    """An output form: translates pulses and defines type and units of the samples.
+
+    Attributes
+    ----------
+    samples : numpy dtype
+        Data type of the stored samples.
+    units : str
+        Units of the samples.
+    t0_ns : float
+        Time of the first sample in ns, counted from where a pulse reaches 99.9 % of its
+        maximum.
+    """
+
+    samples: npt.DTypeLike
+    units: str
+    t0_ns: float
+
+    def __call__(
+        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
+    ) -> Formed:
+        """Translate pulses, keeping their rows."""
+        ...
+
+
+class Windows:
+    """Prepared windows: baseline at 0, tail at 0.80; NaN for rejected pulses.
+
+    Parameters
+    ----------
+    translator
+        Trained run.
+    remains
+        Distribution of the remains of earlier pulses; None for none.
+    pile_up
+        Rate and energies of second pulses; None for none.
+    """
+
+    samples: npt.DTypeLike = np.float32
+    units = ""
+
+    def __init__(
+        self,
+        translator: Translator,
+        remains: DrawnRemains | None = None,
+        pile_up: DrawnPileUp | None = None,
+    ) -> None:
+        self.translator, self.remains, self.pile_up = translator, remains, pile_up
+        self.t0_ns = -translator.recipe.preparation.samples_before * translator.dt_ns
+
+    def __call__(
+        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
+    ) -> Formed:
+        """Translate pulses, keeping their rows."""
+        left = drawn_kev(self.remains, len(pulses), generator)
+        second = None
+        if self.pile_up is not None:  # within the records that are prepared to windows
+            config = self.translator.recipe.preparation
+            before, length = (
+                PADDING_BEFORE + config.samples_before,
+                record_length(config.length),
+            )
+            second = self.pile_up.draw(len(pulses), before, length, rng_of(generator))
+        done = self.translator.translate_pulses(
+            pulses, noise=noise, generator=generator, remains_kev=left, second=second
+        )
+        saturated = np.zeros(len(pulses), bool)
+        return Formed(done.pulses, done.codes, saturated, truth_of(left, second))
+
+
+class AdcTraces:
+    """Raw traces in ADC counts; 0 for rejected pulses.
+
+    Parameters
+    ----------
+    ren
+        Trained run.
+    per_kev, baseline
+        ADC counts per prepared unit and keV, and baseline in ADC counts, see `adc_scale`.
+    adc
+        Number of samples of a trace, and of those before the pulse without noise reaches
+        99.9 % of its maximum; the values of the prepared window if None.
+    remains
+        Distribution of the remains of earlier pulses, which raise the baseline at the start
+        of a trace; None for none.
+    pile_up
+        Rate and energies of second pulses within a trace; None for none.
+
+    Raises
+    ------
+    CpunetError
+        If `n_pre` is not within the trace.
+    """
+
+    samples: npt.DTypeLike = np.uint16
+    units = "ADC"
+
+    def __init__(
+        self,
+        ren: REN,
+        per_kev: float,
+        baseline: float,
+        adc: Adc,
+        remains: DrawnRemains | None = None,
+        pile_up: DrawnPileUp | None = None,
+    ) -> None:
+        self.ren, self.remains, self.pile_up = ren, remains, pile_up
+        self.per_kev, self.baseline = per_kev, baseline
+        self.config = ren.recipe.preparation
+        if pile_up is not None and ren.backend.chain is None:
+            raise CpunetError(
+                "a network knows no shapes beyond its windows, so it gives no raw traces with "
+                "second pulses; leave out `pile_up_khz` or `adc`"
+            )
+        self.length = self.config.length if adc.length is None else adc.length
+        self.n_pre = self.config.samples_before if adc.n_pre is None else adc.n_pre
+        if not 0 <= self.n_pre < self.length:
+            raise CpunetError(
+                f"`n_pre` {self.n_pre} is not within a trace of {self.length} samples; "
+                "give less, or a longer `length`"
+            )
+        self.t0_ns = -self.n_pre * ren.dt_ns
+
+    @property
+    def fills_in(self) -> bool:
+        """Whether traces are padded with baseline and decay without noise."""
+        before = self.n_pre - self.config.samples_before
+        after = self.length - self.n_pre - self.config.samples_after
+        return self.ren.backend.chain is None and max(before, after) > 0
+
+    def __call__(
+        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
+    ) -> Formed:
+        """Translate pulses, keeping their rows; pulses without energy are rejected."""
+        left = drawn_kev(self.remains, len(pulses), generator)
+        second = None
+        if self.pile_up is not None:
+            second = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
+        if self.ren.backend.chain is not None:
+            windows, codes = self._of_chain(pulses, noise, generator, second)
+        else:
+            done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
+            codes = done.codes.copy()
+            windows = extended(
+                done.pulses.waveforms, self.config, self.ren.dt_ns, self.length, self.n_pre
+            )
+        unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
+        codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
+        if left is not None and self.remains is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                heights = left * self.remains.height / pulses.energy_kev
+            decay = self.remains.decay(self.length, lead_us=0.0)
+            windows += heights[:, np.newaxis] * decay
+        windows[codes != Rejection.ACCEPTED] = np.nan
+        scale = np.where(unknown, 0.0, self.per_kev * pulses.energy_kev)
+        traces, saturated = to_adc(windows, scale, self.baseline)
+        # single precision represents 16-bit integers exactly
+        whole = pulses.with_waveforms(traces.astype(np.float32))
+        return Formed(whole, codes, saturated, truth_of(left, second))
+
+    def _of_chain(
+        self,
+        pulses: Pulses,
+        noise: bool,
+        generator: torch.Generator | None,
+        second: SecondPulses | None,
+    ) -> tuple[FloatArray, Codes]:
+        """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
+        prepared = prepare(pulses, self.config, "simulated")
+        traces = np.full((len(pulses), self.length), np.nan, np.float32)
+        codes = prepared.codes.copy()
+        usable = np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0)
+        kept = usable[prepared.index]
+        index = prepared.index[kept]
+        windows = prepared.pulses.waveforms[kept]
+        backend, rng = self.ren.backend, rng_of(generator)
+        for first in range(0, len(windows), BATCH):
+            rows = index[first : first + BATCH]
+            batch = windows[first : first + BATCH]
+            levels, codes[rows] = backend.levels(batch, self.n_pre, self.length)
+            energies = pulses.energy_kev[rows]
+            if noise and backend.noise is not None:
+                levels += backend.noise.draw(energies, self.length, rng)
+            if second is not None and len((other := second.of_rows(rows)).row):
+                # early second pulses need longer traces
+                reached = self.length + other.reach(self.ren.dt_ns)
+                shapes, _ = backend.levels(batch[other.partner], self.n_pre, reached)
+                shapes = np.nan_to_num(shapes)
+                levels += other.added(shapes, energies, self.ren.dt_ns, self.length)
+            traces[rows] = levels
+        return traces, codes
+
+
+def to_adc(
+    windows: FloatArray, scale: npt.ArrayLike, baseline: npt.ArrayLike
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.bool_]]:
+    """Invert ``prepared = (raw - baseline) / scale``, round, and clip to 16 bits.
+
+    Parameters
+    ----------
+    windows
+        Prepared pulses, shape (n, samples); a row with NaN becomes a row of 0.
+    scale, baseline
+        Scale and baseline in ADC counts, per row or common.
+
+    Returns
+    -------
+    traces
+        Raw traces in ADC counts, shape (n, samples).
+    saturated
+        Mask of the clipped rows, shape (n,).
+
+    Examples
+    --------
+    >>> to_adc(np.array([[0, 0.8], [0, 80]], np.float32), 1000.0, 200.0)
+    (array([[  200,  1000],
+           [  200, 65535]], dtype=uint16), array([False,  True]))
+    """
+    factor = np.asarray(scale, float).reshape(-1, 1)
+    counts = np.rint(windows * factor + np.asarray(baseline, float).reshape(-1, 1))
+    missing = ~np.isfinite(counts).all(axis=1)
+    counts[missing] = 0
+    saturated = ((counts < 0) | (counts > HIGHEST)).any(axis=1)
+    return counts.clip(0, HIGHEST).astype(np.uint16), saturated
+
+
+def adc_scale(run: Run, ren: REN, adc: Adc) -> tuple[float, float]:
+    """ADC counts per prepared unit and keV, and baseline: as given, or those of the data.
+
+    Parameters
+    ----------
+    run, ren
+        The run, and its translator.
+    adc
+        Height of a fast pulse above the baseline per keV, and baseline, if they are given.
+
+    Raises
+    ------
+    CpunetError
+        If one of the two is neither given nor known, the gain is not positive, or the baseline
+        is negative.
+    """
+    adc_per_kev, baseline = adc.adc_per_kev, adc.baseline
+    if adc_per_kev is not None and not (np.isfinite(adc_per_kev) and adc_per_kev > 0):
+        raise CpunetError(f"`adc_per_kev` is {adc_per_kev}; expected a number above 0")
+    if baseline is not None and not (np.isfinite(baseline) and baseline >= 0):
+        raise CpunetError(f"`baseline` is {baseline}; expected a number that is not negative")
+    known_gain, known_baseline = None, None
+    cuts, peak = run.data.cuts, run.recipe.peaks.get(run.peak)
+    if cuts is not None and cuts.amplitude >= MIN_ADC:
+        known_gain = None if peak is None else cuts.amplitude / peak.energy_kev
+        known_baseline = {one.name: one.centre for one in cuts.windows}.get("baseline")
+    per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(ren)
+    level = known_baseline if baseline is None else baseline
+    if per_kev is None:
+        raise CpunetError(
+            f"{run.name}: does not say how many ADC counts a keV is; give `adc_per_kev`"
+        )
+    if level is None:
+        raise CpunetError(f"{run.name}: does not say where the baseline is; give `baseline`")
+    return per_kev, level
+
+
+def _height(ren: REN) -> float:
+    """Maximum, in prepared units, of a fast pulse without noise."""
+    config = ren.recipe.preparation
+    time = np.arange(config.length) - config.samples_before
+    ramp = np.clip(time / RISE_SAMPLES + 1, 0, 1).astype(np.float32)
+    height = float(ren.apply(ramp[np.newaxis], noise=False).max())
+    if not (np.isfinite(height) and height > 0):
+        raise CpunetError("the run cannot translate a fast pulse; train again")
+    return height
+
+
+def drawn_kev(
+    remains: DrawnRemains | None, n: int, generator: torch.Generator | None
+) -> npt.NDArray[np.float64] | None:
+    """Remains of `n` pulses in keV, drawn from the random generator of the noise."""
+    return None if remains is None else remains.draw_kev(n, rng_of(generator))
+
+
+def truth_of(left: npt.NDArray[np.float64] | None, second: SecondPulses | None) -> Columns:
+    """Columns on remains and on second pulses, as far as there are any."""
+    truth: Columns = {} if left is None else {"remains_kev": (left, "keV")}
+    return truth if second is None else truth | second.columns()
+
+
+def rng_of(generator: torch.Generator | None) -> np.random.Generator:
+    """A NumPy generator, seeded by a draw from that of torch."""
+    device = "cpu" if generator is None else generator.device
+    seed = torch.randint(2**62, (), generator=generator, device=device)
+    return np.random.default_rng(int(seed))
+
+
+def wanted_tails(
+    translator: Translator, wanted: str | float, *, raw: bool = False
+) -> DrawnRemains | None:
+    """Pile-up tails, remains of earlier pulses, to add to translations.
+
+    Parameters
+    ----------
+    translator
+        Trained run.
+    wanted
+        ``"learned"`` for the remains of the data, ``"none"``, or a rate in kHz.
+    raw
+        Whether the remains are for raw traces, which have not passed any cuts.
+
+    Raises
+    ------
+    CpunetError
+        If `wanted` is invalid, or the run lacks the necessary information.
+    """
+    if wanted == NONE:
+        return None
+    rate = None if wanted == LEARNED else _rate(wanted)
+    known = translator.remains
+    if known is None:
+        raise CpunetError(
+            f"`remains` {wanted}: the run tells nothing of remains of earlier pulses (a "
+            "network, trained before they were told, or without raw traces); train a readout "
+            "chain on raw traces, or leave it out"
+        )
+    if rate is not None:
+        known = known.uncut(rate)
+    elif raw:
+        known = known.uncut()
+    return known if known.law.rate_khz > 0 else None
+
+
+def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | None:
+    """Second pulses to add to translations, with the energies learned by a run.
+
+    Parameters
+    ----------
+    translator
+        Trained run.
+    rate_khz
+        Rate in kHz; 0 for none.
+
+    Raises
+    ------
+    CpunetError
+        If the rate is negative or not finite, or the run has no energies.
+    """
+    if not (np.isfinite(rate_khz) and rate_khz >= 0):
+        raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
+    if rate_khz == 0:
+        return None
+    known = translator.remains
+    if known is None:
+        raise CpunetError(
+            f"`pile_up_khz` {rate_khz:g}: the run does not tell the energies of other pulses "
+            "(a network, trained before they were told, or without raw traces); train a "
+            "readout chain on raw traces, or leave it out"
+        )
+    return DrawnPileUp(rate_khz, known.law.energies_kev, translator.dt_ns)
+
+
+def _rate(wanted: str | float) -> float:
+    try:
+        rate = float(wanted)
+    except ValueError:
+        rate = np.nan
+    if not (np.isfinite(rate) and rate >= 0):
+        raise CpunetError(f"`remains` {wanted}: expected learned, none, or a rate in kHz")
+    return rate
