@@ -213,7 +213,7 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     run = cpunet.train(sim, data, tmp_path / "run", settings=SHORT, device="cpu")
     assert run.data.read == 2 * N * 2 // 3
     assert run.data.read_as == {"table": "5", "dt_ns": 10}
-    report = cpunet.validate(run, sim, raw, rivals=False, device="cpu")  # read as before
+    report = cpunet.validate(run, sim, raw, baselines=False, device="cpu")  # read as before
     assert report.metrics["peaks"]["FEP"]["n_data"] == run.data.used
     back = cpunet.translate(run, data, tmp_path / "back.lh5", inverse=True)
     assert "psd_label_dcr" in cpunet.open_pulses(back.path).columns
@@ -228,7 +228,7 @@ def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
     sides = cpunet.PulseFile(sim, dt_ns=16), cpunet.PulseFile(raw, dt_ns=16)
     run = cpunet.train(*sides, tmp_path / "run", settings=SHORT, device="cpu")
     assert run.sim.read == run.data.read == N
-    report = cpunet.validate(run, *sides, rivals=False, device="cpu")
+    report = cpunet.validate(run, *sides, baselines=False, device="cpu")
     assert report.metrics["peaks"]["FEP"]["n_sim"] == run.sim.used
     made = cpunet.translate(run, sides[0], tmp_path / "translated.lh5")
     np.testing.assert_array_equal(

@@ -133,15 +133,6 @@ def test_noise_goes_as_one_over_energy(ren, sim) -> None:
         assert found == pytest.approx(NOISE_KEV / kev, rel=0.05)
 
 
-def test_one_energy_may_stand_for_all(ren, sim) -> None:
-    np.testing.assert_array_equal(
-        ren.translate(sim, energy_kev=KEV, seed=1),
-        ren.translate(sim, energy_kev=np.full(N, KEV), seed=1),
-    )
-    single = ren.translate(sim[3], energy_kev=KEV, seed=1)
-    np.testing.assert_array_equal(single, ren.translate(sim[3:4], energy_kev=KEV, seed=1)[0])
-
-
 @pytest.mark.parametrize("energies", [np.ones(N - 1), np.ones((N, 2))])
 def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) -> None:
     with pytest.raises(
@@ -149,11 +140,6 @@ def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) ->
     ) as error:
         ren.translate(sim, energy_kev=energies)
     assert "\n" not in str(error.value)
-
-
-def test_remains_of_other_pulses_are_refused(ren, sim) -> None:
-    with pytest.raises(CpunetError, match=rf"^remains_kev has shape \(2,\) beside {N} pulses"):
-        ren.translate(sim, energy_kev=KEV, remains_kev=[1.0, 2.0])
 
 
 def test_the_inverse_adds_no_remains(iren) -> None:
@@ -200,14 +186,6 @@ def test_pulses_without_energy_are_counted(ren, sim) -> None:
     assert without.codes.tolist() == np.where(np.arange(N) == 2, Rejection.NAN, 0).tolist()
 
 
-def test_a_pulse_without_energy_is_nan_and_counted(ren, sim) -> None:
-    energies = np.full(N, KEV)
-    energies[5] = np.nan
-    with pytest.warns(RejectionWarning, match="rows of NaN: 1 energy unknown"):
-        done = ren.translate(sim, energy_kev=energies)
-    assert np.flatnonzero(np.isnan(done).any(axis=1)).tolist() == [5]
-
-
 def test_low_energies_have_large_noise(ren, sim) -> None:
     """The lithium layer leaves a few keV of some events: most are translated all the same."""
     low = np.where(np.arange(N) % 2, KEV, KEV / 10)
@@ -241,15 +219,6 @@ def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:
     # prepared as simulated pulses are
     assert np.abs(back.min(axis=1)).max() < 1e-6
     np.testing.assert_allclose(back.max(axis=1), 1, atol=1e-6)
-
-
-def test_the_inverse_draws_nothing_and_needs_no_energies(ren, iren, sim) -> None:
-    assert ren.needs_energies
-    assert not iren.needs_energies
-    data = ren.translate(sim, energy_kev=KEV, seed=1)
-    first, again = iren.translate(data, seed=1), iren.translate(data, seed=2)
-    np.testing.assert_array_equal(first, again)
-    np.testing.assert_array_equal(iren.translate(data, noise=False), first)
 
 
 def test_gain_and_offset_are_no_part_of_a_measured_pulse(iren) -> None:

@@ -16,12 +16,12 @@ from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Rejection, prepare
+from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.outside import Outside
 from cpunet.translation.backends import Drawn
-from cpunet.translation.translator import IREN, REN
+from cpunet.translation.translator import REN
 from synthetic import write_run
 
 RECIPE = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
@@ -69,16 +69,6 @@ def test_noise_goes_as_one_over_the_energy(run, sim):
         np.testing.assert_allclose(again.pulses.waveforms, found, atol=2e-6)
 
 
-def test_noise_is_of_the_seed_and_may_be_left_out(run, sim):
-    ren = REN.load(run)
-    one, same, other = (ren.translate(sim, energy_kev=2000.0, seed=s) for s in (1, 1, 2))
-    assert np.array_equal(one, same)
-    assert not np.array_equal(one, other)
-    clean = ren.translate(sim, noise=False)
-    assert not clean[:, :200].any()
-    assert np.array_equal(clean, ren.translate(sim, noise=False))
-
-
 def test_other_pulses_are_added_with_the_noise(run, sim):
     ren = REN.load(run)
     assert ren.remains is not None
@@ -101,18 +91,3 @@ def test_other_pulses_are_added_with_the_noise(run, sim):
     assert np.array_equal(result[5], plain[5])
     with pytest.raises(CpunetError, match="drawn with electronic noise"):
         ren.apply(sim, noise=False, remains_kev=left, **energies)
-
-
-def test_pulses_without_an_energy_get_no_noise_and_a_code(run, sim):
-    ren = REN.load(run)
-    with pytest.raises(CpunetError, match="scaled by 1/energy; give energy_kev"):
-        ren.translate(sim)
-    energies = np.full(len(sim), 2000.0)
-    energies[3] = np.nan
-    done = ren.translate_pulses(Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
-    assert done.codes[3] == Rejection.ENERGY_UNKNOWN
-    assert done.valid.sum() == len(sim) - 1
-
-
-def test_the_way_back_has_no_noise(run):
-    assert not IREN.load(run).needs_energies

@@ -21,7 +21,6 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
-from cpunet.electronics.extension import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
@@ -36,7 +35,7 @@ from cpunet.recipes import load_recipe
 from cpunet.translation import file_translation
 from cpunet.translation.forms import to_adc
 from cpunet.translation.many_files import _in_processes, expanded
-from cpunet.translation.noise_blocks import noise_seed, regrouped
+from cpunet.translation.noise_blocks import noise_seed
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
@@ -253,21 +252,6 @@ def test_the_options_of_a_translation_are_told(busy, tmp_path):
 # --- noise and bytes
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
-@given(
-    sizes=st.lists(st.integers(0, 30), min_size=1, max_size=8),
-    size=st.integers(1, 20),
-)
-def test_blocks_are_regrouped(sizes, size):
-    pulses = Pulses.of(np.arange(sum(sizes))[:, None], dt_ns=DT_NS)
-    ends = np.cumsum(sizes)
-    blocks = [pulses[end - n : end] for end, n in zip(ends, sizes, strict=True)]
-    found = list(regrouped(blocks, size))
-    assert all(len(block) == size for block in found[:-1])
-    numbers = [i for block in found for i in block.event_number.tolist()]
-    assert numbers == list(range(sum(sizes)))
-
-
 @pytest.fixture(scope="module")
 def in_blocks(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("blocks")
@@ -325,16 +309,6 @@ def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
             translate(run, nothing)
     with pytest.raises(CpunetError, match="several files or tables do not stay in memory"):
         translate(run, [path, path])
-
-
-def test_options_may_be_numbers_of_numpy(run, tmp_path):
-    source, out = PulseFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
-    options = {"seed": np.int64(3), "realisations": np.int32(2)}
-    told = translate(run, source, out, **options).counts
-    options = {"seed": 3, "realisations": 2}
-    assert translate(run, source, out, **options, resume=True).counts == told | {
-        "skipped": True
-    }
 
 
 def changed_record(path, change):
@@ -397,13 +371,6 @@ def test_each_output_is_compared_with_few_paths(run, many, tmp_path, monkeypatch
     with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
         translate(run, many, tmp_path, force=True)
     assert max(seen) <= 4
-
-
-def test_files_in_a_folder(sequential):
-    out, told = sequential
-    counts = {"read": 3 * N, "translated": 3 * N, "rejections": {}}
-    assert told == {"files": 3, "skipped": 0} | counts
-    assert names(out) == ["sim_0.lh5", "sim_1.lh5", "sim_2.lh5"]
 
 
 def require_same_bytes(path, expected):
@@ -508,21 +475,6 @@ def test_the_preparation_is_undone_to_half_a_count():
     np.testing.assert_allclose(again.scale, prepared.scale, atol=1)
     lost = np.abs(again.pulses.waveforms - prepared.pulses.waveforms).max(axis=1)
     assert (lost * prepared.scale < 1.0).all()
-
-
-def test_windows_are_extended_by_their_decay():
-    config = load_recipe("fast").preparation
-    raw = Pulses.of(measured(), dt_ns=DT_NS)
-    prepared = prepare(raw, config, "measured")
-    longer = extended(prepared.pulses.waveforms, config, DT_NS, 1100, 450)
-    np.testing.assert_array_equal(longer[:, 50:850], prepared.pulses.waveforms)
-    assert (longer[:, :50] == 0).all()
-    rows = prepared.align_sample[:, None] - 450 + np.arange(850, 1100)
-    expected = np.take_along_axis(raw.waveforms, rows, axis=1)
-    counts = longer[:, 850:] * prepared.scale[:, None] + prepared.baseline[:, None] - expected
-    assert np.abs(counts.mean(axis=1)).max() < 20
-    short = extended(prepared.pulses.waveforms, config, DT_NS, 300, 100)
-    np.testing.assert_array_equal(short, prepared.pulses.waveforms[:, 300:600])
 
 
 @pytest.mark.parametrize("adc", [Adc(), ADC])
@@ -762,17 +714,6 @@ def test_a_full_disk_leaves_one_line_and_nothing_else(run, tmp_path):
         with nearly_full_disk(size), pytest.raises(CpunetError, match=listing):
             translate(run, source, out)
         assert names(out.parent) == []
-
-
-def test_no_space_left_is_told(run, tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError("Can't write (file write failed: errno = 28, error message = 'No ...')")
-
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    monkeypatch.setattr("cpunet.pulses.writing.lh5.write", full)
-    with pytest.raises(CpunetError, match=r"out.lh5: cannot be written \(No space left on dev"):
-        translate(run, source, tmp_path / "out.lh5")
-    assert names(tmp_path) == ["sim.lh5"]
 
 
 def test_targets_that_cannot_be_written(run, tmp_path):

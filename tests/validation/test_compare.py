@@ -76,13 +76,6 @@ def test_missing_reports_are_listed_if_allowed(tmp_path):
         page_of(tmp_path / "c", {"V01/p04": ()}, missing_ok=True)
 
 
-def test_many_reports_have_no_columns(tmp_path):
-    few = page_of(tmp_path / "few", {f"V{i}/p03": (80.0,) for i in range(8)})
-    assert "<h2>Side by side</h2>" in few
-    many = page_of(tmp_path / "many", {f"V{i}/p03": (80.0,) for i in range(9)})
-    assert "<h2>Side by side</h2>" not in many
-
-
 def report(folder: Path, iou: float, **more: int) -> Path:
     folder.mkdir(parents=True)
     content = metrics(iou)
@@ -100,14 +93,6 @@ def header(compared: object) -> list[str]:
     return str(compared).splitlines()[1].split()
 
 
-def test_two_reports_are_printed(two):
-    told = str(compare(*two))
-    assert header(told) == ["peak", "score", "first", "second"]
-    assert "80.0 ± 2.5 (88.0)" in told
-    assert "85.0 ± 2.5 (88.0)*" in told
-    assert "note" not in told
-
-
 def test_a_report_in_memory_is_compared(two):
     run = {"compared": {"run": "kept"}} | metrics(70.0)
     assert header(compare(Report(run, {}), two[0])) == ["peak", "score", "kept", "first"]
@@ -123,12 +108,6 @@ def test_names_are_made_unique(tmp_path):
     folders = [report(tmp_path / run / "report", 80.0) for run in ("a", "b")]
     assert compare(*folders).table.names == ("a", "b")
     assert compare(folders[0], folders[0]).table.names == ("report (1)", "report (2)")
-
-
-def test_different_data_are_noted(two, tmp_path):
-    other = report(tmp_path / "third", 85.0, n_data=7)
-    told = str(compare(two[0], other))
-    assert "note: first and third were scored on different pulses" in told
 
 
 def test_the_command(two, tmp_path, capsys):
@@ -168,9 +147,3 @@ def test_bad_metrics_are_told(two, tmp_path, defect):
 def test_a_folder_is_no_page(two, tmp_path):
     with pytest.raises(CpunetError, match="is a folder; give the name of a page"):
         compare(*two, out=tmp_path, force=True)
-
-
-def test_an_unknown_method_is_told(two):
-    words = "first, second: no score of the method magic; there are ren"
-    with pytest.raises(CpunetError, match=words):
-        compare(*two, method="magic")

@@ -99,14 +99,6 @@ def test_noise_of_another_colour_is_seen():
     assert found["spectrum_sigma"] > 10
 
 
-def test_missing_noise_is_seen():
-    rng = np.random.default_rng(4)
-    windows = {"data": noise(rng, 1e-3), "raw": np.zeros((100, 800), np.float32)}
-    found = spectra(windows)["raw"]
-    assert found["rms_ratio"] == 0
-    assert found["sigma"] < -20
-
-
 def test_equal_noise_and_none_at_all_are_numbers_and_drawn():
     some, none = noise(np.random.default_rng(10), 1e-3, 50), np.zeros((50, 800), np.float32)
     equal = spectra({"data": some, "ren": some})

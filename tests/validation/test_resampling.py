@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hist
 import numpy as np
 import pytest
 import scipy.stats
@@ -53,10 +52,6 @@ def test_events_beyond_the_last_bin_are_drawn_and_not_counted(either_way):
     assert found.sum(axis=0).std() == pytest.approx(10, rel=0.15)
 
 
-def test_a_set_without_events_has_no_counts(either_way):
-    assert not Resampled.of(0, 5, 3, np.random.default_rng(0)).counts(np.zeros(0, int), 2).any()
-
-
 def test_all_parameters_see_the_same_events():
     draws = Resampled.of(6, 6, 50, np.random.default_rng(2))
     bins = np.array([0, 1, 2, 2, 1, 0])
@@ -105,13 +100,6 @@ def test_draws_without_a_finite_value_are_left_out():
     few = both_resampled(100, 2, 1, 1)
     few[0].weights[0] = 0
     assert np.isnan(distance_errors(rare, some, few)).all()
-
-
-def test_what_lies_outside_an_axis_is_counted_at_its_rims():
-    values = np.array([-np.inf, -1, 0, 0.5, 1, np.inf, np.nan])
-    axis = hist.axis.Regular(2, 0, 1)
-    assert ceiling(values, axis, resampled_twice(7, 70_000, 70_000, 2, 0))[0] > 98
-    assert iou_error(values, values[:1], axis, both_resampled(7, 1, 400, 0)) > 0
 
 
 @pytest.mark.parametrize(("n", "quantile"), [(20, 0.1), (37, 0.1), (300, 0.5), (25, 0.01)])

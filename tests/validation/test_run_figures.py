@@ -8,7 +8,6 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.special import ndtr
 
-from cpunet.errors import CpunetError
 from cpunet.plotting import SPARE_COLOURS, colours, label
 from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
@@ -67,17 +66,6 @@ def test_all_eight_losses_are_drawn_with_their_moving_average():
     assert average[0].tolist() == pytest.approx([90, np.mean(1 / np.arange(1, 11))])
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_a_training_shorter_than_the_window_is_drawn(n):
-    require_drawn(run_figures.loss_curves(log(n)))
-
-
-def test_a_loss_that_was_not_recorded_is_left_out():
-    figure = run_figures.loss_curves(log(20, ["cycle_forward"]))
-    require_drawn(figure)
-    assert [len(axes.lines) for axes in figure.axes] == [2, 0, 0]
-
-
 def test_a_loss_of_every_third_iteration_is_drawn():
     records = log(60)
     for record in records:
@@ -86,11 +74,6 @@ def test_a_loss_of_every_third_iteration_is_drawn():
     raw, average = run_figures.loss_curves(records).axes[2].lines[:2]
     np.testing.assert_array_equal(raw.get_xdata(), np.arange(0, 600, 30))
     assert np.isfinite(average.get_ydata()).sum() == 11
-
-
-def test_an_empty_log_is_refused():
-    with pytest.raises(CpunetError, match="log is empty"):
-        run_figures.loss_curves([])
 
 
 def test_cycle_figure_draws_all_pulses_in_each_panel():
@@ -127,10 +110,6 @@ def test_a_bar_too_high_for_the_figure_is_labelled():
     assert figure.axes[0].get_ylim()[1] < 0.5
 
 
-def test_histograms_of_one_event_and_of_none_are_drawn():
-    require_drawn(histogram_figure({"data": np.array([1.0]), "ren": np.array([])}))
-
-
 def mean_pulse(windows: np.ndarray) -> MeanPulse:
     return MeanPulse.of(align_half_maximum(windows, 100, 150))
 
@@ -144,21 +123,6 @@ def test_mean_pulse_differences_are_in_percent_of_the_charge():
     difference = figure.axes[1].lines[0].get_ydata()
     assert difference[-1] == pytest.approx(1.0, rel=1e-3)
     assert difference[100] == pytest.approx(0.5, rel=1e-2)
-
-
-def test_pulses_without_a_crossing_are_not_in_the_mean():
-    windows = pulses(5)
-    windows[1], windows[2] = 0, np.nan
-    found, expected = mean_pulse(windows), mean_pulse(windows[[0, 3, 4]])
-    assert found.n == expected.n == 3
-    np.testing.assert_array_equal(found.mean, expected.mean)
-
-
-def test_mean_pulses_of_records_shorter_than_the_window_are_drawn():
-    means = [mean_pulse(windows) for windows in (pulses(5), pulses(5, 700.0))]
-    require_drawn(
-        run_figures.mean_pulses(dict(zip(("data", "raw"), means, strict=True)), 16.0, "DEP")
-    )
 
 
 def test_global_settings_neither_change_nor_matter():

@@ -59,20 +59,6 @@ def test_rows_and_what_they_show():
     assert table.notes == ()
 
 
-def test_another_method():
-    table = side_by_side({"a": metrics(), "b": metrics()}, method="rc")
-    assert [row.cells[0].text for row in table.rows] == [
-        "3.0 ± 1.0 (88.0)",
-        "3.0 ± 1.0 (88.0)",
-        "0.990 ± 0.020",
-        "7.00",
-    ]
-
-
-def test_one_run_has_no_best():
-    assert {row.best for row in side_by_side({"a": metrics()}).rows} == {frozenset()}
-
-
 def test_what_a_run_lacks_is_a_dash():
     old = metrics()
     sep = old["peaks"]["SEP"]

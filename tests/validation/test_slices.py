@@ -70,14 +70,6 @@ def test_superpulses_are_those_of_a_plain_loop():
     assert sum(p.n for p in found.pulses) + sum(found.left_out.values()) == 90
 
 
-def test_the_mean_of_many_equal_pulses_is_each_of_them():
-    pulse = np.linspace(0, 0.97, 20, dtype=np.float32)
-    many = np.tile(pulse, (20_000, 1))
-    (found,) = sliced(many, np.ones(20_000), np.array([0.0, 2.0])).pulses
-    np.testing.assert_allclose(found.mean, pulse, atol=1e-7)
-    np.testing.assert_allclose(found.error, 0, atol=1e-9)
-
-
 def test_without_a_difference_z_is_that_of_chance():
     rng = np.random.default_rng(2)
     edges = np.linspace(20, 120, 4) * DT

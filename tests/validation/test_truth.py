@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.validation import truth as truths
 from cpunet.validation.truth import Responses
 from synthetic import paired_scores
 
@@ -64,20 +63,6 @@ def test_pairs_that_cannot_be_aligned_are_counted():
     nothing = paired_scores(broken[[1]], truth[[1]], 100)
     assert np.isnan(nothing["rmse"])
     assert nothing["unaligned"] == 1
-
-
-def test_scores_do_not_depend_on_blocks(monkeypatch):
-    rng = np.random.default_rng(0)
-    truth = edge(TIME - rng.uniform(330, 370, (20, 1)), 4.0).astype(np.float32)
-    noisy = truth + rng.normal(0, 1e-3, truth.shape).astype(np.float32)
-    whole = paired_scores(noisy, truth, 100)
-    monkeypatch.setattr(truths, "BLOCK", 3)
-    assert paired_scores(noisy, truth, 100) == pytest.approx(whole)
-
-
-def test_no_pairs_have_no_score():
-    empty = np.zeros((0, 800), np.float32)
-    assert np.isnan(paired_scores(empty, empty, 100)["rmse"])
 
 
 def prepared(index, n_read):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import sys
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import REN
 from cpunet.validation.tune import (
-    JOURNAL,
     UNCHANGED,
     HeldOut,
     search_space,
@@ -135,13 +133,6 @@ def test_the_recipes_own_spaces_can_be_searched(name):
             assert value_of(changed, key) == value
 
 
-def test_without_optuna_there_is_a_line(files, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[tune\]'"):
-        tune(*files, tmp_path / "tune", recipe=tiny())
-    assert not [*tmp_path.iterdir()]
-
-
 class Scored:
     """Trainings that cost nothing: the score is near the setting that is best."""
 
@@ -232,12 +223,6 @@ def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
         else ["RUNNING", "COMPLETE", "COMPLETE"]
     )
     assert len(scored.tried) == len(study.trials) - 1
-
-
-def test_a_folder_of_something_else_is_left_alone(files, scored, tmp_path):
-    with pytest.raises(CpunetError, match="exists already and holds no search"):
-        tune(*files, tmp_path, recipe=load_recipe("fast", [FIT]))
-    assert not (tmp_path / JOURNAL).exists()
 
 
 @pytest.mark.thorough

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -72,13 +69,6 @@ def test_a_shift_has_the_analytic_auc(shift):
     assert significance(result) > 5
 
 
-def test_another_spread_of_the_same_mean_is_seen():
-    rng = np.random.default_rng(2)
-    result = classifier_auc(windows(rng, 800), windows(rng, 800, spread=2.0), seed=0)
-    # the best score is |height|: P(2 |z1| > |z2|) = 2 atan(2) / pi
-    assert result.auc == pytest.approx(2 * np.arctan(2) / np.pi, abs=0.04)
-
-
 def test_two_peaks_with_the_mean_and_the_spread_of_one_are_seen():
     rng = np.random.default_rng(3)
     other = windows(rng, 800, spread=0.3) + np.float32(
@@ -128,23 +118,6 @@ def test_rows_that_are_not_finite_are_left_out_and_counted():
     assert 0.3 < result.auc < 0.7
 
 
-def test_missing_rows_do_not_change_what_is_found():
-    rng = np.random.default_rng(8)
-    data, others = windows(rng, 300), windows(rng, 300, mean=1.0)
-    hole = np.full((50, len(TIME)), np.nan, np.float32)
-    clean = classifier_auc(data, others, seed=0)
-    spoiled = classifier_auc(np.concatenate([hole, data]), others, seed=0)
-    assert spoiled.auc == pytest.approx(clean.auc, abs=0.03)
-
-
-def test_spoiled_pulses_do_not_hide_a_difference():
-    rng = np.random.default_rng(9)
-    data, others = windows(rng, 400), windows(rng, 400, mean=1.0)
-    for side in (data, others):
-        side[:6] = 1e4 * rng.normal(size=(6, len(TIME)))
-    assert classifier_auc(data, others, seed=0).auc == pytest.approx(0.76, abs=0.05)
-
-
 def test_unequal_sides_and_the_cap():
     rng = np.random.default_rng(10)
     data, others = windows(rng, 500), windows(rng, 100, mean=1.0)
@@ -154,25 +127,10 @@ def test_unequal_sides_and_the_cap():
     assert capped.auc_std > classifier_auc(data, others, seed=0).auc_std
 
 
-def test_identical_pulses_have_no_features():
-    same = np.ones((50, 10), np.float32)
-    result = classifier_auc(same, same, seed=0)
-    assert (result.auc, result.null_mean) == (0.5, 0.5)
-
-
 def test_rounding_is_no_difference():
     rng = np.random.default_rng(11)
     data, others = (windows(rng, 200, noise=0.0) for _ in range(2))
     assert abs(significance(classifier_auc(data, others, seed=0))) < 3
-
-
-def test_result_is_json_and_repeats_with_its_seed():
-    rng = np.random.default_rng(12)
-    sides = edges(rng, 80), edges(rng, 80)
-    first, second = (classifier_auc(*sides, seed=5) for _ in range(2))
-    assert first == second
-    assert json.loads(json.dumps(asdict(first), allow_nan=False)) == asdict(first)
-    assert classifier_auc(*sides, seed=6) != first
 
 
 def test_too_few_pulses_are_named():

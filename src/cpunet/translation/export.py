@@ -161,14 +161,14 @@ def _fitted(run: Run, translator: Translator) -> list[str]:
     generator = translator.recipe.generator
     if generator.name != "response":
         return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
-    told = describe_chain(run)
-    errors = told["parameter_errors"]
+    chain = describe_chain(run)
+    errors = chain["parameter_errors"]
     numbers = [
         f"`{name}` {value:.4g}" + (f" ± {errors[name]:.2g}" if name in errors else "")
-        for name, value in told["parameters"].items()
+        for name, value in chain["parameters"].items()
     ]
     lines = [f"* readout chain as fitted: {', '.join(numbers)}"]
-    if rms := told["values"].get("noise_rms_kev"):
+    if rms := chain["values"].get("noise_rms_kev"):
         lines.append(f"* noise of the data: {rms:.3g} keV RMS")
     return lines
 
@@ -246,10 +246,10 @@ def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
     ]
     for peak, scores in peaks.items():
         for name, compared in scores["parameters"].items():
-            told = ", ".join(
+            overlaps = ", ".join(
                 f"{method} {iou:.1f}"
                 for method, iou in compared["iou"].items()
                 if iou is not None
             )
-            rows.append(f"| {peak} | {name.replace('_', ' ')} | {told} |")
+            rows.append(f"| {peak} | {name.replace('_', ' ')} | {overlaps} |")
     return [*rows, ""]

@@ -79,8 +79,8 @@ class FileTranslation:
         self.kind: type[Translator] = IREN if options.inverse else REN
         self.translator = self.kind.of(self.run, resolve_device(device))
         self.form = self._form()
-        told = f"{self.run.weights_sha256}{self.run.recipe!r}"
-        self._print = hashlib.sha256(told.encode()).hexdigest()
+        identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
+        self._print = hashlib.sha256(identity.encode()).hexdigest()
         if isinstance(self.form, AdcTraces) and self.form.fills_in:
             log.warning(
                 f"a network knows windows of {self.form.config.length} samples alone; beyond "
@@ -130,9 +130,9 @@ class FileTranslation:
         refuse_inputs(out, self.run.folder, *source.files)
         before = source_print(source)
         options = asdict(self.options) | {"noise_key": noise_key}
-        made = {"source": before, "run": self._print, "options": options}
+        provenance = {"source": before, "run": self._print, "options": options}
         if resume and not force and out.exists():
-            return finished(out, made) | {"skipped": True}
+            return finished(out, provenance) | {"skipped": True}
         refuse_existing(out, force=force)
         pulses = self.opened(source)
         others = _other_columns(pulses)
@@ -144,7 +144,7 @@ class FileTranslation:
                     f"{source.path}: changed while it was read; translate it once it is "
                     "complete"
                 )
-            record = made | {"counts": summary, "cpunet": cpunet.__version__}
+            record = provenance | {"counts": summary, "cpunet": cpunet.__version__}
             # options given from Python may be numbers of NumPy
             writer.stamp(TRANSLATION, json.dumps(record, default=np.generic.item))
         return summary
@@ -263,10 +263,10 @@ def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
 
 def _other_columns(pulses: PulseSource) -> RowColumns:
     """Find the columns to be copied to the output, and report those left out."""
-    told = pulses.describe()
-    if told["format"] in ("LH5", "HDF5"):
+    described = pulses.describe()
+    if described["format"] in ("LH5", "HDF5"):
         n_pulses = pulses.n_pulses or 0
-        others = RowColumns.of_hdf5(pulses.path, told["table"], n_pulses, OWN_COLUMNS)
+        others = RowColumns.of_hdf5(pulses.path, described["table"], n_pulses, OWN_COLUMNS)
     else:
         others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
     for column, reason in others.left_out.items():

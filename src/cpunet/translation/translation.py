@@ -138,8 +138,10 @@ class Translation:
 
     def to_dataframe(self) -> DataFrame:
         """Event, energy, reason of rejection and parameters of each pulse, as a data frame."""
-        told = {"rejection": [Rejection(int(code)).label for code in self.codes]}
-        columns = told if self.adc else told | self.parameters
+        columns: dict[str, Any] = {
+            "rejection": [Rejection(int(code)).label for code in self.codes]
+        }
+        columns |= {} if self.adc else self.parameters
         return self.pulses.to_dataframe().assign(**columns)
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
@@ -165,18 +167,18 @@ class Translation:
         return int(self.counts["read"])
 
     def __str__(self) -> str:
-        told = self.counts
-        text = f"{told['translated']} of {told['read']} pulses translated"
-        if "files" in told:
-            text = f"{told['files']} files, {text}"
-        if told.get("skipped"):
-            which = f"{told['skipped']} files were" if "files" in told else "it was"
+        counts = self.counts
+        text = f"{counts['translated']} of {counts['read']} pulses translated"
+        if "files" in counts:
+            text = f"{counts['files']} files, {text}"
+        if counts.get("skipped"):
+            which = f"{counts['skipped']} files were" if "files" in counts else "it was"
             text += f" ({which} there already)"
         rejected = ", ".join(f"{n} {reason}" for reason, n in self.rejections.items())
         if rejected:
             text += f"; rows of {'0' if self.adc else 'NaN'} for {rejected}"
-        if told.get("saturated"):
-            text += f"; {told['saturated']} saturated"
+        if counts.get("saturated"):
+            text += f"; {counts['saturated']} saturated"
         return f"{self.path or 'in memory'}: {text}"
 
     def __repr__(self) -> str:
@@ -185,14 +187,14 @@ class Translation:
         return f"<Translation {where}: {done}>"
 
     def _repr_html_(self) -> str:
-        told: dict[str, object] = {
+        facts: dict[str, object] = {
             "run": self.run,
             "file": self.path,
             "translated": f"{self.counts['translated']} of {self.counts['read']} pulses",
             "as": "raw traces in ADC" if self.adc else "normalised windows",
             "saturated": self.counts.get("saturated"),
         }
-        told |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
+        facts |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
         small = self.kept is not None  # a file may be large
         drawn = notebook_picture(self.plot()) if small and self.counts["translated"] else ""
-        return part("object", "cpunet translation", told, picture=drawn)
+        return part("object", "cpunet translation", facts, picture=drawn)

@@ -129,9 +129,9 @@ def compare(
         return compared(reports, method=method, missing_ok=missing_ok)
     files = [r.folder if isinstance(r, Report) else Path(r) for r in reports]
     _refuse(Path(out), files, force=force)
-    made = compared(reports, method=method, missing_ok=missing_ok)
-    made.save(out, force=force)
-    return replace(made, path=Path(out))
+    comparison = compared(reports, method=method, missing_ok=missing_ok)
+    comparison.save(out, force=force)
+    return replace(comparison, path=Path(out))
 
 
 def compared(

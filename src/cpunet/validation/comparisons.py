@@ -14,7 +14,6 @@ import hist
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.errors import CpunetError
 from cpunet.pulses.binning import data_axis
 from cpunet.recipes.schema import ScoreConfig
 from cpunet.validation.distances import (
@@ -197,17 +196,7 @@ def compare(
             number of NaN values, by method and for the ``data``.
         ``axis``
             ``low``, ``high`` and ``bins`` of the binning.
-
-    Raises
-    ------
-    CpunetError
-        If a method lacks a parameter of the data.
     """
-    for method, values in methods.items():
-        if absent := data.keys() - values.keys():
-            raise CpunetError(f"{method}: parameter {min(absent)} is missing; compute it too")
-    if not data:
-        return {}
     # all parameters and methods share the same draws of data events
     rng, n_data = np.random.default_rng(seed), len(next(iter(data.values())))
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}

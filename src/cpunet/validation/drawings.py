@@ -57,13 +57,13 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     ren, iren, metrics = found.ren, found.iren, found.metrics
     peaks = {name: peak.energy_kev for name, peak in ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
-    made: dict[str, Drawing] = {SPECTRUM: partial(spectrum_figure, energies, peaks)}
+    drawn: dict[str, Drawing] = {SPECTRUM: partial(spectrum_figure, energies, peaks)}
     tails = metrics["remains"] or {}
     if tails.get("rate_khz") and "sizes" in tails:  # if any are known and were kept
         energies_kev = tails["drawn"]["energies_kev"]
-        made[TAILS] = partial(tails_figure, tails, tails["sizes"], energies_kev)
+        drawn[TAILS] = partial(tails_figure, tails, tails["sizes"], energies_kev)
     if methods := metrics["ae_energy"].get("methods"):
-        made[AE_ENERGY] = partial(ae_energy_figure, methods)
+        drawn[AE_ENERGY] = partial(ae_energy_figure, methods)
     scored = [peak for peak in found.sets if found.values[peak.name]]
     fullest = max(scored, key=lambda s: min(len(s.sim_rows), len(s.data_rows)))
     for name, side, there, back, titles in (
@@ -73,15 +73,15 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
         start = side.waveforms[:SHOWN]
         middle = there.apply(start, noise=False)
         end = back.apply(middle, noise=False)
-        made[f"{fullest.name} {name}"] = partial(
+        drawn[f"{fullest.name} {name}"] = partial(
             cycle_figure, start, middle, end, titles, ren.dt_ns
         )
     drift = getattr(getattr(ren.backend.network, "response", None), "drift", None)
     if isinstance(drift, DriftUNet):
         effect = drift.effect(torch.from_numpy(fullest.raw.waveforms[:IN_DRIFT]))
-        made[DRIFT] = partial(drift_figure, *(values.numpy() for values in effect))
+        drawn[DRIFT] = partial(drift_figure, *(values.numpy() for values in effect))
     for peak in scored:
-        made |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
+        drawn |= {f"{peak.name} {what}": one for what, one in _of_peak(peak, found).items()}
     if DEP in {peak.name for peak in scored} and len(scored) > 1:
         ae = {
             peak.name: {
@@ -90,10 +90,10 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
             }
             for peak in scored
         }
-        made[ROC] = partial(roc_figure, ae, DEP)
+        drawn[ROC] = partial(roc_figure, ae, DEP)
     if found.run.records:
-        made[LOSSES] = partial(loss_curves, found.run.records)
-    return made
+        drawn[LOSSES] = partial(loss_curves, found.run.records)
+    return drawn
 
 
 def _shown(by_method: Mapping[str, T], methods: Collection[str] = DRAWN) -> dict[str, T]:
@@ -104,7 +104,7 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
     name, details, dt_ns = peak.name, found.details[peak.name], peak.dt_ns
     scores, values = found.metrics["peaks"][name], _shown(found.values[name])
     before, bins = found.run.recipe.preparation.samples_before, found.run.recipe.scores.max_bins
-    made: dict[str, Drawing] = {}
+    drawn: dict[str, Drawing] = {}
     further: dict[str, dict[str, Values]] = {}
     for parameter, data in values["data"].items():
         by_method = {m: v[parameter] for m, v in values.items() if parameter in v}
@@ -113,29 +113,29 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         if parameter in PARAMETERS:
             axis, compared = data_axis(data, bins), scores["parameters"][parameter]
             how = (by_method, axis, parameter, name, compared)
-            made[parameter] = partial(parameter_histograms, *how)
+            drawn[parameter] = partial(parameter_histograms, *how)
         else:
             further[parameter] = by_method
-    made["further parameters"] = partial(further_histograms, further, bins, name)
-    made["mean pulse"] = partial(mean_pulses, _shown(details.means), dt_ns, name)
+    drawn["further parameters"] = partial(further_histograms, further, bins, name)
+    drawn["mean pulse"] = partial(mean_pulses, _shown(details.means), dt_ns, name)
     row = _drawable(peak)
     if row is not None:
         sets = _shown(peak.without_noise(np.array([row])), SINGLE)
         pulses = {method: windows[0] for method, windows in sets.items()}
         beside = DataPulse.beside(pulses, peak.data.waveforms, dt_ns, before)
         title = f"{name}, simulated pulse {row}"
-        made["single pulse"] = partial(
+        drawn["single pulse"] = partial(
             single_pulse_figure, pulses, beside, dt_ns, before, title
         )
     slices = _shown(details.slices, ("data", "superpulse", "ren"))
-    made["superpulses"] = partial(slice_figure, slices, dt_ns, name)
+    drawn["superpulses"] = partial(slice_figure, slices, dt_ns, name)
     table = dict(details.ae_against_time)
     table["methods"] = _shown(table["methods"])
-    made["A over E"] = partial(ae_figure, table, name)
+    drawn["A over E"] = partial(ae_figure, table, name)
     if "missing" not in scores["noise"]["data"]:
         noise = _shown(scores["noise"], ("frequency_mhz", "data", "ren"))
-        made["noise"] = partial(spectrum_of_noise, noise, name)
-    return made
+        drawn["noise"] = partial(spectrum_of_noise, noise, name)
+    return drawn
 
 
 def _drawable(peak: PeakSets) -> int | None:

@@ -78,7 +78,7 @@ class PeakDetails:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Results of a validation, from which figures and report are made.
+    """Results of a validation, from which figures and report are translations.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def evaluate(
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
     sim_set, data_set = _load_both(ren, sim, data, names, max_pulses)
     responses = None if truth is None else Responses(truth, sim_set)
-    others = fit_baseline_methods(
+    baseline_methods = fit_baseline_methods(
         sim_set,
         data_set,
         data,
@@ -139,9 +139,11 @@ def evaluate(
         remains=ren.remains,
         fitted=baselines,
     )
-    made = translate_all(ren, others, sim_set, responses, seed)
-    amplitudes = current_amplitudes(sim_set, data_set, made)
-    sets = [peak_sets(name, recipe, sim_set, data_set, made, amplitudes) for name in names]
+    translations = translate_all(ren, baseline_methods, sim_set, responses, seed)
+    amplitudes = current_amplitudes(sim_set, data_set, translations)
+    sets = [
+        peak_sets(name, recipe, sim_set, data_set, translations, amplitudes) for name in names
+    ]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, Any] = {}
     with stage("Scoring", len(sets)) as bar:
@@ -198,9 +200,11 @@ def evaluate(
             }
             for name in details
         },
-        "rivals": {
-            "fits": {name: method.describe() for name, method in others.methods.items()},
-            "missing": others.missing,
+        "baseline_methods": {
+            "fits": {
+                name: method.describe() for name, method in baseline_methods.methods.items()
+            },
+            "missing": baseline_methods.missing,
         },
         "training": {
             "recipe": recipe.name,

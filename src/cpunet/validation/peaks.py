@@ -43,7 +43,7 @@ class PeakSets:
         All prepared pulses of the two sides.
     sim_rows, data_rows
         Rows of the pulses of the peak.
-    made
+    translations
         Translations of the simulated pulses by all methods.
     amplitudes
         Current amplitudes of all pulses with noise, see `current_amplitudes`.
@@ -54,7 +54,7 @@ class PeakSets:
     measured: Pulses
     sim_rows: Rows
     data_rows: Rows
-    made: Translations
+    translations: Translations
     amplitudes: Mapping[str, Values]
 
     @property
@@ -76,7 +76,11 @@ class PeakSets:
         """Rows of the pulses with noise of one method in its whole dataset."""
         if method == "data":
             return self.data_rows
-        return self.sim_rows if method == "raw" else self._prepared(self.made.whole[method])
+        return (
+            self.sim_rows
+            if method == "raw"
+            else self._prepared(self.translations.whole[method])
+        )
 
     def by_method(self) -> WhenAsked[Pulses]:
         """Pulses with noise by method: the data, then from the simplest method to the truth.
@@ -87,7 +91,7 @@ class PeakSets:
             "data": lambda: self.data,
             "raw": lambda: self.raw,
         }
-        for name in self.made.whole:
+        for name in self.translations.whole:
             if len(self.rows(name)) >= MIN_N or name == "ren":
                 makers[name] = partial(self._noisy, name)
         return WhenAsked(makers)
@@ -95,7 +99,7 @@ class PeakSets:
     def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
         """Parameters of the noise-free pulses of the baseline methods and of the truth."""
         found = {}
-        for name, kept in self.made.clean.items():
+        for name, kept in self.translations.clean.items():
             rows = self._prepared(kept.whole)
             if name not in ("raw", "ren") and len(rows) >= MIN_N:
                 found[f"{name}{NO_NOISE}"] = {k: v[rows] for k, v in kept.parameters.items()}
@@ -103,27 +107,27 @@ class PeakSets:
 
     def known_to_all(self) -> Rows:
         """Indices within the peak of the events that all methods have without noise."""
-        whole = [kept.whole[self.sim_rows] for kept in self.made.clean.values()]
+        whole = [kept.whole[self.sim_rows] for kept in self.translations.clean.values()]
         return np.flatnonzero(np.logical_and.reduce(whole))
 
     def without_noise(self, places: Rows) -> dict[str, FloatArray]:
         """Noise-free windows of some events by method, with the truth if it is known."""
-        return self.made.without_noise(self.sim_rows[places])
+        return self.translations.without_noise(self.sim_rows[places])
 
     def paired_scores(self) -> dict[str, PairedScores] | None:
         """Paired scores by method; None if the truth is unknown."""
         rows = self.sim_rows[self.known_to_all()]
         scores = {
             name: scores_of_squares(kept.squares[rows])
-            for name, kept in self.made.clean.items()
+            for name, kept in self.translations.clean.items()
             if kept.squares is not None
         }
         return scores or None
 
     def not_prepared(self) -> dict[str, int]:
         """Number of translated pulses that cannot be prepared like data, by method."""
-        whole = dict(self.made.whole)
-        for name, kept in self.made.clean.items():
+        whole = dict(self.translations.whole)
+        for name, kept in self.translations.clean.items():
             if name not in ("raw", "ren"):
                 whole[f"{name}{NO_NOISE}"] = kept.whole
         counts = {name: int((~kept[self.sim_rows]).sum()) for name, kept in whole.items()}
@@ -139,16 +143,16 @@ class PeakSets:
         return self.sim_rows[flags[self.sim_rows]]
 
     def _noisy(self, name: str) -> Pulses:
-        return Pulses.of(self.made.noisy[name][self.rows(name)], dt_ns=self.dt_ns)
+        return Pulses.of(self.translations.noisy[name][self.rows(name)], dt_ns=self.dt_ns)
 
 
 def current_amplitudes(
-    sim_set: InputSet, data_set: InputSet, made: Translations
+    sim_set: InputSet, data_set: InputSet, translations: Translations
 ) -> dict[str, Values]:
     """Current amplitudes of all pulses of the data, of the simulation, and with noise."""
     windows = {
         "raw": sim_set.prepared.pulses.waveforms,
-        **made.noisy,
+        **translations.noisy,
         "data": data_set.prepared.pulses.waveforms,
     }
     return {method: current_amplitude(of_method) for method, of_method in windows.items()}
@@ -159,7 +163,7 @@ def peak_sets(
     recipe: Recipe,
     sim_set: InputSet,
     data_set: InputSet,
-    made: Translations,
+    translations: Translations,
     amplitudes: Mapping[str, Values],
 ) -> PeakSets:
     """Select the pulses of one peak, or of a range of energies, from both datasets.
@@ -172,7 +176,7 @@ def peak_sets(
         Recipe of the run.
     sim_set, data_set
         Prepared pulses of both sides.
-    made
+    translations
         Translations of the simulated pulses by all methods.
     amplitudes
         Result of `current_amplitudes`.
@@ -180,7 +184,7 @@ def peak_sets(
     selection = parse_selection(name, recipe.peaks)
     sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
     rows = [np.flatnonzero(selection.select(side.energy_kev)) for side in (sim, data)]
-    return PeakSets(name, sim, data, rows[0], rows[1], made, amplitudes)
+    return PeakSets(name, sim, data, rows[0], rows[1], translations, amplitudes)
 
 
 def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:

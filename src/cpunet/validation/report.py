@@ -159,10 +159,10 @@ class Report:
         of_peak = named(self.values, peak, "scored peak")
         data = named(of_peak["data"], parameter, "parameter")
         there = {m: v[parameter] for m, v in of_peak.items() if parameter in v}
-        told = self._compared(peak).get(parameter, {}).get("axis", {})
+        scored = self._compared(peak).get(parameter, {}).get("axis", {})
         axis = (
-            hist.axis.Regular(int(told["bins"]), told["low"], told["high"])
-            if max_bins is None and told.get("bins")
+            hist.axis.Regular(int(scored["bins"]), scored["low"], scored["high"])
+            if max_bins is None and scored.get("bins")
             else data_axis(data, max_bins or MAX_BINS)
         )
         methods = hist.axis.StrCategory(list(there), name="method")
