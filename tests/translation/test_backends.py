@@ -17,8 +17,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.inverse import fit_inverse
-from cpunet.translation import translator
-from cpunet.translation.translator import IREN, REN, RejectionWarning
+from cpunet.translation.translator import IREN, REN
 from synthetic import after_pole_and_decay, in_traces, sampled, two_sites, write_run
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
@@ -156,16 +155,6 @@ def test_seeds(ren, sim) -> None:
     assert abs(np.corrcoef(*noises)[0, 1]) < 0.05
 
 
-def test_batches_have_noise_of_their_own(ren, sim, monkeypatch) -> None:
-    whole = ren.translate(sim, noise=False)
-    monkeypatch.setattr(translator, "BATCH", N // 2)
-    np.testing.assert_allclose(ren.translate(sim, noise=False), whole, atol=1e-6)
-    twice = np.concatenate([sim[: N // 2]] * 2)
-    found = ren.translate(twice, energy_kev=KEV, seed=3)
-    first, second = found[: N // 2, :200].ravel(), found[N // 2 :, :200].ravel()
-    assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
-
-
 def test_pulses_without_energy_are_counted(ren, sim) -> None:
     energies = np.full(N, KEV)
     energies[[1, 4, 6]] = np.nan, 0.0, -5.0
@@ -184,19 +173,6 @@ def test_pulses_without_energy_are_counted(ren, sim) -> None:
     np.testing.assert_array_equal(alone.pulses.waveforms, done.pulses.waveforms[good])
     without = ren.translate_pulses(pulses, noise=False)
     assert without.codes.tolist() == np.where(np.arange(N) == 2, Rejection.NAN, 0).tolist()
-
-
-def test_low_energies_have_large_noise(ren, sim) -> None:
-    """The lithium layer leaves a few keV of some events: most are translated all the same."""
-    low = np.where(np.arange(N) % 2, KEV, KEV / 10)
-    done = ren.translate(sim, energy_kev=low, seed=1)
-    rms = done[:, :200].std(axis=1)
-    assert rms[::2].mean() == pytest.approx(10 * rms[1::2].mean(), rel=0.2)
-    low[::2] = KEV / 50
-    with pytest.warns(RejectionWarning, match="rows of NaN: .* (amplitude|tail)"):
-        done = ren.translate(sim, energy_kev=low, seed=1)
-    assert np.isfinite(done[1::2]).all()
-    assert np.isfinite(done[::2]).all(axis=1).any()
 
 
 def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:

@@ -561,15 +561,6 @@ def left_in(path, table="geds/ren"):
     return lh5.read(f"{table}/remains_kev", path).nda
 
 
-def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    for folder, name in ((busy, "a.lh5"), (run, "b.lh5")):
-        translate(folder, source, tmp_path / name)
-        with h5py.File(tmp_path / name) as file:
-            assert "remains_kev" not in file["geds/ren"]
-    assert values(tmp_path / "a.lh5") == pytest.approx(values(tmp_path / "b.lh5"))
-
-
 def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, many = tmp_path / "out.lh5", {"realisations": 40}

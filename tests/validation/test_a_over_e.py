@@ -64,17 +64,6 @@ def test_errors_cover_the_truth(n_dep, n_sep):
     assert 0.91 < within.mean() < 0.99
 
 
-def test_events_without_an_amplitude_are_left_out():
-    sample = peaks(np.random.default_rng(3))
-    clean = ae_survival(sample["DEP"], {"SEP": sample["SEP"]}, seed=1)
-    spoiled = ae_survival(
-        np.r_[np.nan, sample["DEP"], np.inf],
-        {"SEP": np.r_[sample["SEP"], [np.nan] * 3]},
-        seed=1,
-    )
-    assert spoiled == clean
-
-
 def test_table_of_a_method_that_agrees_and_one_that_does_not():
     rng = np.random.default_rng(4)
     # the scale of A/E is another: each set has its own cut, and it must not matter

@@ -203,21 +203,6 @@ def test_survival_by_ranges_and_the_noise_are_tables(tmp_path):
     assert ["SEP", "REN translation", "90", "200", "1.00 ± 0.10", "–", "-1.5", "–"] in told
 
 
-def test_paper_carries_figures_of_all_peaks_and_no_long_tables(tmp_path):
-    names = ["SEP drift_time", "SEP superpulses", "SEP A over E", "losses"]
-    metrics = {"noise": {"SEP": {"ren": {"n": 7}}}, "training": {"peak": "FEP"}}
-    write_report(tmp_path, metrics, {name: figure() for name in names}, [])
-    html = (tmp_path / "report.html").read_text()
-    shapes = html[html.index('id="shapes"') : html.index('id="ae"')]
-    assert re.findall(r'<figure [^>]*aria-label="([^"]*)"', shapes) == [
-        "SEP drift time",
-        "SEP superpulses",
-    ]
-    assert '<details class="screen"><summary>Its size' in html
-    details = html[html.index('id="details"') :]
-    assert 'aria-label="losses"' in details[details.index('<div class="screen">') :]
-
-
 def test_no_peak_of_a_combined_training_is_shown_first(tmp_path):
     names = [f"{peak} mean pulse" for peak in ("FEP", "SEP", "DEP", "FEP,1000-1580")]
     found = {"training": {"peak": "FEP,1000-1580"}}

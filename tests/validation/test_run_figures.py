@@ -8,7 +8,6 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.special import ndtr
 
-from cpunet.plotting import SPARE_COLOURS, colours, label
 from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS
@@ -132,10 +131,3 @@ def test_global_settings_neither_change_nor_matter():
         assert mpl.rcParams["font.size"] == 30.0
     assert dict(mpl.rcParams) == before
     assert figure.axes[0].xaxis.label.get_size() == 10.0
-
-
-def test_each_method_has_a_colour_of_its_own():
-    methods = ["data", "raw", "ren", "iren", "truth", *"abcde"]
-    assert len(set(colours(methods).values())) == len(methods)
-    assert colours(["x"])["x"] == SPARE_COLOURS[0]
-    assert (label("ren"), label("x")) == ("REN translation", "x")

@@ -71,15 +71,6 @@ def test_what_a_run_lacks_is_a_dash():
     assert [set(row.best) for row in table.rows] == [{0, 1}, set(), set(), set(), set()]
 
 
-def test_peaks_of_any_run_are_shown():
-    other = metrics()
-    other["peaks"] = {"DEP": other["peaks"]["SEP"]}
-    table = side_by_side({"a": metrics(), "b": other})
-    assert list(dict.fromkeys(row.peak for row in table.rows)) == ["SEP", "DEP"]
-    assert table.rows[0].cells[1].value is None
-    assert "(peaks)" in table.notes[0]
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -69,14 +69,6 @@ def test_a_shift_has_the_analytic_auc(shift):
     assert significance(result) > 5
 
 
-def test_two_peaks_with_the_mean_and_the_spread_of_one_are_seen():
-    rng = np.random.default_rng(3)
-    other = windows(rng, 800, spread=0.3) + np.float32(
-        np.sqrt(1 - 0.3**2) * rng.choice([-1, 1], (800, 1)) * SHAPE
-    )
-    assert significance(classifier_auc(windows(rng, 800), other, seed=0)) > 5
-
-
 @pytest.mark.parametrize("change", [{"width": 4.1}, {"noise": 0.0043}])
 def test_small_changes_of_real_pulses_are_seen(change):
     rng = np.random.default_rng(4)

@@ -24,9 +24,7 @@ from cpunet.validation.evaluation import (
     Evaluation,
     _compared,
     evaluate,
-    validation_selection,
 )
-from cpunet.validation.slices import slice_edges
 from cpunet.validation.truth import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
 from synthetic import after_pole, decay, phased_edges
@@ -88,12 +86,6 @@ def whole(run, files) -> Evaluation:
     return evaluated(run, files["sim"], files["data"])
 
 
-def test_peaks_sidebands_and_continua_are_loaded() -> None:
-    selection = validation_selection(["SEP"], RECIPE)
-    chosen = selection.select([KEV["SEP"], KEV["SEP"] + 7, KEV["SEP"] + 15, 2030.0, 1800.0])
-    assert chosen.tolist() == [True, False, True, True, False]
-
-
 @pytest.mark.thorough
 def test_a_sample_of_both_sides_is_compared(run, files) -> None:
     how = {"baselines": False, "device": "cpu", "max_pulses": 250}
@@ -121,19 +113,6 @@ def test_what_is_compared(whole) -> None:
     ]
     # energies of all pulses of the file are there, for its spectrum
     assert len(whole.data.energies_kev) == 380
-
-
-def test_slices_and_axes_say_which_time_they_mean(whole) -> None:
-    data = whole.values["FEP"]["data"]
-    np.testing.assert_allclose(
-        whole.details["FEP"].slices["data"].edges, slice_edges(data["rise_01_90"])
-    )
-    made = drawings(whole)
-    slices, amplitude = made["FEP superpulses"](), made["FEP A over E"]()
-    assert "slices of rise time 1–90 %" in slices.legends[0].get_title().get_text()
-    labels = [axes.get_xlabel() for axes in amplitude.axes]
-    assert "Drift time, 1 % to maximum [ns]" in labels
-    assert made["FEP drift_time"]().axes[0].get_xlabel() in labels
 
 
 @pytest.mark.thorough

@@ -79,12 +79,6 @@ def test_too_good_to_be_chance_asks_for_the_same_events():
     assert found.words == "closer than chance by 6.5 sigma: are the same events on both sides?"
 
 
-def test_a_null_without_spread():
-    assert verdict(100.0, 100.0, 0.0, "lower").agrees
-    off = verdict(50.0, 100.0, 0.0, "lower")
-    assert (off.sigma, off.agrees, off.words) == (None, False, "off")
-
-
 def test_the_table_holds_every_quantity_and_is_json():
     table = verdict_table(metrics())
     assert json.loads(json.dumps(table, allow_nan=False)) == table

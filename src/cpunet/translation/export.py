@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
@@ -99,17 +98,13 @@ def export_onnx(
         done = Export(out, card, None if noise is None else noise_file, difference)
         text.write_text(_card(run, translator, graph, done, scores), encoding="utf-8")
         if noise is not None:
-            with written_aside(noise_file) as stored:
-                _write_noise(stored, noise)
+            spectra: Any = {"continua": noise.kinds, "lines": noise.lines}
+            spectra |= {"shares": noise.shares, "samples": noise.samples, "dt_ns": noise.dt_ns}
+            with written_aside(noise_file) as stored, stored.open("wb") as stream:
+                np.savez(stream, **spectra)
     if noise is None:
         noise_file.unlink(missing_ok=True)  # of an export that this one replaces
     return done
-
-
-def _write_noise(path: Path, noise: BaselineNoise) -> None:
-    spectra: Any = {"continua": noise.kinds, "lines": noise.lines, "shares": noise.shares}
-    with path.open("wb") as stream:
-        np.savez(stream, **spectra, samples=noise.samples, dt_ns=noise.dt_ns)
 
 
 def _card(

@@ -378,7 +378,14 @@ def wanted_tails(
     """
     if wanted == NONE:
         return None
-    rate = None if wanted == LEARNED else _rate(wanted)
+    rate = None
+    if wanted != LEARNED:
+        try:
+            rate = float(wanted)
+        except ValueError:
+            rate = np.nan
+        if not (np.isfinite(rate) and rate >= 0):
+            raise CpunetError(f"`remains` {wanted}: expected learned, none, or a rate in kHz")
     known = translator.remains
     if known is None:
         raise CpunetError(
@@ -420,13 +427,3 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
             "readout chain on raw traces, or leave it out"
         )
     return DrawnPileUp(rate_khz, known.law.energies_kev, translator.dt_ns)
-
-
-def _rate(wanted: str | float) -> float:
-    try:
-        rate = float(wanted)
-    except ValueError:
-        rate = np.nan
-    if not (np.isfinite(rate) and rate >= 0):
-        raise CpunetError(f"`remains` {wanted}: expected learned, none, or a rate in kHz")
-    return rate

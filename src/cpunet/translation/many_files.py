@@ -96,8 +96,11 @@ def translate_files(
             "continue with `resume`"
         )
     rejections = sum((Counter(one["rejections"]) for one in done), Counter[str]())
-    names = ("read", "translated", "saturated")
-    sums = {n: sum(one[n] for one in done) for n in names if all(n in one for one in done)}
+    sums = {
+        name: sum(one[name] for one in done)
+        for name in ("read", "translated", "saturated")
+        if all(name in one for one in done)
+    }
     skipped = sum("skipped" in one for one in done)
     return {"files": len(done), "skipped": skipped, **sums, "rejections": dict(rejections)}
 

@@ -11,7 +11,7 @@ NONE, LEARNED = "none", "learned"  # remains of earlier pulses
 
 @dataclass(frozen=True)
 class Adc:
-    """Raw traces in ADC counts, see `cpunet.translation.to_adc`.
+    """Raw traces in ADC counts, see `cpunet.translation.forms.AdcTraces`.
 
     Parameters
     ----------

@@ -181,7 +181,11 @@ def survival_table(
     table: dict[str, Any] = {}
     for name, of_peak in ae.items():
         finite = {m: int(np.isfinite(of_peak[m]).sum()) for m in methods}
-        rows = _cut_rows(found) if name == DEP else _survival_rows(name, found)
+        rows = (
+            {row: {m: getattr(s, row) for m, s in found.items()} for row in ("cut", "cut_std")}
+            if name == DEP
+            else _survival_rows(name, found)
+        )
         table[name] = {
             "events": finite,
             "missing": {m: len(of_peak[m]) - finite[m] for m in methods},
@@ -341,13 +345,6 @@ def _peak_survival(values: Values, cut: float, cuts: Values) -> PeakSurvival:
     of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
     error = float(100 * np.hypot(survival_error(passing, n), of_cut))
     return PeakSurvival(100 * passing / n, error)
-
-
-def _cut_rows(found: Mapping[str, Survival]) -> dict[str, dict[str, float]]:
-    return {
-        "cut": {m: s.cut for m, s in found.items()},
-        "cut_std": {m: s.cut_std for m, s in found.items()},
-    }
 
 
 def _survival_rows(name: str, found: Mapping[str, Survival]) -> dict[str, dict[str, float]]:

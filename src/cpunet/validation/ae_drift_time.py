@@ -47,13 +47,11 @@ def ae_against_drift_time(
         method and the data a list of bins with ``n``, ``time_ns`` (median), and ``q16``,
         ``median`` and ``q84`` with ``…_error`` of each; or ``missing`` with the reason.
     """
-    known = {
-        method: _finite_pairs(values, drift_time[method])
-        for method, values in amplitude.items()
-    }
-    edges = np.quantile(known["data"][1], np.linspace(0, 1, bins + 1))
+    known = {m: np.isfinite(ae) & np.isfinite(drift_time[m]) for m, ae in amplitude.items()}
+    edges = np.quantile(drift_time["data"][known["data"]], np.linspace(0, 1, bins + 1))
     methods, left_out = {}, {}
-    for method, (ae, time) in known.items():
+    for method, finite in known.items():
+        ae, time = amplitude[method][finite], drift_time[method][finite]
         inside = (time >= edges[0]) & (time <= edges[-1])
         place = np.searchsorted(edges[1:-1], time, side="right")
         chosen = [inside & (place == i) for i in range(bins)]
@@ -115,11 +113,6 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
         alignment="left",
     )
     return figure
-
-
-def _finite_pairs(ae: Values, time: Values) -> tuple[Values, Values]:
-    known = np.isfinite(ae) & np.isfinite(time)
-    return ae[known], time[known]
 
 
 def _bin(ae: Values, time: Values) -> dict[str, Any]:

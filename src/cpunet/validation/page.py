@@ -7,7 +7,7 @@ blocks all requests.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,8 @@ def write_page(
     scores = joined(
         peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()
     )
+    # of each method that is drawn, for the page's legend
+    palette = colours(re.findall('data-method="([^"]*)"', joined([*drawn.values(), scores])))
     html = rendered(
         "report.html",
         title="CPU-Net validation",
@@ -77,7 +79,7 @@ def write_page(
         first=_gallery(placed["first"]),
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts", {})),
-        methods=_methods([*drawn.values(), scores]),
+        methods=[{"name": m, "label": label(m), "colour": c} for m, c in palette.items()],
         scores=scores,
         distributions=_grid(placed["distributions"]),
         further=_folded("Further parameters", _grid(placed["further"]), screen=True),
@@ -125,12 +127,6 @@ def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, li
     return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
 
 
-def _methods(drawn: Iterable[str]) -> list[dict[str, str]]:
-    """Name, label and colour of each method that is drawn, for the page's legend."""
-    names = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn)))
-    return [{"name": m, "label": label(m), "colour": c} for m, c in colours(names).items()]
-
-
 def _folded(title: str, content: Markup, *, screen: bool = False) -> Markup:
     return part("folded", title, content, screen=screen) if content.strip() else Markup()
 
@@ -149,8 +145,12 @@ def verdicts_html(verdicts: Mapping[str, Any]) -> Markup:
     """Return the verdicts in plain words; nothing without verdicts."""
     if not verdicts:
         return Markup()
+    spelt = {"auc": "AUC", "wasserstein": "W₁", "ae": "A/E"}
     rows = [
-        [peak, label(method), _spelt(quantity), _sigma(found["sigma"]), found["words"]]
+        [
+            *(peak, label(method), " ".join(spelt.get(w, w) for w in quantity.split("_"))),
+            *(_sigma(found["sigma"]), found["words"]),
+        ]
         for peak, methods in verdicts.get("table", {}).items()
         for method, quantities in methods.items()
         for quantity, found in quantities.items()
@@ -201,7 +201,13 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
     if paired := scores.get("paired", {}):
         head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
         rows = [
-            [label(method), *(_thousandths(found[key]) for key in ("rmse", "edge_rmse"))]
+            [
+                label(method),
+                *(
+                    NO_VALUE if found[key] is None else f"{1e3 * found[key]:#.3g}".rstrip(".")
+                    for key in ("rmse", "edge_rmse")
+                ),
+            ]
             for method, found in paired.items()
         ]
         tables.append(_table(head, rows))
@@ -239,19 +245,17 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
 def ranges_table(ranges: Mapping[str, Any]) -> Markup:
     """Return the survival of A/E cuts by ranges of energy and method."""
     rows = [
-        [name, label(method), str(found.get("peak", NO_VALUE)), *_survival(found)]
+        [
+            *(name, label(method), str(found.get("peak", NO_VALUE))),
+            _percent(found.get("survival"), found.get("survival_std")),
+            found.get("missing", ""),
+        ]
         for name, methods in ranges.items()
         if name != "missing"
         for method, found in methods.items()
     ]
     head = ["Range", "Method", "Pulses", "Survival [%]", ""]
     return _table(head, rows, words={0, 1, 4}) if rows else Markup()
-
-
-def _survival(found: Mapping[str, Any]) -> tuple[str, str]:
-    if "missing" in found:
-        return NO_VALUE, found["missing"]
-    return _percent(found["survival"], found["survival_std"]), ""
 
 
 def noise_table(noise: Mapping[str, Any]) -> Markup:
@@ -325,10 +329,6 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
     return _table(head, rows, words={0, 1})
 
 
-def _thousandths(value: float | None) -> str:
-    return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
-
-
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     rows: list[tuple[str, Any]] = []
     for name, value in values.items():
@@ -353,8 +353,3 @@ def _table(
 ) -> Markup:
     """Return a table; the columns `words` are aligned as text, all others as numbers."""
     return part("table", head, rows, words or set())
-
-
-def _spelt(quantity: str) -> str:
-    words = {"auc": "AUC", "wasserstein": "W₁", "ae": "A/E"}
-    return " ".join(words.get(word, word) for word in quantity.split("_"))

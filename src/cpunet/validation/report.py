@@ -297,7 +297,8 @@ class Report:
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
         rows = [
-            [*place, *(_number(iou.get(m)) for m in shown)] for place, iou in of_all.items()
+            [*place, *("–" if iou.get(m) is None else f"{iou[m]:.1f}" for m in shown)]
+            for place, iou in of_all.items()
         ]
         return ["peak", "parameter", *shown], rows
 
@@ -323,7 +324,3 @@ def _drawn(drawing: Callable[[], Figure], bar: Stage) -> Figure:
     figure = drawing()
     bar.update(1)
     return figure
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.1f}"

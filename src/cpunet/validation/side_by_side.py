@@ -18,6 +18,7 @@ Metrics = Mapping[str, Any]
 
 FEW = 8  # runs whose scores fit beside each other; more have an overview and panels
 CEILING = " (ceiling)"
+AUC = ("auc", "auc_std", "null_mean", "null_std")
 
 
 @dataclass(frozen=True)
@@ -202,14 +203,25 @@ def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
     scores = [part(metrics, "peaks", peak) for metrics in runs]
     rows = []
     for name in _union(part(s, "parameters") for s in scores):
-        cells = [_overlap(part(s, "parameters", name), method) for s in scores]
+        cells = []
+        for one in (part(s, "parameters", name) for s in scores):
+            value, ceiling = (number(one, "iou", key) for key in (method, "ceiling"))
+            error, spread = (number(one, "iou_std", key) for key in (method, "ceiling"))
+            appended = f" ({ceiling:.1f})" if ceiling is not None else ""
+            cells.append(_cell(".1f", value, error, ceiling, spread, appended=appended))
         title = f"{name.replace('_', ' ')}: IoU [%]{CEILING}"
         rows.append(_row(peak, title, cells, lambda c: -(c.value or 0.0)))
-    cells = [_auc(part(s, "two_sample", method)) for s in scores]
+    cells = [
+        _cell(".3f", *(number(s, "two_sample", method, key) for key in AUC)) for s in scores
+    ]
     rows.append(_row(peak, "classifier: AUC", cells, _off))
-    cells = [_edge(part(s, "paired", method)) for s in scores]
+    cells = [_cell("#.3g", number(s, "paired", method, "edge_rmse"), scale=1e3) for s in scores]
     rows.append(_row(peak, "edge RMSE [10⁻³]", cells, _off))
-    cells = [_survival(part(metrics, "ae_survival", peak), method) for metrics in runs]
+    survival = [part(metrics, "ae_survival", peak) for metrics in runs]
+    cells = [
+        _cell("+.2f", number(s, "difference", method), number(s, "difference_std", method), 0.0)
+        for s in survival
+    ]
     rows.append(_row(peak, "A/E survival minus data [points]", cells, _off))
     return [row for row in rows if any(cell.value is not None for cell in row.cells)]
 
@@ -225,39 +237,19 @@ def _off(cell: Cell) -> float:
     return abs((cell.value or 0.0) - (cell.expected or 0.0))
 
 
-def _overlap(parameter: Metrics, method: str) -> Cell:
-    value, error = (number(parameter, key, method) for key in ("iou", "iou_std"))
-    ceiling, spread = (number(parameter, key, "ceiling") for key in ("iou", "iou_std"))
-    shown = f" ({ceiling:.1f})" if ceiling is not None else ""
-    return _cell(value, error, ceiling, spread, ".1f", shown)
-
-
-def _auc(tested: Metrics) -> Cell:
-    keys = ("auc", "auc_std", "null_mean", "null_std")
-    value, error, mean, spread = (number(tested, key) for key in keys)
-    return _cell(value, error, 0.5 if mean is None else mean, spread, ".3f")
-
-
-def _edge(paired: Metrics) -> Cell:
-    rmse = number(paired, "edge_rmse")
-    return _cell(None if rmse is None else 1e3 * rmse, None, None, None, "#.3g")
-
-
-def _survival(survival: Metrics, method: str) -> Cell:
-    value, error = (number(survival, key, method) for key in ("difference", "difference_std"))
-    return _cell(value, error, 0.0, None, "+.2f")
-
-
 def _cell(
-    value: float | None,
-    error: float | None,
-    expected: float | None,
-    expected_std: float | None,
     digits: str,
+    value: float | None,
+    error: float | None = None,
+    expected: float | None = None,
+    expected_std: float | None = None,
+    *,
     appended: str = "",
+    scale: float = 1.0,
 ) -> Cell:
     if value is None:
         return Cell()
+    value *= scale
     of_error = f" ± {error:{digits.lstrip('+')}}" if error is not None else ""
     text = f"{value:{digits}}{of_error}{appended}"
     return Cell(text, value, error, expected, expected_std, digits)

@@ -135,8 +135,9 @@ def tune(
         )
     study.set_user_attr(BEGUN, begun)
     own = {key: value_of(recipe, key) for key in space}
-    if not study.trials and all(_holds(space[key], own[key]) for key in space):
-        study.enqueue_trial(_labelled(own, space), {UNCHANGED: True})
+    given = {key: _in_journal(space[key], value) for key, value in own.items()}
+    if not study.trials and None not in given.values():
+        study.enqueue_trial(given, {UNCHANGED: True})
     states = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
 
     def objective(trial: Trial) -> float:
@@ -250,18 +251,13 @@ def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
     return checked(Recipe, settings, f"recipe {recipe.name}, search, {source}")
 
 
-def _holds(config: SearchConfig, value: Any) -> bool:
-    """Whether a search space contains a value of a setting."""
+def _in_journal(config: SearchConfig, value: Any) -> Any:
+    """A value as the journal has it, choices as JSON; None if the space does not contain it."""
     if config.low is None or config.high is None:
-        return value in (config.choices or ())
-    return isinstance(value, int | float) and config.low <= value <= config.high
-
-
-def _labelled(values: dict[str, Any], space: Mapping[str, SearchConfig]) -> dict[str, Any]:
-    """Values in the form of the journal: choices as JSON, since they can be lists."""
-    chosen = {key: config.choices for key, config in space.items() if config.choices}
-    # a setting of 4.0 is the choice 4 of the search space
-    return values | {k: json.dumps(c[c.index(values[k])]) for k, c in chosen.items()}
+        choices = config.choices or ()  # a setting of 4.0 is the choice 4
+        return json.dumps(choices[choices.index(value)]) if value in choices else None
+    within = isinstance(value, int | float) and config.low <= value <= config.high
+    return value if within else None
 
 
 def _suggested(trial: Trial, key: str, own: Any, config: SearchConfig) -> Any:
