@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from cpunet.plotting import colours, group, label, styled
 from cpunet.tables import NO_VALUE
 
-COLUMNS = 3  # panels in a line
+COLUMNS = 4  # panels in a line; of more than one line, 3
 LONGEST = 23  # maximum characters of a name
 
 
@@ -78,9 +78,10 @@ def score_figure(
     methods
         Methods, if they differ; otherwise all are REN translations.
     """
-    columns, methods = min(COLUMNS, len(rows)), methods or ["ren"] * len(names)
+    columns = len(rows) if len(rows) <= COLUMNS else COLUMNS - 1
+    methods = methods or ["ren"] * len(names)
     lines, palette = -(-len(rows) // columns), colours(methods)
-    figure = Figure(figsize=(1.6 + 2.7 * columns, lines * (0.9 + 0.18 * len(names))))
+    figure = Figure(figsize=(1.6 + 2.4 * columns, lines * (0.9 + 0.18 * len(names))))
     panels = figure.subplots(lines, columns, sharey=True, squeeze=False).flat
     for row, axes in zip(rows, panels, strict=False):
         for place, (cell, method) in enumerate(zip(row.cells, methods, strict=True)):
