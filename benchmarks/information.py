@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.measured import measured_noise
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
@@ -189,8 +189,8 @@ def main() -> None:
     files = [PulseFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
     selection = parse_selection("FEP", RECIPE.peaks)
     sim = load_pulses(files[0], "simulated", RECIPE, selection).prepared.pulses
-    data = load_pulses(files[1], "measured", RECIPE, selection).prepared.pulses
-    noise, _ = measured_noise(files[1], data, RECIPE.preparation)
+    measured = load_pulses(files[1], "measured", RECIPE, selection)
+    data, (noise, _) = measured.prepared.pulses, measured_noise(measured, RECIPE.preparation)
     if arguments.chain is not None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)
     start, _ = response_fit.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from cpunet.electronics.remains import Remains
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.validation.remains_figure import Slopes, remains_figure
@@ -25,7 +26,7 @@ def main() -> None:
     arguments = parser.parse_args()
     source = open_pulses(arguments.file, kev_per_adc=arguments.kev_per_adc)
     preparation = load_recipe("fast").preparation
-    remains = Remains.of_traces(source.blocks(4096), preparation, arguments.decay_us)
+    remains = Remains.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
     raw = next(iter(source.blocks(4096)))
     console = Console()
     for name, value in remains.describe().items():

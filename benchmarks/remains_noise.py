@@ -19,6 +19,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
@@ -53,7 +54,7 @@ def main() -> None:
         shutil.copyfile(arguments.folder / name, arguments.out / name)
 
     console = Console()
-    remains = Remains.of_traces([lifted], config)
+    remains = Remains.of(Baselines.of([lifted], config))
     console.print(remains.describe())
     known = np.load(arguments.folder / "data_labels.npz")["flag"] == 0
     sets = {
@@ -62,7 +63,7 @@ def main() -> None:
         "taken": remains.empty(lifted),
     }
     for name, chosen in sets.items():
-        noise = BaselineNoise.from_traces(lifted[chosen], config)
+        noise = BaselineNoise.of(Baselines.of([lifted], config), chosen)
         khz = np.arange(len(noise.density)) / noise.samples / noise.dt_ns * 1e6
         at = ", ".join(f"{np.interp(f, khz, noise.density):.1f}" for f in FREQUENCIES_KHZ)
         console.print(

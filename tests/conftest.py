@@ -6,6 +6,7 @@ import gc
 import importlib.util
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +16,8 @@ import torch
 from hypothesis import settings
 
 from cpunet import progress
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.source import PulseSource
 
 # compilation and a shared machine make single examples slow now and then
 settings.register_profile("cpunet", deadline=None, max_examples=25)
@@ -75,6 +78,20 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
 
     monkeypatch.setattr(progress.Stage, "update", update)
     return seen
+
+
+@pytest.fixture(scope="module")
+def reads() -> Iterator[Counter[Path]]:
+    """How often the pulses of each file have been read by the tests of a module."""
+    times, blocks = Counter[Path](), PulseSource.blocks
+
+    def counted(source: PulseSource, size: int = 4096) -> Iterator[Pulses]:
+        times[source.path] += 1
+        return blocks(source, size)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PulseSource, "blocks", counted)
+        yield times
 
 
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.noise_traces import coloured_noise
 from cpunet.networks.response_layer import Readout
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -71,7 +72,7 @@ def measured_with(chain: Electronics) -> Unpaired:
     adc = 15_000 + chain.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
     raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(N, KEV))
     data = prepare(raw, RECIPE.preparation, "measured").pulses
-    measured = BaselineNoise.from_traces(raw, RECIPE.preparation)
+    measured = BaselineNoise.of(Baselines.of([raw], RECIPE.preparation))
     return Unpaired(simulated(charge(N, seed=1)), data, measured)
 
 

@@ -322,6 +322,7 @@ def _traces(
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """Properties of measured traces, and the tails of earlier pulses under them."""
     from cpunet.electronics.remains import Remains, remains_in_words
+    from cpunet.pulses.baselines import Baselines
     from cpunet.pulses.trace_properties import BLOCK, trace_properties, traces_in_words
 
     told: dict[str, Any] = {}
@@ -332,8 +333,8 @@ def _traces(
         told["traces"] = f"cannot be described: {error}"
         lines = [("", told["traces"])]
     try:
-        blocks = source.blocks(_REMAINS_BLOCK)
-        told["remains"] = Remains.of_traces(blocks, recipe.preparation).describe()
+        baselines = Baselines.of(source.blocks(_REMAINS_BLOCK), recipe.preparation)
+        told["remains"] = Remains.of(baselines).describe()
         lines += remains_in_words(told["remains"])
     except CpunetError as error:
         told["remains"] = f"not known: {error}"

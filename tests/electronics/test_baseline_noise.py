@@ -12,6 +12,7 @@ from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.finishing import finish, finish_both
 from cpunet.electronics.noise_traces import coloured_noise, noise_power
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -47,7 +48,7 @@ def traces(n: int = 300, seed: int = 0, start: int = 500) -> Pulses:
 
 @pytest.fixture(scope="module")
 def noise() -> BaselineNoise:
-    return BaselineNoise.from_traces(traces(), CONFIG)
+    return BaselineNoise.of(Baselines.of([traces()], CONFIG))
 
 
 def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
@@ -65,7 +66,9 @@ def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
 
 
 def test_the_error_of_the_rms_covers_the_truth() -> None:
-    found = [BaselineNoise.from_traces(traces(100, seed), CONFIG) for seed in range(20, 40)]
+    found = [
+        BaselineNoise.of(Baselines.of([traces(100, seed)], CONFIG)) for seed in range(20, 40)
+    ]
     true = NOISE_KEV * 0.8 / np.exp(-397 * DT_NS / 54_600)
     errors = np.array([noise.rms_error for noise in found])
     pulls = (np.array([noise.rms for noise in found]) - true) / errors
@@ -109,9 +112,9 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
 
 def test_bad_input_is_named(noise) -> None:
     with pytest.raises(CpunetError, match="only 0 of 40 traces have a known energy"):
-        BaselineNoise.from_traces(Pulses.of(traces(40).waveforms, dt_ns=DT_NS), CONFIG)
+        BaselineNoise.of(Baselines.of([Pulses.of(traces(40).waveforms, dt_ns=DT_NS)], CONFIG))
     with pytest.raises(CpunetError, match="samples before the pulse; the noise needs 400"):
-        BaselineNoise.from_traces(traces(start=380), CONFIG)
+        BaselineNoise.of(Baselines.of([traces(start=380)], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
     records = shape(3, 1200).astype(np.float32)
@@ -196,7 +199,7 @@ def test_any_number_and_length(n: int, length: int) -> None:
 
 def test_noise_slower_than_a_baseline_is_found() -> None:
     baselines = 2 * coloured_noise(SPECTRUM, 1500, 1200, DT_NS, np.random.default_rng(6))
-    noise = BaselineNoise.from_traces(on_baselines(baselines), CONFIG)
+    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
     assert noise.n_baselines > 1000
     assert noise.rms == pytest.approx(2 * TO_PREPARED, rel=0.1)
     drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(7)) / TO_PREPARED
@@ -214,7 +217,9 @@ def test_noise_slower_than_a_baseline_is_found() -> None:
 
 def test_white_noise_has_no_slow_part() -> None:
     rng = np.random.default_rng(8)
-    noise = BaselineNoise.from_traces(on_baselines(2 * rng.normal(size=(800, 1200))), CONFIG)
+    noise = BaselineNoise.of(
+        Baselines.of([on_baselines(2 * rng.normal(size=(800, 1200)))], CONFIG)
+    )
     density = noise.density_of(GRID) / TO_PREPARED**2
     assert density[1:30].mean() == pytest.approx(4, rel=0.15)
     assert density[100:-10].mean() == pytest.approx(4, rel=0.03)
@@ -225,7 +230,7 @@ def test_a_line_is_a_sine_of_its_height() -> None:
     phase = rng.uniform(0, 2 * np.pi, (800, 1))
     line = 3 * np.sin(2 * np.pi * 0.11 * np.arange(1200) + phase)
     baselines = line + rng.normal(size=(800, 1200))
-    noise = BaselineNoise.from_traces(on_baselines(baselines), CONFIG)
+    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
     drawn = noise.draw(np.ones(800), 1200, np.random.default_rng(10)) / TO_PREPARED
     assert drawn.std() == pytest.approx(np.sqrt(4.5 + 1), rel=0.05)
     wave = np.exp(-2j * np.pi * 0.11 * np.arange(400))
@@ -240,9 +245,8 @@ def test_baselines_of_different_kinds_are_drawn_as_such(n: int) -> None:
     """Also if they are few: small kinds are not drawn with what all have in common."""
     rng = np.random.default_rng(11)
     heights = np.exp(rng.normal(0, 0.3, n))
-    noise = BaselineNoise.from_traces(
-        on_baselines(heights[:, np.newaxis] * rng.normal(size=(n, 1200))), CONFIG
-    )
+    raw = on_baselines(heights[:, np.newaxis] * rng.normal(size=(n, 1200)))
+    noise = BaselineNoise.of(Baselines.of([raw], CONFIG))
     drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(12)) / TO_PREPARED
     width = np.log(drawn.std(axis=1))
     assert np.median(width) == pytest.approx(0, abs=0.1)
@@ -274,7 +278,7 @@ def test_short_beginnings_of_many_windows_have_one_kind_of_noise(samples: int) -
 
 def test_traces_without_noise_are_refused() -> None:
     with pytest.raises(CpunetError, match="most baselines are constant"):
-        BaselineNoise.from_traces(on_baselines(np.zeros((100, 1200))), CONFIG)
+        BaselineNoise.of(Baselines.of([on_baselines(np.zeros((100, 1200)))], CONFIG))
 
 
 def test_windows_without_energies_are_refused() -> None:

@@ -19,6 +19,7 @@ from cpunet.electronics.drawn_remains import (
 from cpunet.electronics.readout import read_out
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.preparation import prepare
@@ -103,8 +104,8 @@ def test_what_passes_is_measured_by_adding_remains_to_traces_without():
     prepared = prepare(raw, RECIPE.preparation, "measured")
     cuts = fit_cuts(prepared, RECIPE.cuts)
     kept = apply_cuts(prepared, cuts)
-    found = Remains.of_traces([raw], RECIPE.preparation)
-    passed = passing(found, [raw[kept.index]], RECIPE.preparation, cuts)
+    found = Remains.of(Baselines.of([raw], RECIPE.preparation))
+    passed = passing(found, raw[kept.index], RECIPE.preparation, cuts)
     assert passed is not None
     assert passed[0] == 1
     assert passed[-1] == 0
@@ -112,5 +113,5 @@ def test_what_passes_is_measured_by_adding_remains_to_traces_without():
     kev, true = drawn.draw_kev(20_000, rng), traces.remains_kev[kept.index]
     for size in (3, 10, 20):
         assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)
-    few = passing(found, [raw[slice(0, 5)]], RECIPE.preparation, cuts)
+    few = passing(found, raw[slice(0, 5)], RECIPE.preparation, cuts)
     assert few is None

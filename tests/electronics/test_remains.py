@@ -12,6 +12,7 @@ from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.remains import Remains, read_baselines
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
@@ -54,7 +55,7 @@ def busy() -> RawTraces:
 
 @pytest.fixture(scope="module")
 def found(busy: RawTraces) -> Remains:
-    return Remains.of_traces(in_blocks(as_pulses(busy)), PREPARATION)
+    return Remains.of(Baselines.of(in_blocks(as_pulses(busy)), PREPARATION))
 
 
 def test_each_trace_has_its_remainder(busy: RawTraces, found: Remains):
@@ -85,7 +86,7 @@ def test_the_rate_is_found_without_the_energies(found: Remains):
 
 @pytest.mark.thorough
 def test_recorded_energies_are_taken_if_they_do():
-    found = Remains.of_traces([as_pulses(traces_of(0.5, broad=True))], PREPARATION)
+    found = Remains.of(Baselines.of([as_pulses(traces_of(0.5, broad=True))], PREPARATION))
     assert found.fit.recorded
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(0.5, abs=3 * found.fit.rate_error_khz)
@@ -95,7 +96,7 @@ def test_recorded_energies_are_taken_if_they_do():
     "preset", [pytest.param("ornl", marks=pytest.mark.thorough), "legend200"]
 )
 def test_nothing_is_invented_where_there_is_nothing(preset: str):
-    found = Remains.of_traces([as_pulses(traces_of(0.0, preset))], PREPARATION)
+    found = Remains.of(Baselines.of([as_pulses(traces_of(0.0, preset))], PREPARATION))
     assert found.law is None
     assert found.describe()["rate_khz"] == 0
 
@@ -126,7 +127,7 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     raw = as_pulses(busy)
     lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
     blocks = [raw.with_waveforms(lost.astype(np.float32))]
-    found = Remains.of_traces(blocks, PREPARATION, decay_us=54.6)
+    found = Remains.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
     assert not found.coupled
     assert found.describe()["told_by"] == "slope"
     large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.remains_kev > 100)
@@ -143,12 +144,12 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
 @pytest.mark.thorough
 def test_traces_that_all_lie_on_remains_are_told():
     with pytest.raises(CpunetError, match="nearly all traces lie on remains"):
-        Remains.of_traces([as_pulses(traces_of(3.0, "legend200"))], PREPARATION)
+        Remains.of(Baselines.of([as_pulses(traces_of(3.0, "legend200"))], PREPARATION))
 
 
 @pytest.mark.thorough
 def test_slow_decays_are_told_by_their_levels():
-    found = Remains.of_traces([as_pulses(traces_of(0.3, "legend200"))], PREPARATION)
+    found = Remains.of(Baselines.of([as_pulses(traces_of(0.3, "legend200"))], PREPARATION))
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(0.3, abs=3 * found.fit.rate_error_khz)
     assert found.decay_us == pytest.approx(570, rel=0.05)
@@ -159,7 +160,7 @@ def test_energies_of_zero_are_left_out(busy: RawTraces, found: Remains):
     energy = raw.energy_kev.copy()
     energy[:5] = 0
     blocks = in_blocks(Pulses.of(raw.waveforms, dt_ns=16, energy_kev=energy))
-    again = Remains.of_traces(blocks, PREPARATION)
+    again = Remains.of(Baselines.of(blocks, PREPARATION))
     assert again.adc_per_kev == pytest.approx(found.adc_per_kev, rel=1e-3)
 
 
@@ -174,14 +175,14 @@ def test_energies_of_zero_are_left_out(busy: RawTraces, found: Remains):
 )
 def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: str):
     with pytest.raises(CpunetError, match=said) as caught:
-        Remains.of_traces([change(as_pulses(busy, slice(0, 400)))], PREPARATION)
+        Remains.of(Baselines.of([change(as_pulses(busy, slice(0, 400)))], PREPARATION))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.thorough
 def test_a_bench_detector_follows_the_law(reference_data: Path):
     source = open_pulses(reference_data / "real" / "th228.fcio", kev_per_adc=2614.5 / 40265)
-    found = Remains.of_traces(source.blocks(1000), PREPARATION)
+    found = Remains.of(Baselines.of(source.blocks(1000), PREPARATION))
     assert found.law is not None
     assert found.fit.recorded
     assert found.decay_us == pytest.approx(85, rel=0.04)

@@ -22,7 +22,6 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
-from cpunet.training.fit import Sides
 from cpunet.training.networks import outside_noise
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
@@ -196,10 +195,9 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     # networks with noise outside are prepared alike
     paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
     chosen = parse_selection("FEP", paper.peaks)
-    sim = load_pulses(files.sim, "simulated", paper, chosen).prepared.pulses
+    sim = load_pulses(files.sim, "simulated", paper, chosen)
     measured = load_pulses(data, "measured", paper, chosen)
-    sides = Sides(sim, measured.prepared.pulses, data, measured)
-    outside, entry = outside_noise(sides, paper)
+    outside, entry = outside_noise(sim, measured, paper)
     assert outside is not None
     assert outside.noise.remains is not None
     assert outside.noise.remains.law.rate_khz == told["rate_khz"]

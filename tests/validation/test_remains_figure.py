@@ -9,6 +9,7 @@ from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.readout import read_out
 from cpunet.electronics.remains import Remains
 from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
 from cpunet.validation.remains_figure import Slopes, remains_figure, sizes_figure
@@ -21,7 +22,7 @@ def test_slopes_without_remains_are_those_of_empty_baselines():
     steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(1500, 2614.5))
     traces = read_out(steps, read_electronics("ornl", {"earlier_pulses.rate_kHz": 2}), seed=2)
     raw = Pulses.of(traces.waveforms, dt_ns=16, energy_kev=traces.energy_kev)
-    remains = Remains.of_traces([raw], load_recipe("fast").preparation)
+    remains = Remains.of(Baselines.of([raw], load_recipe("fast").preparation))
     slopes = Slopes.of(raw, remains)
     after, noise = slopes.spreads
     assert after == pytest.approx(noise, rel=0.5)

@@ -84,6 +84,16 @@ def whole(run, files) -> Evaluation:
     return evaluated(run, files["sim"], files["data"])
 
 
+def test_each_side_is_read_once(files, reads):
+    once = {files["sim"].path: 1, files["data"].path: 1}
+    reads.clear()
+    run = train(files["sim"], files["data"], recipe=RECIPE, device="cpu")
+    assert reads == once
+    reads.clear()
+    evaluated(run, files["sim"], files["data"])
+    assert reads == once
+
+
 def test_peaks_sidebands_and_continua_are_loaded() -> None:
     selection = validation_selection(["SEP"], RECIPE)
     chosen = selection.select([KEV["SEP"], KEV["SEP"] + 7, KEV["SEP"] + 15, 2030.0, 1800.0])

@@ -1,19 +1,16 @@
-"""Length, level and tilt of baselines, and the tails of earlier pulses that they indicate."""
+"""Level and tilt of baselines, and the tails of earlier pulses that they indicate."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
-from cpunet.pulses.preparation import Prepared
-from cpunet.recipes.schema import PreparationConfig
+from cpunet.pulses.baselines import Baselines
 
 MIN_N = 30  # minimum number of baselines
-SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
-# Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
-START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
 SIGMA_PER_MAD = 1.4826
 MIN_LARGE = 20  # minimum number of large remainders to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
@@ -22,18 +19,63 @@ COUPLED = 2.5
 # Number of Gaussian standard deviations of the residual RMS beyond which a baseline holds
 # another pulse.
 DISTURBED = 6.0
+MIN_SAMPLES = 64  # minimum length of a baseline
 
 
-def samples_before_pulses(
-    prepared: Prepared, config: PreparationConfig
-) -> npt.NDArray[np.int64]:
-    """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
-    windows = prepared.pulses.waveforms[:, : config.samples_before]
-    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
-    above = windows >= level[:, np.newaxis]
-    # Start of the pulse proper: every sample from there to the alignment is above threshold.
-    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
-    return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)
+class UsableBaselines(NamedTuple):
+    """Baselines of one length, in ADC counts, and what is known of their traces."""
+
+    values: FloatArray
+    energy_kev: FloatArray
+    adc_per_kev: float
+    tail_decay_us: float
+    dt_ns: float
+
+
+def usable(baselines: Baselines) -> UsableBaselines:
+    """Baselines as tails of earlier pulses are measured from them.
+
+    Raises
+    ------
+    CpunetError
+        If too few traces can be prepared or have a known energy, the baselines are too short,
+        or the pulses do not decay.
+    """
+    prepared, length = baselines.prepared, baselines.length
+    if len(prepared) < MIN_N:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+        raise CpunetError(
+            f"only {len(prepared)} of {len(baselines)} traces can be prepared "
+            f"({reasons or 'there are no more'}); {MIN_N} or more are needed to tell remains "
+            "of earlier pulses"
+        )
+    if length < MIN_SAMPLES:
+        raise CpunetError(
+            f"the traces have {length} samples before the pulse; remains of earlier pulses "
+            f"need {MIN_SAMPLES} or more, so give traces with a longer baseline"
+        )
+    with np.errstate(divide="ignore"):  # an energy of 0 is left out
+        gains = baselines.height / prepared.pulses.energy_kev
+    gains = gains[np.isfinite(gains) & (gains > 0)]
+    if len(gains) < MIN_N:
+        raise CpunetError(
+            f"only {len(gains)} traces have a known energy and can be prepared; {MIN_N} or "
+            "more are needed to tell remains of earlier pulses in keV"
+        )
+    large = prepared.scale >= np.median(prepared.scale)
+    slope = float(np.median(prepared.tail_slope[large]))
+    if not slope < 0:
+        raise CpunetError(
+            "the tails of the traces do not decay, so nothing is known of earlier pulses; "
+            "are these measured traces?"
+        )
+    return UsableBaselines(
+        baselines.first.waveforms[:, :length].astype(float),
+        baselines.first.energy_kev,
+        float(np.median(gains)),
+        -1e3 / slope,
+        baselines.first.dt_ns,
+    )
 
 
 def tail_shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:

@@ -8,7 +8,7 @@ drawn with this probability. Raw traces have not passed any cuts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
@@ -192,7 +192,7 @@ class SameNoise:
 
 
 def passing(
-    remains: Remains, traces: Iterable[Pulses], config: PreparationConfig, cuts: CutWindows
+    remains: Remains, traces: Pulses, config: PreparationConfig, cuts: CutWindows
 ) -> tuple[float, ...] | None:
     """Probability that traces with remainders of `SIZES_KEV` pass the quality cuts.
 
@@ -201,7 +201,7 @@ def passing(
     remains
         Remainders of the channel.
     traces
-        Blocks of raw traces that have passed the cuts.
+        Raw traces that have passed the cuts.
     config, cuts
         Preparation settings and quality cuts.
 
@@ -210,15 +210,9 @@ def passing(
     tuple of float
         One probability per size, or None if too few traces have no remainder.
     """
-    templates: list[npt.NDArray[np.float32]] = []
-    for block in traces:
-        empty = remains.measure(block) < remains.error_kev
-        templates += list(block.waveforms[empty])
-        if len(templates) >= TEMPLATES:
-            break
-    if len(templates) < MIN_TEMPLATES:
+    raw = traces.waveforms[remains.measure(traces) < remains.error_kev][:TEMPLATES]
+    if len(raw) < MIN_TEMPLATES:
         return None
-    raw = np.stack(templates[:TEMPLATES])
     shape = tail_shape(raw.shape[1], remains.dt_ns, remains.decay_us)
     unit = (remains.adc_per_kev * shape).astype(np.float32)
     shares = []

@@ -10,6 +10,7 @@ import cpunet
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.files import Source, pulse_file
 from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
@@ -57,9 +58,8 @@ def subtract_tails(
     refuse_existing(Path(out), *file.files, force=force)
     source = file.open()
     try:
-        tails = Remains.of_traces(
-            source.blocks(_BLOCK), preparation or load_recipe("fast").preparation
-        )
+        config = preparation or load_recipe("fast").preparation
+        tails = Remains.of(Baselines.of(source.blocks(_BLOCK), config))
     except CpunetError as error:
         raise CpunetError(f"{file.path}: {error}") from error
     attrs = {MADE_BY: f"cpunet subtract_tails {cpunet.__version__}", SIDE: "measured"}

@@ -10,7 +10,7 @@ their baselines, a time :math:`h` apart, have a ratio of :math:`e^{h/\tau}`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,23 +18,23 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_tails import (
+    UsableBaselines,
     lifted,
     lower_spread,
     mode,
     own_decay_us,
     read_baselines,
     tail_shape,
+    usable,
     widest,
 )
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.remains_fit import RateFit, fit_rate
 from cpunet.electronics.remains_law import RemainsLaw
-from cpunet.electronics.remains_traces import Gathered, gathered
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.schema import PreparationConfig
 
-MOST = 16384  # traces used in the fit of the law
 LARGE = 12.0  # minimum height in errors of remainders used for the decay time
 # If a larger fraction of traces has remainders above the error, noise is measured only from
 # traces with remainders below 0, at the cost of half of the noise.
@@ -118,20 +118,13 @@ class Remains:
         return self.fit.law if sure and self.fit.gain_of_law > SURE_GAIN else None
 
     @classmethod
-    def of_traces(
-        cls,
-        blocks: Iterable[Pulses],
-        config: PreparationConfig,
-        decay_us: float | None = None,
-    ) -> Remains:
+    def of(cls, baselines: Baselines, decay_us: float | None = None) -> Remains:
         """Measure the remainders under raw traces and fit their law.
 
         Parameters
         ----------
-        blocks
-            Measured traces of one channel with their energies, from any mixture of peaks.
-        config
-            Preparation settings.
+        baselines
+            Baselines of measured traces of one channel, from any mixture of peaks.
         decay_us
             Decay time of the preamplifier in us, if known. Otherwise it is taken from large
             remainders or, if there are none, from the tails of the pulses.
@@ -142,19 +135,19 @@ class Remains:
             If the baselines are too short, the energies are unknown, or too few traces can
             be used.
         """
-        seen = gathered(blocks, config, MOST)
+        seen = usable(baselines)
         decay = decay_us or seen.tail_decay_us
         mean, left, quiet, broadest = _read(seen, decay)
         level = mode(mean[quiet])
         tilted = left > LARGE * lower_spread(left[quiet])
-        large = seen.baselines[quiet & tilted] - level
+        large = seen.values[quiet & tilted] - level
         coupled = lifted(large, left[quiet & tilted])
         own = own_decay_us(large, seen.dt_ns) if coupled else None
         error: float | None = None
         if own is not None and decay_us is None:
             decay, error = own
             mean, left, quiet, broadest = _read(seen, decay)
-        samples = seen.baselines.shape[1]
+        samples = seen.values.shape[1]
         height = tail_shape(samples, seen.dt_ns, decay).mean() * seen.adc_per_kev
         of_slope, of_level = left / seen.adc_per_kev, (mean - level) / height
         slope_error = lower_spread(of_slope[quiet])
@@ -254,10 +247,10 @@ def remains_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _read(
-    seen: Gathered, decay_us: float
+    seen: UsableBaselines, decay_us: float
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
     """Mean of each baseline, remainder, whether it holds no other pulse, and largest RMS."""
-    mean, left, width = read_baselines(seen.baselines, seen.dt_ns, decay_us)
+    mean, left, width = read_baselines(seen.values, seen.dt_ns, decay_us)
     broadest = widest(width)
     return mean, left, width <= broadest, broadest
 

@@ -67,6 +67,7 @@ def load_prepared(
     select: Select | None = None,
     peaks: PeakNames | None = None,
     most: int | None = None,
+    seen: Callable[[Pulses, Prepared], None] | None = None,
 ) -> Prepared:
     """Read, select, prepare and collect the pulses of a file.
 
@@ -84,6 +85,8 @@ def load_prepared(
     most
         Maximum number of accepted pulses to keep.  If there are more, a random sample of them
         is kept, always the same for the same file.  This bounds the memory.
+    seen
+        Function that is given each block of the file, and those of its pulses that can be used.
 
     Returns
     -------
@@ -101,6 +104,8 @@ def load_prepared(
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
             part = _prepare_selected(block, config, kind, select, peaks, n_read)
+            if seen is not None:
+                seen(block, part)
             n_read += len(block)
             n_kept += len(part)
             sets.append(part)

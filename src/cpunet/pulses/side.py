@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -67,14 +68,32 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
         If the file states that its pulses are of the other side, or if they appear to be
         and `insist` is False.
     """
+    if require_recorded_side(source, wanted, remedy) or insist:
+        return
+    first = next(iter(source.blocks(_LOOKED_AT)))
+    require_apparent_side(source.path, first.waveforms, wanted, remedy)
+
+
+def require_recorded_side(source: PulseSource, wanted: Kind, remedy: str) -> bool:
+    """Refuse pulses whose file states the other side; whether it states one at all."""
     found = recorded_side(source)
-    if found is None and not insist:
-        found = apparent_side(next(iter(source.blocks(_LOOKED_AT))).waveforms)
+    _require(found, source.path, wanted, remedy)
+    return found is not None
+
+
+def require_apparent_side(
+    path: Path, waveforms: npt.NDArray[np.floating], wanted: Kind, remedy: str
+) -> None:
+    """Refuse pulses that appear to be of the other side by the first ones of them."""
+    _require(apparent_side(waveforms[:_LOOKED_AT]), path, wanted, remedy)
+
+
+def _require(found: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
     if found is not None and found.side != wanted:
         begin = " If" if remedy.endswith("?") else "; if"
         sure = "" if found.certain else f"{begin} they are {wanted}, say so with `insist`"
         raise CpunetError(
-            f"{source.path}: given as {wanted} pulses, but these {found.why}", f"{remedy}{sure}"
+            f"{path}: given as {wanted} pulses, but these {found.why}", f"{remedy}{sure}"
         )
 
 

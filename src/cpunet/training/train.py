@@ -195,9 +195,7 @@ def _job(
     if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
         kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
         raise CpunetError(f"{init.name}: {kinds}; resample them")
-    return TrainingJob(
-        recipe, peak, seed, device, sim, data, pair[1], Path(folder), init, resume
-    )
+    return TrainingJob(recipe, peak, seed, device, sim, data, Path(folder), init, resume)
 
 
 def _trained(job: TrainingJob, out: Path | None) -> Run:

@@ -99,7 +99,6 @@ def evaluate(
     others = fit_baseline_methods(
         sim_set,
         data_set,
-        data,
         parse_selection(trained_on, recipe.peaks),
         recipe,
         remains=ren.remains,

@@ -22,15 +22,13 @@ from cpunet.electronics.baseline_methods.translating import translate_like_data
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, SameNoise, TraceNoise
 from cpunet.electronics.finishing import blocks, finish, finish_both
-from cpunet.electronics.measured_noise import noise_of_traces
-from cpunet.electronics.measured_remains import measured_remains
+from cpunet.electronics.measured import noise_of, remains_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import EnergySelection
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.learned_remains import wanted_remains
 from cpunet.translation.options import LEARNED
@@ -68,7 +66,6 @@ class FittedBaselineMethods:
 def fit_baseline_methods(
     sim: InputSet,
     data: InputSet,
-    data_file: PulseFile,
     fit_on: EnergySelection,
     recipe: Recipe,
     *,
@@ -81,8 +78,6 @@ def fit_baseline_methods(
     ----------
     sim, data
         All prepared pulses of both sides.
-    data_file
-        Measured file, for its baselines.
     fit_on
         Energies on which the methods are fitted: those of the training.
     recipe
@@ -101,10 +96,8 @@ def fit_baseline_methods(
     # all but the untranslated simulation, which is scored anyway
     kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
     there = remains is not None and remains.law.rate_khz > 0
-    found = measured_remains(data_file, config)[0] if there else None
-    noise = _or_reason(
-        result.missing, "noise", lambda: noise_of_traces(data_file, config, found)
-    )
+    found = remains_of(data)[0] if there else None
+    noise = _or_reason(result.missing, "noise", lambda: noise_of(data, found))
     if noise is not None:
         result.noise = TraceNoise(noise, remains) if there else noise
     fit_sim, fit_data = (

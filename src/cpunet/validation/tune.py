@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -29,13 +29,13 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, checked
 from cpunet.training.checkpoints import differences
 from cpunet.training.devices import resolve_device
-from cpunet.training.fit import Sides, match
+from cpunet.training.fit import match
 from cpunet.training.loop import train
 from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
@@ -120,7 +120,7 @@ def tune(
     measured = load_pulses(sides[1], "measured", recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
-    held_out = HeldOut.of(simulated, measured, sides[1], recipe, seed)
+    held_out = HeldOut.of(simulated, measured, recipe, seed)
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         study_name="cpunet",
@@ -282,7 +282,7 @@ class HeldOut:
 
     Parameters
     ----------
-    fit
+    fit_sim, fit_data
         Pulses for the training.
     sim, data
         Held-out pulses.
@@ -290,7 +290,8 @@ class HeldOut:
         Parameters of the held-out data, and the null distance of each.
     """
 
-    fit: Sides
+    fit_sim: InputSet
+    fit_data: InputSet
     sim: Pulses
     data: Pulses
     values: dict[str, Values]
@@ -298,9 +299,7 @@ class HeldOut:
     seed: int
 
     @classmethod
-    def of(
-        cls, sim: InputSet, data: InputSet, data_file: PulseFile, recipe: Recipe, seed: int
-    ) -> Self:
+    def of(cls, sim: InputSet, data: InputSet, recipe: Recipe, seed: int) -> Self:
         """Split both sides at random.
 
         Raises
@@ -315,8 +314,7 @@ class HeldOut:
         n_sim, n_data = len(held_sim), len(held_data)
         draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
         nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
-        fit = Sides(fit_sim, fit_data, data_file, data)
-        return cls(fit, held_sim, held_data, values, nulls, seed)
+        return cls(fit_sim, fit_data, held_sim, held_data, values, nulls, seed)
 
     def score(self, ren: REN) -> float:
         r"""Distance of translated held-out pulses from data; 1 for two samples of the data.
@@ -360,23 +358,25 @@ class HeldOut:
         """
         model: nn.Module
         if recipe.training.method == "matching":
-            found = match(self.fit, recipe, seed, lambda *_step: None)
+            found = match(self.fit_sim, self.fit_data, recipe, seed, lambda *_step: None)
             model, recipe = found.model, found.recipe
         else:
-            outside, _ = outside_noise(self.fit, recipe)
-            sides = (self.fit.sim.waveforms, self.fit.data.waveforms)
-            model = train(*sides, recipe, seed=seed, device=device, outside=outside)
+            sides = (self.fit_sim, self.fit_data)
+            outside, _ = outside_noise(*sides, recipe)
+            sim, data = (side.prepared.pulses.waveforms for side in sides)
+            model = train(sim, data, recipe, seed=seed, device=device, outside=outside)
         facts = {"dt_ns": self.sim.dt_ns, "peak": "", "seconds": 0.0}
         return REN.of(Run.of(model, recipe, seed=seed, device=device, **facts), device)
 
 
-def _split(side: InputSet, rng: np.random.Generator) -> tuple[Pulses, Pulses]:
+def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
     """The pulses of a side to fit, and those held out."""
-    pulses = side.prepared.pulses
-    rows, n = rng.permutation(len(pulses)), int(SHARE * len(pulses))
+    prepared = side.prepared
+    rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
     if n < MIN_N:
         raise CpunetError(
-            f"{side.path}: {len(pulses)} pulses, of which {n} would be held out, "
+            f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, "
             f"and {MIN_N} are needed; select more energies (`peak`) or give more"
         )
-    return pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]
+    rest = replace(side, prepared=prepared[np.sort(rows[n:])])
+    return rest, prepared.pulses[np.sort(rows[:n])]
