@@ -68,12 +68,6 @@ def test_uneven_times_are_refused(tmp_path):
         open_pulses(path)
 
 
-def test_one_number_a_line_is_one_pulse(tmp_path):
-    path = tmp_path / "pulse.dat"
-    np.savetxt(path, PULSE)
-    np.testing.assert_array_equal(open_pulses(path, dt_ns=1).read().waveforms, [PULSE])
-
-
 @pytest.mark.parametrize("delimiter", [" ", ",", ", "])
 def test_one_pulse_a_line(tmp_path, delimiter):
     path = tmp_path / "pulses.csv"
@@ -85,15 +79,6 @@ def test_one_pulse_a_line(tmp_path, delimiter):
     np.testing.assert_array_equal(source.read().waveforms, rows)
 
 
-def test_what_siggen_prints_is_one_pulse(tmp_path):
-    path = tmp_path / "printed.txt"
-    lines = [" ".join(f"{v:.3f}" for v in PULSE[i : i + 10]) for i in range(0, 50, 10)]
-    path.write_text("signal: \n" + "\n".join(lines) + "\n\n")
-    pulses = open_pulses(path, dt_ns=1).read()
-    assert pulses.waveforms.shape == (1, 50)
-    np.testing.assert_allclose(pulses.waveforms[0], PULSE, atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -101,10 +86,6 @@ def test_what_siggen_prints_is_one_pulse(tmp_path):
         ("# nothing\n\n", "holds no numbers"),
         ("1 2 3 4 5\n" * 4, "5 numbers are no pulse"),
         (" ".join("1" * 20) + "\n1 2\n", r"line 2: 2 numbers, before it 20"),
-        (
-            ("signal:\n" + " ".join("1" * 20) + "\n") * 2,
-            r"line 3: another pulse; give each a file",
-        ),
     ],
 )
 def test_other_text_is_refused(tmp_path, text, message):
