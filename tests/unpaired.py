@@ -11,7 +11,7 @@ from alignment import at_half_maximum
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.noise_traces import coloured_noise
+from cpunet.electronics.readout import coloured_noise
 from cpunet.networks.response_layer import Readout
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses

@@ -9,8 +9,8 @@ import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.finishing import finish, finish_both
-from cpunet.electronics.noise_traces import coloured_noise, noise_power
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.readout import coloured_noise, noise_power
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -87,16 +87,16 @@ def test_finished_pulses_have_the_noise_of_the_data(noise) -> None:
     records = shape(200, 1200).astype(np.float32)
     windows = finish(
         records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
-    )
+    ).windows
     raw = traces(200, seed=8)[:]
-    data = finish(raw.waveforms, CONFIG, dt_ns=DT_NS)[raw.energy_kev == 1592.5]
+    data = finish(raw.waveforms, CONFIG, dt_ns=DT_NS).windows[raw.energy_kev == 1592.5]
     assert np.isfinite(windows).all()
     assert np.median(windows[:, :200].std(axis=1)) == pytest.approx(
         np.median(data[:, :200].std(axis=1)), rel=0.05
     )
     again = finish(
         records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
-    )
+    ).windows
     np.testing.assert_array_equal(windows, again)
 
 
@@ -104,9 +104,8 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
     records = shape(600, 1200).astype(np.float32)
     records[3] = 0  # cannot be prepared
     given = {"dt_ns": DT_NS, "noise": noise, "energy_kev": np.full(600, 1592.5), "seed": 3}
-    clean, noisy = finish_both(records, CONFIG, **given)
-    np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS))
-    np.testing.assert_array_equal(noisy, finish(records, CONFIG, **given))
+    noisy, _, clean = finish(records, CONFIG, **given)
+    np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS).windows)
     assert np.isnan(noisy[3]).all()
 
 

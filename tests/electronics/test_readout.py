@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from cpunet.electronics.chain import Electronics, NoiseSpectrum, read_electronics
-from cpunet.electronics.noise_traces import (
+from cpunet.electronics.readout import (
+    RawTraces,
     coloured_noise,
     cut_noise,
+    draw_other_pulses,
     noise_power,
     read_baselines,
+    read_out,
 )
-from cpunet.electronics.other_pulses import draw_other_pulses
-from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.remains_law import RemainsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses

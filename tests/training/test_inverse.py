@@ -62,7 +62,7 @@ def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> Flo
     energy = None if kev is None else np.full(len(sim), kev)
     windows = finish(
         records, RECIPE.preparation, dt_ns=DT_NS, noise=noise, energy_kev=energy, seed=5
-    )
+    ).windows
     assert np.isfinite(windows).all()
     return windows
 

@@ -11,7 +11,7 @@ import torch
 from alignment import crossing
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.extension import PADDING_BEFORE, with_room
+from cpunet.electronics.finishing import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes import load_recipe

@@ -21,7 +21,7 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import SIZES_KEV
-from cpunet.electronics.extension import extended
+from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator

@@ -53,7 +53,7 @@ def convolved(windows, square=0.0):
     current = np.diff(np.pad(windows, ((0, 0), (401, 400)), mode="edge"), axis=1)
     records = fftconvolve(current, kernel()[np.newaxis], axes=1)[:, 40 : 40 + 1200]
     records = records + square * records**2
-    return finish(records.astype(np.float32), CONFIG, dt_ns=16.0)
+    return finish(records.astype(np.float32), CONFIG, dt_ns=16.0).windows
 
 
 def test_a_convolution_is_linear_wherever_its_maximum_is():

@@ -9,7 +9,7 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, passing
-from cpunet.electronics.extension import PADDING_BEFORE
+from cpunet.electronics.finishing import PADDING_BEFORE
 from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines

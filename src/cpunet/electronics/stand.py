@@ -15,7 +15,6 @@ import numpy.typing as npt
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import respond
-from cpunet.electronics.growing_archive import GrowingArchive
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
 from cpunet.electronics.stand_plan import LABELS, OTHER, Labels, Side, StandPlan
 from cpunet.errors import CpunetError
@@ -242,17 +241,26 @@ def _write_sim(
     labels: list[Labels] = []
     electronics, side = plan.electronics, plan.sim
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
-    writer = PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated"))
-    with GrowingArchive(folder / "truth.npz", "response", electronics.length) as truth:
-        with writer:
-            for fine, label, hits in side.blocks("Simulated events", library):
-                writer.append(_block_means(fine, per_sample))
-                writer.append_rows(HIT_TABLE, hit_columns(hits))
-                truth.append(respond(fine, electronics))
-                labels.append(label)
-            writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
-        label = np.concatenate(labels)
-        truth.close(label=label, n_pre=np.array(electronics.n_pre))
+    # the truth grows in a file of its own: it may be larger than memory
+    rows = folder / "truth.rows"
+    with (
+        rows.open("wb") as truth,
+        PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated")) as writer,
+    ):
+        for fine, label, hits in side.blocks("Simulated events", library):
+            writer.append(_block_means(fine, per_sample))
+            writer.append_rows(HIT_TABLE, hit_columns(hits))
+            truth.write(respond(fine, electronics).astype(np.float32).tobytes())
+            labels.append(label)
+        writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
+    label = np.concatenate(labels)
+    np.savez(
+        folder / "truth.npz",
+        response=np.memmap(rows, np.float32, "r", shape=(len(label), electronics.length)),
+        label=label,
+        n_pre=np.array(electronics.n_pre),
+    )
+    rows.unlink()
     stand.n_sim = len(label)
     stand.sim_lines = _by_line(label)
 

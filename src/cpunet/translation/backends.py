@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
-from cpunet.electronics.finishing import finish_with_codes
+from cpunet.electronics.finishing import PADDING_BEFORE, extended, finish, with_room
 from cpunet.electronics.second_pulses import SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import KeptNoise
@@ -237,7 +236,7 @@ class NoisyNetworkBackend(NetworkBackend):
             before = PADDING_BEFORE + self.config.samples_before
             shapes = extended(clean[second.partner], self.config, dt_ns, length, before)
             added += second.added(shapes, energy_kev, dt_ns, records.shape[1])
-        return finish_with_codes(
+        return finish(
             records,
             self.config,
             dt_ns=dt_ns,
@@ -245,7 +244,7 @@ class NoisyNetworkBackend(NetworkBackend):
             energy_kev=energy_kev,
             seed=seed,
             added=added,
-        )
+        )[:2]
 
 
 class ResponseBackend(Backend):
@@ -284,7 +283,7 @@ class ResponseBackend(Backend):
             added = _left(self.remains, records, energy_kev, drawn.remains_kev)
             if second is not None and len(second.row):
                 added += self._second(windows, energy_kev, second, records.shape[1])
-        return finish_with_codes(
+        return finish(
             records,
             self.config,
             dt_ns=float(self.chain.response.dt_ns),
@@ -292,7 +291,7 @@ class ResponseBackend(Backend):
             energy_kev=energy_kev if drawn.noise else None,
             seed=seed,
             added=added,
-        )
+        )[:2]
 
     def graph(self, length: int) -> Graph:
         """The chain as a matrix."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 
 from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.extension import extended
+from cpunet.electronics.finishing import extended
 from cpunet.electronics.second_pulses import DrawnPileUp, SecondPulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses

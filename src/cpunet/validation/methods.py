@@ -16,12 +16,14 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_methods.base import BaselineMethod
-from cpunet.electronics.baseline_methods.registry import BASELINE_METHODS
-from cpunet.electronics.baseline_methods.translating import translate_like_data
+from cpunet.electronics.baseline_methods import (
+    BASELINE_METHODS,
+    BaselineMethod,
+    translate_like_data,
+)
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_remains import DrawnRemains, SameNoise, TraceNoise
-from cpunet.electronics.finishing import blocks, finish, finish_both
+from cpunet.electronics.finishing import blocks, finish
 from cpunet.electronics.measured import noise_of, remains_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
@@ -226,9 +228,17 @@ def translate_all(
                     if name == "truth"
                     else rivals.methods[name].translate(block.waveforms)
                 )
-                clean[name], drawn = _finished(records, block, noise, recipe, rngs[name])
-                if drawn is not None:
-                    noisy[name][rows] = drawn
+                finished = finish(
+                    records,
+                    recipe.preparation,
+                    dt_ns=block.dt_ns,
+                    noise=noise,
+                    energy_kev=block.energy_kev,
+                    seed=rngs[name],
+                )
+                clean[name] = finished.clean
+                if noise is not None:
+                    noisy[name][rows] = finished.windows
             clean["ren"] = ren.apply(block.waveforms, noise=False)
             noisy["ren"][rows] = ren.apply(
                 block.waveforms,
@@ -244,26 +254,6 @@ def translate_all(
     whole = {name: _whole(windows) for name, windows in noisy.items()}
     joined = {name: _joined(found) for name, found in parts.items()}
     return Translations(ren, rivals, pulses, noisy, whole, joined, truth)
-
-
-def _finished(
-    records: FloatArray,
-    pulses: Pulses,
-    noise: SameNoise | None,
-    recipe: Recipe,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Windows without noise, and with noise if it is known."""
-    if noise is None:
-        return finish(records, recipe.preparation, dt_ns=pulses.dt_ns), None
-    return finish_both(
-        records,
-        recipe.preparation,
-        dt_ns=pulses.dt_ns,
-        noise=noise,
-        energy_kev=pulses.energy_kev,
-        seed=rng,
-    )
 
 
 def _numbers(

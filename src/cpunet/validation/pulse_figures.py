@@ -14,7 +14,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
+from cpunet.electronics.window_response import fitted_tail_slope, without_decay
 from cpunet.errors import CpunetError
 from cpunet.plotting import DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.pulses.container import FloatArray
