@@ -17,7 +17,7 @@ from torch import nn
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
 from cpunet.cli import main
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.trace_properties import _last_below, trace_properties, traces_in_words
+from cpunet.pulses.description import _last_below, trace_properties, traces_in_words
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector

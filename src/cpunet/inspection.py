@@ -307,7 +307,7 @@ def _pulses(file: PulseFile, recipe: Recipe) -> InfoResult:
 
 def _is_measured(source: PulseSource) -> bool:
     """Whether they are raw traces, by what the file records or by the shape of the pulses."""
-    from cpunet.pulses.side import apparent_side, recorded_side
+    from cpunet.pulses.provenance import apparent_side, recorded_side
 
     found = recorded_side(source)
     if found is None:
@@ -323,7 +323,7 @@ def _traces(
     """Properties of measured traces, and the tails of earlier pulses under them."""
     from cpunet.electronics.remains import Remains, remains_in_words
     from cpunet.pulses.baselines import Baselines
-    from cpunet.pulses.trace_properties import BLOCK, trace_properties, traces_in_words
+    from cpunet.pulses.description import BLOCK, trace_properties, traces_in_words
 
     told: dict[str, Any] = {}
     try:

@@ -11,8 +11,8 @@ from cpunet.electronics.remains import Remains
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import Source, pulse_file
-from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PreparationConfig
 

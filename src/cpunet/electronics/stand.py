@@ -20,8 +20,8 @@ from cpunet.electronics.stand_plan import LABELS, OTHER, Labels, Side, StandPlan
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, read_settings, require_seed

@@ -19,11 +19,15 @@ from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.doubts import apart, go_down, second_rate
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
+from cpunet.pulses.provenance import (
+    recorded_detector,
+    require_apparent_side,
+    require_recorded_side,
+)
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
-from cpunet.pulses.side import recorded_detector, require_apparent_side, require_recorded_side
 from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import PreparationConfig, Recipe
 

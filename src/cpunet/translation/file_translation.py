@@ -16,10 +16,10 @@ from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
-from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run

@@ -12,8 +12,8 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.pulses.provenance import TRANSLATION
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.side import TRANSLATION
 from cpunet.training.run import Run
 
 Record = dict[str, Any]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.columns import MemoryColumn
+from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
