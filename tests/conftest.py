@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import gc
-import importlib.util
 import os
 import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -25,16 +23,6 @@ settings.register_profile("full", deadline=None, max_examples=200)  # see `make 
 settings.load_profile("cpunet")
 
 BEGUN = time.monotonic()
-
-
-def beside(name: str) -> ModuleType:
-    """A module of this folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def pytest_configure() -> None:
@@ -60,12 +48,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     minutes = float(os.environ.get("CPUNET_SLOW_MINUTES", "inf"))
     if item.get_closest_marker("slow") and time.monotonic() - BEGUN > 60 * minutes:
         pytest.skip(f"the {minutes:g} minutes for slow tests are over")
-
-
-@pytest.fixture(scope="session")
-def held() -> ModuleType:
-    """The program whose trainings wait for a signal, see there."""
-    return beside("held")
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tracemalloc
 from pathlib import Path
 
 import h5py
@@ -17,7 +16,7 @@ from torch import nn
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
 from cpunet.cli import main
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.description import _last_below, trace_properties, traces_in_words
+from cpunet.pulses.description import trace_properties
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
@@ -63,29 +62,6 @@ def test_a_file_is_opened(tmp_path):
     (tmp_path / "text").write_text("no pulses")
     with pytest.raises(CpunetError, match="text"):
         load(tmp_path / "text")
-
-
-def test_nothing_known_is_none(tmp_path):
-    np.save(tmp_path / "pulses.npy", np.full((2, 20), np.nan))
-    told = info(tmp_path / "pulses.npy", read=DT).values
-    assert (told["energy_kev"], told["samples"], told["peaks"]) == (
-        None,
-        None,
-        dict.fromkeys(RECIPE.peaks, 0),
-    )
-    assert (told["n_not_finite"], told["n_constant"]) == (2, 0)
-    json.dumps(told)
-
-
-def test_memory_does_not_grow_with_the_file(tmp_path):
-    block = Pulses.of(np.zeros((4096, 100)), dt_ns=16)  # 1.6 MB as float32
-    write_pulses(tmp_path / "pulses.lh5", (block for _ in range(12)))
-    tracemalloc.start()
-    try:
-        assert info(tmp_path / "pulses.lh5").values["n_pulses"] == 12 * 4096
-        assert tracemalloc.get_traced_memory()[1] < 10e6
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.mark.thorough
@@ -184,13 +160,6 @@ def test_amplitudes_suggest_a_calibration(tmp_path):
     assert info(file, read=DT).values["amplitudes"] == "no lines that stand out"
 
 
-def test_the_measured_spectrum_suggests_its_calibration(reference_data):
-    told = info(reference_data / "real" / "th228.fcio").values
-    assert "Th-228" in told["amplitudes"]
-    # as found from its lines by hand
-    assert float(told["amplitudes"].split()[-1]) == pytest.approx(0.06493, rel=0.01)
-
-
 def test_files_of_hits_are_described(tmp_path):
     path = tmp_path / "hits.npz"
     place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
@@ -244,11 +213,6 @@ def test_the_properties_are_those_that_were_made():
     assert told["saturated_percent"] == pytest.approx(5)
     with pytest.raises(CpunetError, match="only 0 of 60 traces hold a pulse"):
         trace_properties([Pulses.of(np.ones((n, 200)), dt_ns=16)], RECIPE)
-
-
-def test_a_pulse_that_is_never_below_a_level():
-    pulses = np.array([[0, 1, 3, 2], [2, 2, 3, 2]], np.float32)
-    assert _last_below(pulses, np.array([2, 2]), np.array([1.5, 1.5])).tolist() == [2, 0]
 
 
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
@@ -312,21 +276,6 @@ def test_traces_that_are_no_numbers(tmp_path):
         info(tmp_path / "pulses.npy", read=DT, out=tmp_path / "e.png")
 
 
-def test_shares_are_percent_whatever_their_time(tmp_path):
-    fit = {"parameters": {"slow_12.5_ns": 0.02, "decay_2.9_us": 0.05, "decay_us": 50.0}}
-    write_run(tmp_path, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
-    lines = dict(info(tmp_path).lines)
-    assert lines["response"] == "slow 12.5 ns 2 %, decay 2.9 µs 5 %, decay 50 µs"
-
-
-def test_all_of_the_traces_are_saturated():
-    traces = {"trigger_sample": [1, 1, 1], "noise_adc": 1.0, "baseline_samples": 1}
-    traces |= {"saturated_percent": 100.0, "pile_up_percent": 0.25, "rejected": {}}
-    lines = dict(traces_in_words(traces | {"looked_at": 9}))
-    assert lines["saturated"] == "100 %"
-    assert lines["pile-up"].startswith("0.25 % ")
-
-
 def test_a_figure_replaces_nothing_unasked(tmp_path):
     path, out = tmp_path / "pulses.npy", tmp_path / "pulses.png"
     np.save(path, np.tile(np.arange(300.0), (3, 1)))
@@ -337,13 +286,6 @@ def test_a_figure_replaces_nothing_unasked(tmp_path):
     info(path, read=DT, out=out)
     with pytest.raises(CpunetError, match="exists already"):
         info(path, read=DT, out=out)
-
-
-def test_a_run_has_no_spectrum(tmp_path):
-    (tmp_path / "run").mkdir()
-    write_run(tmp_path / "run", nn.ModuleDict(), RECIPE, INFO)
-    with pytest.raises(CpunetError, match="no spectrum to draw"):
-        info(tmp_path / "run", out=tmp_path / "run.png")
 
 
 def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):

@@ -130,25 +130,6 @@ def test_a_calibration_that_is_off(sides, check):
     assert "would put it right" not in check(sim, right).out
 
 
-def test_swapped_sides(sides, check):
-    sim, data = sides.write_sim(), sides.write_data()
-    done = check(data, sim)
-    assert done.code == 1
-    assert "are --sim and --data swapped?" in first(done)
-    assert check(sim, data).code == 0
-
-
-def test_another_period(sides, check):
-    sim = sides.write_sim()
-    other = sides.write_data("other", dt_ns=10.0)
-    done = check(sim, other)
-    told = first(done)
-    assert "sampled every 16 ns" in told
-    assert "every 10 ns" in told
-    assert "resample" in told
-    assert "ok" not in done.out  # nor that the sampling is fine
-
-
 def test_another_detector(sides, check):
     slow = np.apply_along_axis(
         lambda row: np.interp(np.arange(450) / 2, np.arange(225), row), 1, sides.sim
@@ -178,21 +159,6 @@ def test_too_few_pulses(sides, check, n):
     assert "more files, or more energies" in told
 
 
-def test_saturated_traces(sides, check):
-    traces = sides.traces
-    top = np.quantile(traces.max(axis=1), 0.5)
-    done = check(sides.write_sim(), sides.write_data(traces=np.minimum(traces, int(top))))
-    told = next(line for line in done.out.splitlines() if "saturated" in line)
-    assert "choose lower energies" in told
-
-
-def test_windowed_traces(sides, check):
-    windowed = sides.traces[:, 480:640]
-    told = first(check(sides.write_sim(), sides.write_data(traces=windowed)))
-    assert "window_outside_record" in told
-    assert "give longer records or allow more" in told
-
-
 def test_remains_of_earlier_pulses(sides, check):
     traces = sides.traces.astype(float)
     late = np.exp(-np.arange(traces.shape[1]) / 3400)
@@ -201,16 +167,6 @@ def test_remains_of_earlier_pulses(sides, check):
     traces += size[:, None] * late
     done = check(sides.write_sim(), sides.write_data(traces=np.uint16(traces.round())))
     assert "remains of earlier pulses" in done.out
-
-
-@pytest.mark.thorough
-def test_training_tells_of_findings(sides, stand, tiny, command):
-    few = sides.write_data(traces=sides.traces[:50], kev=sides.kev[:50])
-    words = ["train", "--sim", sides.write_sim(), "--data", few, *tiny]
-    done = command(*words, "--out", sides.folder / "run")
-    assert done.code == 0
-    assert "measured pulses of 50 can be used; 1000 or more are better" in done.err
-    assert done.err.splitlines()[-1].startswith("next: cpunet validate ")
 
 
 class SeenError(Exception):

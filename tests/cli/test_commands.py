@@ -16,11 +16,8 @@ from matplotlib.figure import Figure
 
 from cpunet.cli import main
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.outputs import mark
-from cpunet.training.run import RUN
 from cpunet.validation import drawings
 from cpunet.validation import report as reports
-from cpunet.validation.report import REPORT
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 
@@ -57,18 +54,6 @@ def test_the_run_folder(trained, stand):
     lines = (trained / "losses.jsonl").read_text().splitlines()
     records = [json.loads(line) for line in lines]
     assert [record["iteration"] for record in records] == [0, 1, 2, 3]
-
-
-@pytest.mark.thorough
-def test_the_same_seed_gives_the_same_weights(command, trained, stand, tiny, tmp_path):
-    outcomes = [
-        command("train", *stand.inputs, "--out", tmp_path / seed, "--seed", seed, *tiny)
-        for seed in ("3", "4")
-    ]
-    assert [outcome.code for outcome in outcomes] == [0, 0]
-    weights = [(f / "weights.safetensors").read_bytes() for f in (tmp_path / "3", trained)]
-    assert weights[0] == weights[1]
-    assert weights[0] != (tmp_path / "4" / "weights.safetensors").read_bytes()
 
 
 def translated(path: Path, table: str) -> dict[str, np.ndarray]:
@@ -213,26 +198,6 @@ def test_the_report_is_complete(report):
     assert str(folder / "report.html") in printed
 
 
-def test_a_peak_without_pulses_is_told_and_the_others_are_scored(
-    command, trained, stand, tmp_path, undrawn
-):
-    below = stand.data_kev < 2200
-    data = stand.write(
-        tmp_path / "data.lh5", "geds/raw", stand.data_waveforms[below], stand.data_kev[below]
-    )
-    words = ("--sim", stand.sim, "--data", data, "--out", tmp_path / "report")
-    outcome = command("validate", trained, *words)
-    assert outcome.code == 0
-    metrics = json.loads((tmp_path / "report" / "metrics.json").read_text())
-    assert metrics["peaks"]["FEP"]["missing"].startswith("no measured pulses")
-    assert metrics["peaks"]["FEP"]["parameters"] == {}
-    assert set(metrics["peaks"]["SEP"]["parameters"]) == PARAMETERS
-    assert "paired" not in metrics["peaks"]["SEP"]
-    assert "no measured pulses" in outcome.out
-    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
-    assert "Not scored: no measured pulses" in page
-
-
 def test_info_of_files_and_runs(command, stand, trained):
     told = command("info", stand.data)
     assert told.code == 0
@@ -246,37 +211,3 @@ def test_info_of_files_and_runs(command, stand, trained):
     assert lines["trained"].startswith("recipe paper on FEP, seed 3; ")
     assert "pulses used" in lines["simulated"] and "pulses used" in lines["measured"]  # noqa: PT018
     assert len(told.out.splitlines()) < 20
-
-
-@pytest.mark.parametrize("what", ["train", "translate", "validate"])
-def test_existing_output_is_refused_and_with_force_replaced(
-    command, trained, stand, tiny, tmp_path, undrawn, what
-):
-    out = tmp_path / ("out.lh5" if what == "translate" else "out")
-    words = {
-        "train": ["train", *stand.inputs, "--out", out, *tiny],
-        "translate": ["translate", trained, stand.sim, "--out", out],
-        "validate": ["validate", trained, *stand.inputs, "--out", out],
-    }[what]
-    kind = {"train": RUN, "validate": REPORT}.get(what)
-    if kind is None:
-        out.write_text("old")
-    else:
-        out.mkdir()
-        (out / "old").touch()
-        mark(out, kind)
-    refused = command(*words)
-    assert refused.code == 2
-    expected = f"error: {out}: exists already; choose another name or give --force"
-    assert refused.err.splitlines() == [expected]
-    if kind is None:
-        assert out.read_text() == "old"
-    else:
-        assert "old" in listing(out)
-    assert command(*words, "--force").code == 0
-    assert listing(tmp_path) == [out.name]
-    if kind is None:
-        assert len(translated(out, "geds/ren")["values"]) == len(stand.sim_kev)
-    else:
-        assert kind.known_by in listing(out)
-        assert "old" not in listing(out)

@@ -13,12 +13,6 @@ import pytest
 from cpunet.cli import COMMANDS
 
 
-def test_no_command_at_all(command):
-    outcome = command()
-    assert outcome.code == 2
-    assert "Usage" in outcome.out + outcome.err
-
-
 def test_help(command):
     outcome = command("--help")
     assert outcome.code == 0

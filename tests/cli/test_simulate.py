@@ -123,16 +123,6 @@ def test_wrong_words_are_one_line(command, tmp_path: Path, words: list[str], sai
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("option", "key"), [("--dt-ns", "dt_ns"), ("--length-ns", "length_ns")]
-)
-def test_zero_is_not_the_default_of_a_library(command, tmp_path: Path, option: str, key: str):
-    outcome = command("library", "make", *PPC, option, "0", "--out", tmp_path / "psl.lh5")
-    assert outcome.code == 2
-    assert f"settings: {key}: " in outcome.err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_units_and_windows_of_a_file(command, tmp_path: Path):
     path = tmp_path / "hits.csv"
     columns = "".join(f"#column double {c}\n" for c in ("Event", "X", "Y", "Z", "Edep"))
@@ -144,12 +134,3 @@ def test_units_and_windows_of_a_file(command, tmp_path: Path):
     outcome = command("simulate", *words, *units)
     assert "1 of 2 events written (1 800-1200 by" in outcome.out
     assert "check --origin, --flip-z and --hits-detector" in outcome.err
-
-
-def test_output_is_replaced_only_when_told(command, hits: Path, tmp_path: Path):
-    out = tmp_path / "sim.lh5"
-    out.write_text("mine")
-    words = ["simulate", *PPC, "--hits", hits, "--out", out]
-    assert "exists already" in command(*words).err
-    assert out.read_text() == "mine"
-    assert command(*words, "--force").code == 0

@@ -99,33 +99,6 @@ def test_no_ringing_is_invented_for_a_fast_decay(command, tmp_path: Path):
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
 
 
-@pytest.mark.thorough
-def test_it_is_replaced_with_force_only(command, made: Path):
-    words = ("stand", "--preset", "ornl", "--events", "DEP=5", "--out", made)
-    assert "exists already" in command(*words).err
-    assert command(*words, "--force").code == 0
-    assert not list(made.glob("*.rows"))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--preset", "ornl", "--events", "FEP=0"), "--events FEP=0: give at least 1 event"),
-        (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
-        (("--preset", "orln"), "legend200, ornl, ringing"),
-        (("--preset", "ornl", "--shift", "bias=1"), "bias: no such setting"),
-        (("--preset", "ornl", "--shift", "defualt"), "neither a file nor one of default"),
-        (("--preset", "ornl", "--set", "hole_trapping_per_us=-1"), "hole_trapping_per_us"),
-    ],
-)
-def test_bad_input_is_one_line(command, tmp_path: Path, words: tuple[str, ...], said: str):
-    done = command("stand", *words, "--out", tmp_path / "stand")
-    assert done.code == 2
-    assert said in done.err
-    assert done.err.count("\n") == 1
-    assert not any(tmp_path.iterdir())
-
-
 def test_shift_detector_and_settings_are_told(command, tmp_path: Path):
     (tmp_path / "shift.yaml").write_text("temperature_K: 1\nhole_velocity_low_factor: 0.97\n")
     (tmp_path / "settings.yaml").write_text("cloud_fwhm_mm: 0.2\n")

@@ -83,10 +83,3 @@ def test_adc_counts(command, trained, stand, sources, tmp_path, monkeypatch):
     refused = command("translate", trained, sources / "sim_0.lh5", "--out", "x", *length)
     assert refused.code == 2
     assert "add --adc" in refused.err
-
-
-@pytest.mark.parametrize("words", [("--jobs", 0), ("--adc-per-kev", "V"), ("--length", 0)])
-def test_words_that_are_none(command, trained, sources, tmp_path, words):
-    first = ("translate", trained, sources / "sim_0.lh5", "--out", tmp_path / "out")
-    assert command(*first, *words).code == 2
-    assert names(tmp_path) == ["in"]

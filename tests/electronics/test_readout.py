@@ -62,13 +62,6 @@ def test_noise_has_the_spectrum_asked_for():
     assert np.abs(ratio - 1).max() < 0.05
 
 
-def test_legend200_noise_falls_as_measured():
-    spectrum = read_electronics("legend200").noise.spectrum
-    frequency, power = np.fft.rfftfreq(8192, 0.016), noise_power(spectrum, 16, 8192)
-    flat = power[(frequency > 0.5) & (frequency < 2)].mean()
-    assert 20 < flat / power[(frequency > 25) & (frequency < 30)].mean() < 40
-
-
 def test_noise_cut_from_baselines_is_theirs(tmp_path):
     path = tmp_path / "baselines.lh5"
     white = 14000 + np.random.default_rng(4).normal(0, 7, (50, 2000))
@@ -99,15 +92,6 @@ def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
     expected = traces.baseline_adc[:, None] + height * traces.response
     assert np.abs(traces.waveforms - expected).max() <= 0.51
     assert not traces.flags.any()
-
-
-def test_noisy_traces_scatter_about_theirs_by_the_noise(traces: RawTraces):
-    chain = read_electronics("ornl")
-    height = chain.gain_adc_per_kev * traces.true_energy_kev[:, None]
-    rest = traces.waveforms - traces.baseline_adc[:, None] - height * traces.response
-    clean = rest[traces.flags == 0] / chain.gain_adc_per_kev
-    assert clean.std() == pytest.approx(chain.noise.rms_kev, rel=0.05)
-    assert np.abs(rest[(traces.flags & 3) > 0]).max() > 20 * chain.gain_adc_per_kev
 
 
 def test_shares_of_disturbed_traces(traces: RawTraces):
@@ -193,11 +177,6 @@ def test_wandering_is_recovered_from_levels_and_their_changes():
     plain = read_out(steps, quiet, seed=2)
     assert np.array_equal(plain.energy_kev, traces.energy_kev)
     assert np.array_equal(plain.response, traces.response)
-
-
-def test_quantiles_of_energies_that_fall_are_refused():
-    with pytest.raises(CpunetError, match="must not fall"):
-        changed("ornl", other_pulses_kev=[100, 50])
 
 
 def test_saturation_is_flagged_and_clipped(pulses: Pulses):

@@ -117,11 +117,6 @@ def test_remains_are_taken_off(busy: RawTraces, found: Remains):
     assert slopes[0][alone].std() > 10 * spread
 
 
-def test_other_traces_are_measured_alike(busy: RawTraces, found: Remains):
-    again = found.measure(as_pulses(busy, slice(500, 700)))
-    assert again == pytest.approx(found.kev[500:700], nan_ok=True, abs=1e-3)
-
-
 def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     """Behind a capacitor levels say nothing: here each trace has lost its own."""
     raw = as_pulses(busy)
@@ -153,15 +148,6 @@ def test_slow_decays_are_told_by_their_levels():
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(0.3, abs=3 * found.fit.rate_error_khz)
     assert found.decay_us == pytest.approx(570, rel=0.05)
-
-
-def test_energies_of_zero_are_left_out(busy: RawTraces, found: Remains):
-    raw = as_pulses(busy)
-    energy = raw.energy_kev.copy()
-    energy[:5] = 0
-    blocks = in_blocks(Pulses.of(raw.waveforms, dt_ns=16, energy_kev=energy))
-    again = Remains.of(Baselines.of(blocks, PREPARATION))
-    assert again.adc_per_kev == pytest.approx(found.adc_per_kev, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.pulses import _current_kernels, parameters
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import (
     PARAMETERS,
@@ -81,51 +80,11 @@ def test_current_amplitude_equals_the_production_chain(noise):
     assert np.abs(current_amplitude(waveforms) - expected).max() < 1e-6
 
 
-@pytest.mark.parametrize("length", [6, 50, 97, 98, 150])
-def test_current_amplitude_of_short_records_equals_the_production_chain(length):
-    waveforms = multi_site(50, 0.01, seed=2)[:, 300 : 300 + length]
-    assert current_amplitude(waveforms) == pytest.approx(production_chain(waveforms), abs=1e-6)
-
-
-@pytest.mark.parametrize("n", [1, 40])
-def test_averages_of_several_pulses_are_those_of_dspeed_to_the_last_bit(n):
-    from dspeed.processors import avg_current, moving_window_multi, upsampler
-
-    waveforms = multi_site(n, 0.01, seed=4)
-    waveforms[0, 120] = np.nan
-    expected = np.empty((n, waveforms.shape[1] - 1), np.float32)
-    avg_current(waveforms, 1, expected)
-    fine = np.empty((n, (expected.shape[1] - 1) * 16), np.float32)
-    upsampler(expected, 16, fine)
-    smooth = np.empty_like(fine)
-    moving_window_multi(fine, 48, 3, 0, smooth)
-    current, steepest = _current_kernels.currents(waveforms)
-    np.testing.assert_array_equal(current, expected)
-    np.testing.assert_array_equal(steepest[1:], expected.argmax(axis=1)[1:])
-    found = _current_kernels.averaged_maxima(
-        current,
-        np.zeros(n, np.int64),
-        current.shape[1],
-        upsampling=16,
-        steps=48,
-        averages=3,
-        ends=5,
-    )
-    np.testing.assert_array_equal(found, smooth[:, 5:-5].max(axis=1))
-
-
 def test_current_amplitude_finds_a_maximum_far_from_the_steepest_sample():
     # a lone spike of one sample is averaged away, a broad ramp elsewhere is not
     pulse = np.clip((TIME - 600) / 20, 0, 1)
     pulse[100] += 0.08
     assert current_amplitude(pulse[np.newaxis].astype(np.float32)) == pytest.approx(0.05, 1e-4)
-
-
-def test_current_amplitude_does_not_depend_on_blocks(monkeypatch):
-    waveforms = multi_site(20, 1e-3, seed=3)
-    whole = current_amplitude(waveforms)
-    monkeypatch.setattr(parameters, "BLOCK", 3)
-    np.testing.assert_array_equal(current_amplitude(waveforms), whole)
 
 
 @given(
@@ -143,22 +102,6 @@ def test_drift_time_of_a_ramp(start, samples, height, fraction):
     expected = (first_top - (start + fraction * samples)) * DT_NS
     # the ramp's corner lies between samples, where straight lines miss it a little
     assert measured == pytest.approx(expected, abs=0.5 * DT_NS)
-
-
-def test_drift_time_is_interpolated_between_samples():
-    crossings = np.linspace(200, 201, 11)[:, np.newaxis]
-    ramps = np.clip((TIME - crossings) / 100, 0, 1)
-    ramps[:, 400:] = 1.5  # so that every pulse has the same first maximum
-    measured = drift_time(ramps.astype(np.float32), DT_NS, 0.2)
-    assert measured == pytest.approx((400 - crossings[:, 0] - 30) * DT_NS, abs=1e-2)
-
-
-@given(tau_us=st.floats(10, 1000), height=st.floats(0.1, 1e4))
-@settings(max_examples=50, deadline=None)
-def test_tail_slope_gives_the_decay_constant(tau_us, height):
-    decay = height * np.exp(-TIME * DT_NS * 1e-3 / tau_us)
-    slope = tail_slope(decay[np.newaxis].astype(np.float32), DT_NS, 300)
-    assert slope == pytest.approx(-1e3 / tau_us, rel=1e-4)
 
 
 def test_tail_slope_equals_a_polynomial_fit():
@@ -268,19 +211,6 @@ def test_current_width_is_that_of_dspeeds_own_chain(noise):
         assert width == pytest.approx((end - begin) * DT_NS / 16, abs=0.05)
 
 
-@pytest.mark.parametrize("sigma", [3.0, 6.0, 12.0, 25.0])
-@pytest.mark.parametrize("offset", [0.0, 0.3])
-def test_current_of_a_gaussian(sigma, offset):
-    found = parameters_of(ndtr((TIME - 300 - offset) / sigma))
-    # variances add: differences and steps of one sample, and three averages over three
-    width = np.sqrt(sigma**2 + (1 + 1 + 3 * 9) / 12)
-    fwhm = 2 * np.sqrt(2 * np.log(2)) * width
-    assert found["current_width"] == pytest.approx(fwhm * DT_NS, rel=5e-3)
-    assert found["current_amplitude"] == pytest.approx(
-        1 / (np.sqrt(2 * np.pi) * width), rel=1e-2
-    )
-
-
 def test_baseline_rms_is_that_about_a_line():
     waveforms = multi_site(20, 3e-3, seed=6) + np.float32(1e-4) * TIME.astype(np.float32)
     found = parameters_of(waveforms)["baseline_rms"]
@@ -331,31 +261,6 @@ def test_a_negative_pulse_has_neither_times_nor_tail(offset):
             assert np.isnan(values).all(), name
     assert found["current_amplitude"] == 0
     assert found["baseline_rms"] == pytest.approx(0, abs=1e-7)
-
-
-@pytest.mark.parametrize(
-    "pulse",
-    [
-        np.zeros(800),
-        np.full(800, 3e38),
-        np.where(TIME % 2, 3e38, -3e38),
-        np.where(TIME == 400, 1.0, 0.0),
-        np.where(TIME == 0, 1.0, 0.0),
-        np.where(TIME == 799, 1.0, 0.0),
-        np.exp(np.minimum(TIME - 720, 80)),
-        np.exp(-TIME),
-        1e-38 * TIME,
-        np.random.default_rng(10).normal(size=800),
-    ],
-)
-def test_odd_pulses_give_numbers_or_nan_without_a_warning(pulse):
-    for values in parameters_of(pulse).values():
-        assert not np.isinf(values).any()
-
-
-def test_pulses_of_another_length_are_refused():
-    with pytest.raises(CpunetError, match="the pulses have 799 samples and prepared ones 800"):
-        parameters_of(np.zeros((2, 799)))
 
 
 def test_the_documented_table_is_the_registry():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from pathlib import Path
 
 import h5py
@@ -91,19 +90,6 @@ def test_a_choice_between_arrays(tmp_path):
         open_pulses(path, table="wf2", dt_ns=16)
 
 
-def test_of_plain_datasets_the_one_called_waveform_is_taken(tmp_path):
-    path = write_hdf5(tmp_path / "pulses.h5", waveform=VALUES, values=VALUES[:, :3], dt_ns=16.0)
-    np.testing.assert_array_equal(open_pulses(path).read().waveforms, VALUES)
-
-
-def test_the_amplitude_of_a_trace_of_infinities_is_unknown(tmp_path):
-    values = VALUES.copy()
-    values[0, :2] = np.inf, -np.inf
-    path = write_npz(tmp_path / "pulses.npz", waveform=values, dt_ns=16.0)
-    energies = open_pulses(path, kev_per_adc=1).read().energy_kev
-    assert np.isnan(energies).tolist() == [True] + [False] * 10
-
-
 def test_a_choice_between_groups(tmp_path):
     path = tmp_path / "pulses.h5"
     with h5py.File(path, "w") as h5:
@@ -136,17 +122,6 @@ def test_columnwise_arrays_and_objects_beside_the_waveforms(tmp_path):
     path = write_npz(tmp_path / "pulses.npz", waveform=np.asfortranarray(VALUES), more={"a": 1})
     read = open_pulses(path, dt_ns=16).read()
     np.testing.assert_array_equal(read.waveforms, VALUES)
-
-
-def test_memory_does_not_grow_with_the_file(tmp_path):
-    np.save(tmp_path / "pulses.npy", np.zeros((20_000, 500), np.float32))  # 40 MB
-    tracemalloc.start()
-    try:
-        blocks = open_pulses(tmp_path / "pulses.npy", dt_ns=16).blocks(250)
-        assert sum(len(block) for block in blocks) == 20_000
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
 
 
 def test_simulated_reference_pulses(reference_data: Path):

@@ -114,12 +114,6 @@ def test_a_cut_off_file_gives_its_whole_events_and_then_an_error(tmp_path):
         open_pulses(path).read()
 
 
-def test_no_events(tmp_path):
-    path = write(tmp_path / "run.fcio", config(1))
-    with pytest.raises(CpunetError, match="holds no pulses"):
-        open_pulses(path).read()
-
-
 def test_energies_of_another_file_must_have_as_many(tmp_path):
     events = [event(i, {0: trace(i)}) for i in range(5)]
     path = write(tmp_path / "run.fcio", config(1), *events)
@@ -134,11 +128,6 @@ def test_energies_of_another_file_must_have_as_many(tmp_path):
         open_pulses(path, energy=f"{hit}:long_kev").read()
     with pytest.raises(CpunetError, match="event 4 has no energy"):
         open_pulses(path, energy=f"{hit}:short_kev").read()
-
-
-def test_nothing_is_printed(reference_data: Path, capfd):
-    open_pulses(reference_data / "real" / "th228.fcio").read()
-    assert capfd.readouterr() == ("", "")
 
 
 def test_measured_traces_equal_their_copy_in_hdf5(reference_data: Path):

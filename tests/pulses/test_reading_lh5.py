@@ -152,13 +152,6 @@ def test_of_several_columns_the_full_record_is_taken(file, raw):
     assert (other.dt_ns, other.length) == (64.0, 10)
 
 
-def test_one_table_under_two_names_is_one(file, raw):
-    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file, group="ch1")
-    with h5py.File(file, "a") as h5:
-        h5["alias"] = h5["ch1"]
-    assert open_pulses(file).n_pulses == N
-
-
 @pytest.mark.thorough
 def test_encoded_waveforms_are_decoded(file, raw):
     table = waveform_table(raw)
@@ -217,18 +210,6 @@ def test_a_period_without_units_needs_the_user(file, raw):
     with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give `dt_ns`"):
         open_pulses(file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
-
-
-def test_no_waveforms_lists_what_there_is(file):
-    lh5.write(Table(col_dict={"edep": Array(np.arange(3.0))}), "det1", file, group="stp")
-    with pytest.raises(CpunetError, match=r"no waveforms in it; it holds stp/det1"):
-        open_pulses(file)
-
-
-def test_no_events_is_an_error(file):
-    lh5.write(Table(col_dict={"waveform": waveform_table(np.zeros((0, 8)))}), "raw", file)
-    with pytest.raises(CpunetError, match=r"raw/waveform holds no pulses"):
-        open_pulses(file)
 
 
 def test_nan_samples_are_passed_on(file):

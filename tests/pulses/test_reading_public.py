@@ -217,20 +217,3 @@ def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monke
     assert report.metrics["peaks"]["FEP"]["n_data"] == run.data.used
     back = cpunet.translate(run, data, tmp_path / "back.lh5", inverse=True)
     assert "psd_label_dcr" in cpunet.open_pulses(back.path).columns
-
-
-@pytest.mark.slow
-def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
-    rng = np.random.default_rng(5)
-    sim = write_pickles(tmp_path / "fep_wf_sim.pickle", phased_edges(N, rng, 500, 1000))
-    raw = write_pickles(tmp_path / "fep_wf_ornl.pickle", measured(rng, N, 1600, 700))
-    assert "pickled pulses" in told(capsys, monkeypatch, "info", raw, "--dt-ns", 16)
-    sides = cpunet.PulseFile(sim, dt_ns=16), cpunet.PulseFile(raw, dt_ns=16)
-    run = cpunet.train(*sides, tmp_path / "run", settings=SHORT, device="cpu")
-    assert run.sim.read == run.data.read == N
-    report = cpunet.validate(run, *sides, rivals=False, device="cpu")
-    assert report.metrics["peaks"]["FEP"]["n_sim"] == run.sim.used
-    made = cpunet.translate(run, sides[0], tmp_path / "translated.lh5")
-    np.testing.assert_array_equal(
-        cpunet.open_pulses(made.path).columns["tp0"].read(0, 3), [400, 401, 402]
-    )

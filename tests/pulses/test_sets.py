@@ -102,11 +102,6 @@ def test_peaks_are_named() -> None:
     assert prepared.pulses.peak.tolist() == ["DEP", "", "DEP"]
 
 
-def test_progress_is_told(stages: dict[str, list[float | None]]) -> None:
-    load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
-    assert stages == {"Preparing run7.lh5": [9, 4, 4, 1]}
-
-
 def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     source = source_of([1000.0, 50.0] * 500)
     first, second = (
@@ -122,17 +117,6 @@ def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     whole = load_prepared(source, CONFIG, "measured", select=near_1000)
     same = np.isin(whole.index, first.index)
     assert (whole.pulses.waveforms[same] == first.pulses.waveforms).all()
-
-
-def test_a_sample_that_is_large_enough_is_everything() -> None:
-    source = source_of([1000.0] * 9)
-    assert load_prepared(source, CONFIG, "measured", most=9).rejections == {}
-
-
-def test_only_windows_are_kept() -> None:
-    prepared = load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
-    assert prepared.pulses.waveforms.shape == (9, 40)
-    assert prepared.pulses.waveforms.base is None
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-
 import h5py
 import lh5
 import numpy as np
@@ -105,16 +103,6 @@ def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
     np.testing.assert_allclose(found, pulses.waveforms.max(axis=1))
 
 
-def test_an_existing_file_is_kept_unless_forced(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    write_pulses(path, some(3))
-    with pytest.raises(CpunetError, match="exists already; choose another name"):
-        write_pulses(path, some(4))
-    assert open_pulses(path).n_pulses == 3
-    write_pulses(path, some(4), force=True)
-    assert open_pulses(path).n_pulses == 4
-
-
 def test_a_failure_leaves_no_file(tmp_path):
     def failing():
         yield some()
@@ -150,23 +138,6 @@ def test_columns_must_fit(tmp_path):
         with pytest.raises(CpunetError, match="separate files"):
             writer.append(some())
     assert open_pulses(path).n_pulses == 6
-
-
-def test_empty_blocks_between_others_add_nothing(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    assert write_pulses(path, [some(0), some(2), some(0), some(3, start=2)]) == 5
-    assert open_pulses(path).read().event_number.tolist() == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.thorough
-def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path):
-    block = some(250, 500)  # 0.5 MB
-    tracemalloc.start()
-    try:
-        write_pulses(tmp_path / "pulses.lh5", (block for _ in range(30)))
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
 
 
 def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
@@ -217,14 +188,3 @@ def test_no_column_replaces_another(tmp_path):
     for others in (in_file, beside):
         values = {name: column.nda[0] for name, column in others.read(0, 6).items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
-
-
-def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
-    def full(*_given):
-        raise CpunetError("no space left")
-
-    monkeypatch.setattr("cpunet.pulses.writing.FileInTheMaking", full)
-    writer = PulseWriter(tmp_path / "a.lh5")
-    with pytest.raises(CpunetError, match="no space left"), writer:
-        pass
-    assert list(tmp_path.iterdir()) == []

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from alignment import at_half_maximum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
@@ -14,6 +13,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.moments import BLOCK, MIN_N, Moments
 from synthetic import two_sites
+from unpaired import at_half_maximum
 
 RECIPE = load_recipe("fast")
 CONFIG, PREPARATION = RECIPE.matching.training, RECIPE.preparation
