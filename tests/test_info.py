@@ -10,7 +10,6 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from torch import nn
 
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
@@ -101,28 +100,6 @@ def test_a_run_folder(tmp_path):
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
     assert load(tmp_path).summary() == info(tmp_path).lines
     assert lines["remains"] == "of earlier pulses: none that are certain"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "no folder of this program; give the folder of a run, which holds run.json"),
-        ("{", r"run.json: damaged \([^\n]*\); train again"),
-        ("[1]", r"run.json: .*no mapping"),
-    ],
-)
-def test_folders_that_are_no_runs(tmp_path, text, message):
-    if text is not None:
-        (tmp_path / "run.json").write_text(text)
-    with pytest.raises(CpunetError, match=message):
-        info(tmp_path)
-
-
-def test_reference_pulses(reference_data: Path):
-    told = info(reference_data / "closure" / "data.lh5").values
-    assert (told["n_pulses"], told["length"], told["dt_ns"]) == (3343, 1200, 16)
-    assert min(told["peaks"].values()) > 500
-    assert (told["n_not_finite"], told["n_constant"]) == (0, 0)
 
 
 def test_every_table_of_a_file(tmp_path):
@@ -238,14 +215,6 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_crystal_without_the_taper_is_not_turned_over(reference_data: Path):
-    """Upside down more hits would be inside, but the bore would be at the wrong end."""
-    path = reference_data / "geant4" / "g4_h20mm.npz"
-    told = info(path, detector=read_detector("icpc")).values["detectors"][""]["crystal"]
-    assert told["outside_percent"] == pytest.approx(10.5, abs=0.3)
-    assert "fits" not in told
-
-
 def test_hits_are_compared_with_a_crystal(tmp_path):
     """Hits of an upturned crystal that stands elsewhere; the remedy puts them inside."""
     crystal = read_detector("icpc")
@@ -274,18 +243,6 @@ def test_traces_that_are_no_numbers(tmp_path):
     assert info(tmp_path / "pulses.npy", read=DT).values["n_not_finite"] == 30
     with pytest.raises(CpunetError, match="no spectrum to draw"):
         info(tmp_path / "pulses.npy", read=DT, out=tmp_path / "e.png")
-
-
-def test_a_figure_replaces_nothing_unasked(tmp_path):
-    path, out = tmp_path / "pulses.npy", tmp_path / "pulses.png"
-    np.save(path, np.tile(np.arange(300.0), (3, 1)))
-    with pytest.raises(CpunetError, match="is the input"):
-        info(path, read=DT, out=path, force=True)
-    with pytest.raises(CpunetError, match="pictures are made as"):
-        info(path, read=DT, out=tmp_path / "pulses.gif")
-    info(path, read=DT, out=out)
-    with pytest.raises(CpunetError, match="exists already"):
-        info(path, read=DT, out=out)
 
 
 def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
@@ -326,24 +283,6 @@ def test_impurities_from_the_measured_depletion():
     # given by hand, the scale leads to the same fields
     scale = {"impurity_scale": found.values["impurity_scale"]}
     assert info("ppc", settings=values | scale).lines == found.lines
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("own_cache")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "icpc",
-        pytest.param("bege", marks=pytest.mark.slow),
-        pytest.param("ppc", marks=pytest.mark.slow),
-    ],
-)
-def test_a_figure_of_each_detector(tmp_path: Path, name: str):
-    out = tmp_path / "fields.png"
-    info(name, settings=COARSE, out=out)
-    height, width = imread(out).shape[:2]
-    assert width > 1200
-    assert 0.3 < height / width < 1
 
 
 @pytest.mark.usefixtures("own_cache")

@@ -21,7 +21,6 @@ from cpunet.outputs import (
     require_replaceable,
     written_aside,
 )
-from cpunet.training.checkpoints import unfinished_folder
 
 RUN = FolderKind("run", "cpunet train", "run.json", r"run\.json|log/[ab]")
 REPORT = FolderKind("report", "cpunet validate", "metrics.json", r"metrics\.json")
@@ -80,15 +79,6 @@ def test_what_failed_leaves_what_was_there(tmp_path, error, old, writer):
     with pytest.raises(error, match="stop"):
         fail()
     assert tree(tmp_path) == before
-
-
-@pytest.mark.parametrize("writer", [written_aside, run_folder_aside, unfinished_folder])
-def test_another_file_that_failed_is_named(tmp_path, writer):
-    missing = tmp_path / "sim.lh5"
-    with pytest.raises(CpunetError, match=rf"\(No such file or directory, {missing}\)"):  # noqa: SIM117
-        with writer(tmp_path / "out"):
-            missing.read_bytes()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_move_that_fails_brings_the_old_folder_back(tmp_path, monkeypatch):

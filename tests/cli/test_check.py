@@ -11,9 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import cpunet
-from cpunet.errors import CpunetError
-from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.validation.validate import validate
 
@@ -68,12 +65,6 @@ def first(outcome: Any) -> str:
     return next(line for line in outcome.out.splitlines() if not line.startswith("ok"))
 
 
-def test_lines_within_a_range_are_no_test(sides, check):
-    done = check(sides.write_sim(), sides.write_data(), "--peak", "1000-")
-    assert done.code == 0
-    assert "FEP, SEP, DEP are in the range trained on, and no test of it any more" in done.out
-
-
 def test_sides_that_fit(sides, check):
     picture = sides.folder / "check.png"
     done = check(sides.write_sim(), sides.write_data(), "--out", picture)
@@ -86,19 +77,6 @@ def test_sides_that_fit(sides, check):
     assert "exists" in again.err.splitlines()[-1]
 
 
-def test_pulses_in_memory_and_a_result_that_draws(sides):
-    sim, data = open_pulses(sides.write_sim()).read(), sides.write_data()
-    found = cpunet.check(sim, data)
-    assert found.ok
-    assert str(found).startswith("ok     every 16 ns")
-    assert repr(found).startswith("<CheckResult: ")
-    assert len(found.plot().axes) == 4
-    wrong = cpunet.check(data, data, peak="300-400")
-    assert not wrong.ok
-    with pytest.raises(CpunetError, match="no pulses of both sides"):
-        wrong.plot()
-
-
 def test_another_peak(sides, check):
     sim, data = sides.write_sim(), sides.write_data(kev=sides.kev - 1000)
     told = first(check(sim, data))
@@ -106,17 +84,6 @@ def test_another_peak(sides, check):
     assert "Energies there: 1614 to 1615 keV" in told
     assert "--peak 1600- takes 240 pulses" in told
     assert "outside" not in first(check(sim, data, "--peak", "1600-"))
-
-
-@pytest.mark.parametrize(
-    ("factor", "told", "remedy"),
-    [(1e-3, "if these are MeV, give --kev-per-adc 1000", 1000), (40, "ADC counts", 1 / 40)],
-)
-def test_energies_in_other_units(sides, check, factor, told, remedy):
-    sim, data = sides.write_sim(), sides.write_data(kev=sides.kev * factor)
-    assert told in first(check(sim, data))
-    done = check(sim, sides.write_data("right", kev=sides.kev * factor * remedy))
-    assert "Energies there" not in done.out
 
 
 def test_a_calibration_that_is_off(sides, check):

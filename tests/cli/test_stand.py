@@ -53,25 +53,6 @@ def test_the_folder_is_read_and_prepared(made: Path):
     assert set(flags) == {"label", "flag", "remains_kev", "n_piled", "piled_kev", "piled_ns"}
 
 
-def test_rates_are_options_and_are_told(command, tmp_path: Path):
-    values = {
-        "earlier_pulses.rate_kHz": 0,
-        "pile_up.rate_kHz": 40,
-        "hum": "{frequency_Hz: 50, amplitude_kev: 2}",
-        "wander": "{time_us: 500, rms_kev: 3}",
-    }
-    rates = [f"--set={name}={value}" for name, value in values.items()]
-    words = ("stand", "--preset", "ornl", "--events", "DEP=40", *rates)
-    assert command(*words, "--out", tmp_path / "stand").code == 0
-    electronics = json.loads((tmp_path / "stand" / "stand.json").read_text())["electronics"]
-    assert electronics["earlier_pulses"] == {"rate_kHz": 0}
-    assert electronics["hum"] == {"frequency_Hz": 50, "amplitude_kev": 2}
-    assert electronics["wander"] == {"time_us": 500, "rms_kev": 3}
-    with np.load(tmp_path / "stand" / "data_labels.npz") as known:
-        assert (known["remains_kev"] == 0).all()
-        assert 0.3 < (known["flag"] & 2 > 0).mean() < 0.9
-
-
 @pytest.mark.slow
 def test_no_ringing_is_invented_for_a_fast_decay(command, tmp_path: Path):
     """With 2,000 pulses a fit with fixed fast decays is poor, and a ringing imitates one."""
@@ -97,23 +78,3 @@ def test_no_ringing_is_invented_for_a_fast_decay(command, tmp_path: Path):
     assert found["fast_decay_1_us"] == pytest.approx(2.9, rel=0.15)
     assert found["decay_us"] == pytest.approx(54.6, rel=0.05)
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
-
-
-def test_shift_detector_and_settings_are_told(command, tmp_path: Path):
-    (tmp_path / "shift.yaml").write_text("temperature_K: 1\nhole_velocity_low_factor: 0.97\n")
-    (tmp_path / "settings.yaml").write_text("cloud_fwhm_mm: 0.2\n")
-    done = command(
-        *("stand", "--preset", "ornl", "--events", "DEP=5"),
-        *("--shift", tmp_path / "shift.yaml", "--shift", "temperature_K=1.5"),
-        *("--set", "bias_V=3900", "--set", "self_repulsion=0.5"),
-        *("--settings", tmp_path / "settings.yaml", "--out", tmp_path / "stand"),
-    )
-    assert done.code == 0, done.err
-    made_by = json.loads((tmp_path / "stand" / "stand.json").read_text())
-    sim, data = made_by["sim"], made_by["data"]
-    assert sim["detector"]["bias_V"] == data["detector"]["bias_V"] == 3900
-    assert data["detector"]["temperature_K"] - sim["detector"]["temperature_K"] == 1.5
-    assert data["settings"]["hole_velocity_low_factor"] == 0.97
-    for side in (sim, data):
-        assert side["settings"]["self_repulsion"] == 0.5
-        assert side["settings"]["cloud_fwhm_mm"] == 0.2

@@ -156,17 +156,6 @@ def test_drawn_noise_has_the_density_it_is_drawn_from() -> None:
     np.testing.assert_allclose(found.mean(axis=0)[positive], wanted, rtol=0.05)
 
 
-def test_white_noise_of_different_pulses_has_nothing_in_common() -> None:
-    white = of_density(np.ones(GRID // 2 + 1))
-    drawn = white.draw(np.ones(300), 1400, np.random.default_rng(5))
-    assert white.rms == pytest.approx(1)
-    products = drawn @ drawn.T / drawn.shape[1]
-    np.testing.assert_allclose(np.diag(products), 1, atol=0.25)
-    others = products[~np.eye(len(products), dtype=bool)]
-    assert others.std() == pytest.approx(1 / np.sqrt(1400), rel=0.1)
-    assert np.abs(others).max() < 6 / np.sqrt(1400)
-
-
 def test_noise_slower_than_a_baseline_is_found() -> None:
     baselines = 2 * coloured_noise(SPECTRUM, 1500, 1200, DT_NS, np.random.default_rng(6))
     noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
@@ -224,16 +213,6 @@ def test_beginnings_of_windows_show_the_fast_part() -> None:
     drawn = noise.draw(np.ones(400), 1200, rng) / TO_PREPARED
     for lag in (1, 3, 8):
         assert drift(drawn, lag) == pytest.approx(4 * (1 - 0.8**lag), rel=0.05)
-
-
-@pytest.mark.parametrize("samples", [6, 20, 37, 38])
-def test_short_beginnings_of_many_windows_have_one_kind_of_noise(samples: int) -> None:
-    white = np.random.default_rng(14).normal(size=(100, 800))
-    windows = Pulses.of(white, dt_ns=DT_NS, energy_kev=np.full(100, 1000.0))
-    noise = BaselineNoise.from_windows(windows, samples)
-    assert noise.rms == pytest.approx(1000, rel=0.15)
-    with pytest.raises(CpunetError, match="the baselines have 5 samples; the noise needs 6"):
-        BaselineNoise.from_windows(windows, 5)
 
 
 def test_traces_without_noise_are_refused() -> None:

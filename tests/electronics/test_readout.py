@@ -152,15 +152,6 @@ def test_hum_is_a_wave_of_its_size():
     assert level.std() == pytest.approx(30 * chain.gain_adc_per_kev / 2**0.5, rel=0.1)
 
 
-def test_wandering_slower_than_anything_is_a_level():
-    noise, wander = {"rms_kev": 0.0, "spectrum": QUIET}, {"time_us": 1e20, "rms_kev": 20}
-    chain = changed("ornl", noise=noise, wander=wander, **rates())
-    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
-    added_kev = draw_other_pulses(steps, chain, np.random.default_rng(1)).added_kev
-    assert added_kev[:, 0].std() == pytest.approx(20, rel=0.1)
-    assert np.ptp(added_kev, axis=1).max() < 1e-3
-
-
 def test_wandering_is_recovered_from_levels_and_their_changes():
     noise, wander = {"rms_kev": 0.0, "spectrum": QUIET}, {"time_us": 200, "rms_kev": 20}
     chain = changed("ornl", noise=noise, wander=wander, **rates())
@@ -193,14 +184,6 @@ def test_energies_have_the_resolution(pulses: Pulses):
     assert 2.355 * read_out(line, short, seed=1).energy_kev.std() == pytest.approx(
         2.6, rel=0.05
     )
-
-
-def test_the_seed_decides(pulses: Pulses, traces: RawTraces):
-    chain = read_electronics("ornl")
-    again, other = read_out(pulses, chain, seed=3), read_out(pulses, chain, seed=4)
-    assert (again.waveforms == traces.waveforms).all()
-    assert (again.energy_kev == traces.energy_kev).all()
-    assert (other.waveforms != traces.waveforms).any()
 
 
 def test_pulses_without_energy_are_named():

@@ -13,7 +13,6 @@ from cpunet.pulses.channels import (
     channel_names,
     channels_of,
     one_by_one,
-    own_folder,
     paired,
 )
 from cpunet.pulses.reading.files import PulseFile
@@ -82,10 +81,3 @@ def test_an_output_of_one_is_refused(tmp_path):
     (tmp_path / "run" / ".cpunet.json").write_text("{}")
     with pytest.raises(CpunetError, match="is the output of one channel"):
         one_by_one(paired(data, data), tmp_path / "run", lambda *_: None)
-
-
-def test_runs_of_channels_are_found(tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "run.json").write_text("{}")
-    assert own_folder(tmp_path / "run", "ch1", "run.json") == tmp_path / "run"
-    assert own_folder(tmp_path / "runs", "ch1", "run.json") == tmp_path / "runs" / "ch1"

@@ -51,34 +51,10 @@ def test_the_usual_names_are_understood(tmp_path, write, name, waveform, dt_ns, 
 
 
 @pytest.mark.parametrize(("write", "name"), WRITERS)
-def test_what_stands_beside_the_waveforms_can_be_read(tmp_path, write, name):
-    path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, edep=ENERGY)
-    columns = open_pulses(path).columns
-    assert sorted(columns) == open_pulses(path).describe()["columns"]
-    np.testing.assert_array_equal(columns["edep"].read(2, 5), ENERGY[2:5])
-
-
-@pytest.mark.parametrize(("write", "name"), WRITERS)
 def test_an_energy_without_units_is_not_in_kev(tmp_path, write, name):
     path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, energy=ENERGY)
     assert np.isnan(open_pulses(path).read().energy_kev).all()
     np.testing.assert_array_equal(open_pulses(path, kev_per_adc=1).read().energy_kev, ENERGY)
-
-
-@pytest.mark.parametrize(("write", "name"), WRITERS)
-def test_a_period_that_changes_names_the_event(tmp_path, write, name):
-    dt_ns = np.full(11, 16.0)
-    dt_ns[6] = np.nan
-    path = write(tmp_path / name, waveform=VALUES, dt_ns=dt_ns)
-    with pytest.raises(CpunetError, match=r"event 6: sampling period nan ns, before it 16"):
-        open_pulses(path).read()
-
-
-@pytest.mark.parametrize(("write", "name"), WRITERS)
-def test_columns_of_another_length_are_refused(tmp_path, write, name):
-    path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, energy_kev=ENERGY[:5])
-    with pytest.raises(CpunetError, match="energy_kev has 5 values beside 11 waveforms"):
-        open_pulses(path)
 
 
 def test_a_choice_between_arrays(tmp_path):
@@ -88,23 +64,6 @@ def test_a_choice_between_arrays(tmp_path):
     assert open_pulses(path, table="wf16", dt_ns=16).length == 15
     with pytest.raises(CpunetError, match=r"no array wf2 .*; there are wf1, wf16"):
         open_pulses(path, table="wf2", dt_ns=16)
-
-
-def test_a_choice_between_groups(tmp_path):
-    path = tmp_path / "pulses.h5"
-    with h5py.File(path, "w") as h5:
-        for i, name in enumerate(("one", "two")):
-            group = h5.create_group(name)
-            group["waveform"] = VALUES + i
-            group["dt_ns"] = np.full(11, 16.0)
-            group["energy"] = ENERGY
-            group["energy"].attrs["units"] = "keV"
-    with pytest.raises(CpunetError, match=r"2 tables of waveforms \(one, two\); choose one"):
-        open_pulses(path)
-    for table in ("two", "two/waveform"):
-        pulses = open_pulses(path, table=table).read()
-        np.testing.assert_array_equal(pulses.waveforms, VALUES + 1)
-        np.testing.assert_array_equal(pulses.energy_kev, ENERGY)
 
 
 def test_npy_needs_the_period(tmp_path):

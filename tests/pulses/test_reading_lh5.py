@@ -191,13 +191,6 @@ def test_a_period_that_changes_names_the_event(file, raw):
         list(open_pulses(file).blocks(4))
 
 
-@pytest.mark.parametrize("dt", [np.nan, 0.0, -16.0])
-def test_a_period_that_is_no_period_is_refused(file, raw, dt):
-    lh5.write(Table(col_dict={"waveform": waveform_table(raw, dt)}), "raw", file)
-    with pytest.raises(CpunetError, match=r"pulses.lh5: event 0: the sampling period is"):
-        open_pulses(file)
-
-
 def test_the_users_period_must_agree(file, raw):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
@@ -210,15 +203,6 @@ def test_a_period_without_units_needs_the_user(file, raw):
     with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give `dt_ns`"):
         open_pulses(file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
-
-
-def test_nan_samples_are_passed_on(file):
-    values = np.ones((3, 8), np.float32)
-    values[1, 2] = np.nan
-    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "raw", file)
-    pulses = open_pulses(file, kev_per_adc=1.0).read()
-    assert np.isnan(pulses.waveforms[1, 2])
-    assert np.isnan(pulses.energy_kev).tolist() == [False, True, False]
 
 
 def test_memory_does_not_grow_with_the_file(file):

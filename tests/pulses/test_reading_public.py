@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import pickle
-import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-import cpunet
-from cpunet.cli import main
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses, tables_of
-from cpunet.pulses.writing import write_pulses
 from synthetic import decay, phased_edges
 
 KEV = 2614.511
@@ -181,39 +177,3 @@ def test_what_is_wrong_with_a_pickle_is_one_line(tmp_path, defect):
     with pytest.raises(CpunetError, match=words) as error:
         open_pulses(file, **options).read()
     assert "\n" not in str(error.value)
-
-
-def test_a_text_named_as_a_pickle(tmp_path):
-    (tmp_path / "notes.pickle").write_text("these are no pulses")
-    with pytest.raises(CpunetError, match="breaks off after 0 entries"):
-        open_pulses(tmp_path / "notes.pickle", dt_ns=16)
-
-
-def told(capsys, monkeypatch, *words: object) -> str:
-    monkeypatch.setattr("sys.argv", ["cpunet", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert not ended.value.code
-    return capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monkeypatch):
-    raw, sim = tmp_path / "MJD_Train_0.hdf5", tmp_path / "sim.lh5"
-    write_majorana(raw)
-    table = told(capsys, monkeypatch, "info", raw, "--dt-ns", 10)
-    assert "column energy [keV]" in table
-    one = told(capsys, monkeypatch, "info", raw, "--table", 5, "--dt-ns", 10)
-    assert "Majorana release" in one
-    assert re.search(rf"^lines +{2 * N * 2 // 3} FEP$", one, re.MULTILINE)
-    simulated = phased_edges(N, np.random.default_rng(3), 500, 1000)
-    pulses = cpunet.Pulses.of(simulated, dt_ns=10, energy_kev=np.full(N, KEV))
-    write_pulses(sim, pulses)
-    data = cpunet.PulseFile(raw, table="5", dt_ns=10)
-    run = cpunet.train(sim, data, tmp_path / "run", settings=SHORT, device="cpu")
-    assert run.data.read == 2 * N * 2 // 3
-    assert run.data.read_as == {"table": "5", "dt_ns": 10}
-    report = cpunet.validate(run, sim, raw, rivals=False, device="cpu")  # read as before
-    assert report.metrics["peaks"]["FEP"]["n_data"] == run.data.used
-    back = cpunet.translate(run, data, tmp_path / "back.lh5", inverse=True)
-    assert "psd_label_dcr" in cpunet.open_pulses(back.path).columns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from hypothesis import strategies as st
 from cpunet.errors import CpunetError
 from cpunet.pulses import sets
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.arrays import MemorySource
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.sets import load_prepared
 from cpunet.recipes.schema import PreparationConfig
 
@@ -31,20 +32,6 @@ CONFIG = PreparationConfig(
 )
 
 
-class MemorySource:
-    """Pulses in memory, given out in blocks."""
-
-    path = Path("run7.lh5")
-
-    def __init__(self, pulses: Pulses) -> None:
-        self.pulses = pulses
-        self.n_pulses = len(pulses)
-
-    def blocks(self, size: int, /) -> Iterator[Pulses]:
-        for start in range(0, len(self.pulses), size):
-            yield self.pulses[start : start + size]
-
-
 def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> MemorySource:
     energy_kev = np.asarray(energies, float)
     t = np.maximum(np.arange(60) - 27, 0)
@@ -52,7 +39,8 @@ def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> Memor
         np.nan_to_num(energy_kev, nan=500.0)[:, None] * np.minimum(t / 5, 1) * np.exp(-t / 300)
     )
     raw[broken or []] = np.nan
-    return MemorySource(Pulses.of(raw, dt_ns=16, energy_kev=energy_kev))
+    pulses = Pulses.of(raw, dt_ns=16, energy_kev=energy_kev)
+    return MemorySource(PulseFile(Path("run7.lh5")), pulses)
 
 
 @pytest.fixture(autouse=True)
@@ -84,22 +72,7 @@ def test_counts_add_up(energies: list[float], most: int) -> None:
     assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read
     assert prepared.n_read == len(energies) + 1
     assert len(prepared) == min(most, energies.count(1000.0) + 1)
-    assert (source.pulses.energy_kev[prepared.index] == 1000).all()
-
-
-def test_without_selection_energies_need_not_be_known() -> None:
-    prepared = load_prepared(source_of([np.nan] * 5), CONFIG, "simulated")
-    assert (len(prepared), prepared.rejections) == (5, {})
-
-
-def test_peaks_are_named() -> None:
-    prepared = load_prepared(
-        source_of([1592, 1000, 1593]),
-        CONFIG,
-        "measured",
-        peaks=lambda energy_kev: np.where(energy_kev > 1500, "DEP", ""),
-    )
-    assert prepared.pulses.peak.tolist() == ["DEP", "", "DEP"]
+    assert (source.read().energy_kev[prepared.index] == 1000).all()
 
 
 def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:

@@ -67,19 +67,6 @@ def test_the_lh5_library_reads_what_was_written(tmp_path_factory, waveforms, dt_
     assert again.dt_ns == pytest.approx(dt_ns)
 
 
-def test_units_attributes_and_compression(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    write_pulses(path, some(), table="ch7/raw", waveform_units="ADC", attrs={"run": "r001"})
-    table = lh5.read("ch7/raw", path)
-    assert table.waveform.values.attrs["sample_units"] == "ADC"
-    assert table.attrs["run"] == "r001"
-    assert lh5.ls(path, "ch7/") == ["ch7/raw"]
-    with h5py.File(path) as h5:
-        values = h5["ch7/raw/waveform/values"]
-        assert (values.compression, values.shuffle) == ("gzip", True)
-        assert values.chunks[1] == 20
-
-
 def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
     build_dsp = pytest.importorskip("dspeed").build_dsp
     path, pulses = tmp_path / "pulses.lh5", some(20, 30)
@@ -118,12 +105,6 @@ def test_no_pulses_leave_no_file(tmp_path, blocks):
     with pytest.raises(CpunetError, match=r"pulses.lh5: no pulses to write"):
         write_pulses(tmp_path / "pulses.lh5", blocks)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("other", [some(length=21), some(dt_ns=8.0)])
-def test_blocks_must_fit_together(tmp_path, other):
-    with pytest.raises(CpunetError, match="write them to separate files"):
-        write_pulses(tmp_path / "pulses.lh5", [some(), other])
 
 
 def test_columns_must_fit(tmp_path):

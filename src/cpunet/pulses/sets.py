@@ -44,7 +44,7 @@ _REMEDIES = {
 }
 
 
-class Source(Protocol):
+class RawPulses(Protocol):
     """A source of raw pulses in blocks, such as a reader."""
 
     @property
@@ -60,7 +60,7 @@ class Source(Protocol):
 
 
 def load_prepared(
-    source: Source,
+    source: RawPulses,
     config: PreparationConfig,
     kind: Kind,
     *,
@@ -177,7 +177,7 @@ def _prepare_selected(
     )
 
 
-def _nothing_left(source: Source, sets: list[Prepared]) -> CpunetError:
+def _nothing_left(source: RawPulses, sets: list[Prepared]) -> CpunetError:
     codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
     if not len(codes):
         return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")
