@@ -64,26 +64,26 @@ def test_a_file_is_opened(tmp_path):
 
 
 @pytest.mark.thorough
-def test_remains_of_a_bench_detector(reference_data: Path, tmp_path: Path):
+def test_tails_of_a_bench_detector(reference_data: Path, tmp_path: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
     flat = tmp_path / "flat.lh5"
     tails = subtract_tails(PulseFile(path, kev_per_adc=calibrated), flat)
     told = info(path, read=FileOptions(kev_per_adc=calibrated)).values
-    assert told["remains"] == tails.describe()
-    assert told["remains"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
+    assert told["tails"] == tails.describe()
+    assert told["tails"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
     json.dumps(told)
-    left = lh5.read("geds/raw/remains_kev", flat).nda
+    left = lh5.read("geds/raw/tails_kev", flat).nda
     assert len(left) == 1000
     assert np.nanmean(left > 10) == pytest.approx(0.3, abs=0.03)
-    again = info(flat).values["remains"]
+    again = info(flat).values["tails"]
     assert again["rate_khz"] == 0
 
 
-def test_remains_that_cannot_be_told(tmp_path):
+def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
     told = info(path).values
-    assert told["remains"].startswith("not known: only 0 of 40 traces can be prepared")
+    assert told["tails"].startswith("not known: only 0 of 40 traces can be prepared")
     with pytest.raises(CpunetError, match="only 0 of 40 traces"):
         subtract_tails(path, tmp_path / "flat.lh5")
     with pytest.raises(CpunetError, match="is the input"):
@@ -92,14 +92,14 @@ def test_remains_that_cannot_be_told(tmp_path):
 
 def test_a_run_folder(tmp_path):
     recipe = load_recipe("paper", ["generator.width=2"])
-    remains = {"rate_khz": 0.0}
-    fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "remains": remains}
+    tails = {"rate_khz": 0.0}
+    fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "tails": tails}
     write_run(tmp_path, nn.ModuleDict(), recipe, INFO | {"fit": fit})
     lines = dict(info(tmp_path).lines)
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
     assert load(tmp_path).summary() == info(tmp_path).lines
-    assert lines["remains"] == "of earlier pulses: none that are certain"
+    assert lines["pile-up tails"] == "none that are certain"
 
 
 def test_every_table_of_a_file(tmp_path):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Loaded: TypeAlias = Run | Report | Stand | PulseFile
 
 _DPI = 150
-_LOOKED_AT, _REMAINS_BLOCK = 256, 4096  # traces read at a time
+_LOOKED_AT, _TAILS_BLOCK = 256, 4096  # traces read at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -320,8 +320,8 @@ def _is_measured(source: PulseSource) -> bool:
 def _traces(
     source: PulseSource, recipe: Recipe
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Properties of measured traces, and the tails of earlier pulses under them."""
-    from cpunet.electronics.remains import Remains, remains_in_words
+    """Properties of measured traces, and the pile-up tails under them."""
+    from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
     from cpunet.pulses.baselines import Baselines
     from cpunet.pulses.description import BLOCK, trace_properties, traces_in_words
 
@@ -333,10 +333,10 @@ def _traces(
         told["traces"] = f"cannot be described: {error}"
         lines = [("", told["traces"])]
     try:
-        baselines = Baselines.of(source.blocks(_REMAINS_BLOCK), recipe.preparation)
-        told["remains"] = Remains.of(baselines).describe()
-        lines += remains_in_words(told["remains"])
+        baselines = Baselines.of(source.blocks(_TAILS_BLOCK), recipe.preparation)
+        told["tails"] = PileUpTails.of(baselines).describe()
+        lines += tails_in_words(told["tails"])
     except CpunetError as error:
-        told["remains"] = f"not known: {error}"
-        lines += [("remains", told["remains"])]
+        told["tails"] = f"not known: {error}"
+        lines += [("pile-up tails", told["tails"])]
     return told, lines

@@ -126,14 +126,14 @@ def test_too_few_pulses(sides, check, n):
     assert "more files, or more energies" in told
 
 
-def test_remains_of_earlier_pulses(sides, check):
+def test_tails_of_earlier_pulses(sides, check):
     traces = sides.traces.astype(float)
     late = np.exp(-np.arange(traces.shape[1]) / 3400)
     rng = np.random.default_rng(3)
     size = rng.exponential(0.3 * np.ptp(traces, axis=1)) * (rng.uniform(size=N) < 0.4)
     traces += size[:, None] * late
     done = check(sides.write_sim(), sides.write_data(traces=np.uint16(traces.round())))
-    assert "remains of earlier pulses" in done.out
+    assert "pile-up tails" in done.out
 
 
 class SeenError(Exception):

@@ -47,10 +47,10 @@ def test_the_folder_is_read_and_prepared(made: Path):
         flags = dict(stored)
     assert len(flags["label"]) == len(flags["flag"]) == made_by["counts"]["n_data"]
     assert set(flags["label"]) <= {0, 2, 3}
-    left = flags["remains_kev"] > 1
+    left = flags["tails_kev"] > 1
     assert (left == (flags["flag"] & 1 > 0)).mean() > 0.99
     assert 0.1 < left.mean() < 0.6
-    assert set(flags) == {"label", "flag", "remains_kev", "n_piled", "piled_kev", "piled_ns"}
+    assert set(flags) == {"label", "flag", "tails_kev", "n_piled", "piled_kev", "piled_ns"}
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from cpunet.electronics.readout import (
     read_baselines,
     read_out,
 )
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
@@ -95,7 +95,7 @@ def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
 
 
 def test_shares_of_disturbed_traces(traces: RawTraces):
-    law = RemainsLaw(1.5, 54.6, read_electronics("ornl").other_pulses_kev)
+    law = TailsLaw(1.5, 54.6, read_electronics("ornl").other_pulses_kev)
     assert np.mean(traces.flags & 1 > 0) == pytest.approx(law.share_above(0.98), abs=0.09)
     often = changed("ornl", pile_up={"rate_kHz": 36.1})
     steps = Pulses.of(np.ones((N, 900)), dt_ns=4, energy_kev=np.full(N, 1000.0))
@@ -103,23 +103,23 @@ def test_shares_of_disturbed_traces(traces: RawTraces):
     assert piled == pytest.approx(0.5, abs=0.1)  # 1 - exp(-36.1 kHz x 19.2 us)
 
 
-def test_remains_follow_the_law_and_all_decays_of_the_chain():
+def test_tails_follow_the_law_and_all_decays_of_the_chain():
     chain = changed("ornl", length=1200, **rates(3))
     steps = Pulses.of(np.ones((4000, 10)), dt_ns=4, energy_kev=np.full(4000, 1000.0))
     other = draw_other_pulses(steps, chain, np.random.default_rng(1))
-    law = RemainsLaw(3, 54.6, chain.other_pulses_kev)
+    law = TailsLaw(3, 54.6, chain.other_pulses_kev)
     above = [5, 20, 100, 500]
-    found = [(other.remains_kev > kev).mean() for kev in above]
-    # several remains add up, and a twentieth of each charge decays early
+    found = [(other.tails_kev > kev).mean() for kev in above]
+    # several tails add up, and a twentieth of each charge decays early
     assert found == pytest.approx(law.share_above(above), rel=0.12, abs=0.01)
-    assert other.remains_kev.mean() == pytest.approx(0.953 * law.mean_kev, rel=0.1)
-    old = other.added_kev[other.remains_kev > 100]
+    assert other.tails_kev.mean() == pytest.approx(0.953 * law.mean_kev, rel=0.1)
+    old = other.added_kev[other.tails_kev > 100]
     ratio = np.median(old[:, 1000] / old[:, 0])
     assert ratio == pytest.approx(np.exp(-16 / 54.6), rel=0.01)
     assert (old[:, 1000] / old[:, 0]).min() < 0.97 * ratio  # of pulses a few us before
 
 
-def test_second_pulses_are_where_the_truth_says():
+def test_piled_up_pulses_are_where_the_truth_says():
     quiet = {"noise": {"rms_kev": 0.0, "spectrum": QUIET}, "trigger_jitter_ns": 200}
     chain = changed("ornl", **quiet, **rates(0, 30))
     steps = Pulses.of(np.ones((200, 900)), dt_ns=4, energy_kev=np.full(200, 1000.0))

@@ -151,14 +151,14 @@ def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) ->
     assert "\n" not in str(error.value)
 
 
-def test_remains_of_other_pulses_are_refused(ren, sim) -> None:
-    with pytest.raises(CpunetError, match=rf"^remains_kev has shape \(2,\) beside {N} pulses"):
-        ren.translate(sim, energy_kev=KEV, remains_kev=[1.0, 2.0])
+def test_tails_of_other_pulses_are_refused(ren, sim) -> None:
+    with pytest.raises(CpunetError, match=rf"^tails_kev has shape \(2,\) beside {N} pulses"):
+        ren.translate(sim, energy_kev=KEV, tails_kev=[1.0, 2.0])
 
 
-def test_the_inverse_adds_no_remains(iren) -> None:
-    with pytest.raises(CpunetError, match="leave out remains_kev"):
-        iren.translate(responded(5, seed=3), remains_kev=100.0)
+def test_the_inverse_adds_no_tails(iren) -> None:
+    with pytest.raises(CpunetError, match="leave out tails_kev"):
+        iren.translate(responded(5, seed=3), tails_kev=100.0)
 
 
 def test_seeds(ren, sim) -> None:

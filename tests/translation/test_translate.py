@@ -20,7 +20,7 @@ from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors, Wavefor
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import SIZES_KEV
+from cpunet.electronics.drawn_tails import SIZES_KEV
 from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
@@ -76,7 +76,7 @@ def run(tmp_path_factory):
     return write_chain(tmp_path_factory.mktemp("runs") / "run", INFO | {"data": DATA})
 
 
-REMAINS = {
+TAILS = {
     "rate_khz": 1.0,
     "drawn": {
         "rate_khz": 1.0,
@@ -92,8 +92,8 @@ REMAINS = {
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory):
-    """A chain of data with remains of earlier pulses."""
-    info = INFO | {"data": DATA, "fit": {"remains": REMAINS}}
+    """A chain of data with pile-up tails."""
+    info = INFO | {"data": DATA, "fit": {"tails": TAILS}}
     return write_chain(tmp_path_factory.mktemp("runs") / "run", info)
 
 
@@ -241,7 +241,7 @@ def test_the_options_of_a_translation_are_told(busy, tmp_path):
         [
             ({}, None),
             ({"noise": False}, "noise False"),
-            ({"seed": 4, "remains": "learned"}, "seed 4, remains learned"),
+            ({"seed": 4, "tails": "learned"}, "seed 4, tails learned"),
             (raw | {"realisations": 2}, "realisations 2, adc baseline 0.0"),
         ]
     ):
@@ -607,22 +607,22 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
 
 
 def left_in(path, table="geds/ren"):
-    return lh5.read(f"{table}/remains_kev", path).nda
+    return lh5.read(f"{table}/tails_kev", path).nda
 
 
-def test_remains_are_off_unless_asked_for(busy, run, tmp_path):
+def test_tails_are_off_unless_asked_for(busy, run, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder, name in ((busy, "a.lh5"), (run, "b.lh5")):
         translate(folder, source, tmp_path / name)
         with h5py.File(tmp_path / name) as file:
-            assert "remains_kev" not in file["geds/ren"]
+            assert "tails_kev" not in file["geds/ren"]
     assert values(tmp_path / "a.lh5") == pytest.approx(values(tmp_path / "b.lh5"))
 
 
 def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, many = tmp_path / "out.lh5", {"realisations": 40}
-    translate(busy, source, out, remains="learned", **many)
+    translate(busy, source, out, tails="learned", **many)
     left = left_in(out)
     assert len(left) == 40 * N
     assert left.max() < 40
@@ -631,15 +631,15 @@ def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     higher = values(out)[:, 410:440].mean(axis=1)
     share = left / lh5.read("geds/ren/energy", out).nda
     assert np.corrcoef(share, higher)[0, 1] > 0.4
-    translate(busy, source, tmp_path / "rate.lh5", remains="1", **many)
+    translate(busy, source, tmp_path / "rate.lh5", tails="1", **many)
     assert left_in(tmp_path / "rate.lh5").max() > 100
 
 
-def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
+def test_tails_lift_the_baselines_of_raw_traces(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    for remains in ("none", "3"):
-        out = tmp_path / f"{remains}.lh5"
-        translate(busy, source, out, adc=True, scale=ADC, remains=remains, seed=3)
+    for tails in ("none", "3"):
+        out = tmp_path / f"{tails}.lh5"
+        translate(busy, source, out, adc=True, scale=ADC, tails=tails, seed=3)
     left = left_in(tmp_path / "3.lh5")
     none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
     assert (left > 20).sum() > 5
@@ -655,7 +655,7 @@ def piled(out):
     ]
 
 
-def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
+def test_piled_up_pulses_are_within_raw_traces_and_told(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     options = {"adc": True, "scale": ADC, "seed": 3, "realisations": 5}
     translate(busy, source, tmp_path / "none.lh5", **options)
@@ -666,7 +666,7 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
     assert 0 < (count > 0).sum() < 5 * N
     assert np.array_equal(np.isnan(kev), count == 0)
     clean, more = (values(tmp_path / f"{name}.lh5").astype(float) for name in ("none", "some"))
-    # away from the pulse, the trace rises by the second pulse's energy where it is said
+    # away from the pulse, the trace rises by the piled-up pulse's energy where it is said
     single = (count == 1) & (np.abs(after_ns) > 1500) & (np.abs(after_ns) < 7000)
     assert single.sum() >= 3
     for row in np.flatnonzero(single):
@@ -677,7 +677,7 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
         assert added[at + 5 : at + 15].mean() == pytest.approx(wanted, rel=0.1, abs=40)
 
 
-def test_second_pulses_are_within_windows(busy, tmp_path):
+def test_piled_up_pulses_are_within_windows(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, options = tmp_path / "some.lh5", {"seed": 3, "realisations": 10}
     translate(busy, source, out, pile_up_khz=20, **options)
@@ -685,7 +685,7 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
     assert len(count) == 10 * N
     # 20 kHz for a record of 1,400 samples of 16 ns
     assert count.mean() == pytest.approx(0.448, abs=0.1)
-    # baselines are flat but behind a second pulse, or on its edge
+    # baselines are flat but behind a piled-up pulse, or on its edge
     tilt = np.abs(values(out)[:, :50].mean(axis=1) - values(out)[:, 100:150].mean(axis=1))
     assert tilt[count == 0].max() < 0.03
     inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)
@@ -708,10 +708,10 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
         ({"jobs": 0}, "`jobs` is 0; expected 1 or more"),
         ({"seed": -1}, "`seed` -1: expected a whole number from 0"),
         ({"seed": 2**64}, "expected a whole number from 0"),
-        ({"remains": "many"}, "`remains` many: expected learned, none, or a rate in kHz"),
-        ({"remains": "-1"}, "expected learned, none, or a rate"),
-        ({"remains": "learned", "noise": False}, "or translate with noise"),
-        ({"remains": "learned", "inverse": True}, "leave out `remains`"),
+        ({"tails": "many"}, "`tails` many: expected learned, none, or a rate in kHz"),
+        ({"tails": "-1"}, "expected learned, none, or a rate"),
+        ({"tails": "learned", "noise": False}, "or translate with noise"),
+        ({"tails": "learned", "inverse": True}, "leave out `tails`"),
     ],
 )
 def test_options_that_cannot_be(busy, tmp_path, options, said):
@@ -720,11 +720,11 @@ def test_options_that_cannot_be(busy, tmp_path, options, said):
         translate(busy, source, tmp_path / "out.lh5", **options)
 
 
-def test_runs_that_tell_of_no_remains(run, network, tmp_path):
+def test_runs_that_tell_of_no_tails(run, network, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
-        with pytest.raises(CpunetError, match="the run tells nothing of remains"):
-            translate(folder, source, tmp_path / "o.lh5", remains="1")
+        with pytest.raises(CpunetError, match="the run tells nothing of tails"):
+            translate(folder, source, tmp_path / "o.lh5", tails="1")
         with pytest.raises(CpunetError, match="does not tell the energies of other pulses"):
             translate(folder, source, tmp_path / "o.lh5", pile_up_khz=1)
 

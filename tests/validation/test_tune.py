@@ -76,7 +76,7 @@ def test_held_out_pulses_are_of_the_peak_and_in_no_training(files):
 class Giving(REN):
     """Gives pulses whatever it is asked to translate."""
 
-    remains = None
+    tails = None
 
     def __init__(self, windows: np.ndarray, recipe: Recipe) -> None:
         self.windows, self.recipe = windows, recipe

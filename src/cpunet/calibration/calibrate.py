@@ -32,7 +32,7 @@ from cpunet.calibration.nuisances import Physics, known_before
 from cpunet.calibration.result import described, hopeless
 from cpunet.calibration.search import Calibrated, Search
 from cpunet.calibration.titles import titled
-from cpunet.electronics.measured import drawn_like, measured_noise, remains_of
+from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
@@ -234,11 +234,11 @@ class _Job:
         """The search, ready to start."""
         measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
         preparation = self.recipe.preparation
-        remains, _ = remains_of(sides.data)
+        tails, _ = tails_of(sides.data)
         drawn = None
-        if remains is not None and remains.law is not None:
-            drawn = drawn_like(remains, sides.data, preparation)
-        noise, note = measured_noise(sides.data, preparation, remains)
+        if tails is not None and tails.law is not None:
+            drawn = drawn_like(tails, sides.data, preparation)
+        noise, note = measured_noise(sides.data, preparation, tails)
         if note is not None:
             log.warning(note)
         physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors

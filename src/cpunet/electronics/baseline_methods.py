@@ -11,7 +11,7 @@ import scipy.optimize
 import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.electronics.drawn_tails import TraceNoise
 from cpunet.electronics.finishing import (
     PADDING_AFTER,
     PADDING_BEFORE,

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from cpunet.electronics.baseline_tails import MIN_N, SIGMA_PER_MAD
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.noise_spectrum import FIRST_CLEAN_BIN, spectrum
+from cpunet.electronics.pile_up_tails import MIN_N, SIGMA_PER_MAD
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray, Pulses

@@ -131,7 +131,7 @@ class EarlierPulses(Config):
 
 
 class PileUp(Config):
-    """Second pulses within the record, a Poisson process."""
+    """Piled-up pulses within the record, a Poisson process."""
 
     rate_kHz: _Rate
 

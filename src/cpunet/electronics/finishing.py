@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import SameNoise, TraceNoise
+from cpunet.electronics.drawn_tails import SameNoise, TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import tail_slope
@@ -130,7 +130,7 @@ def finish(
     dt_ns
         Sampling period in ns.
     noise
-        Noise to add, with or without the tails of earlier pulses. None for noise-free
+        Noise to add, with or without the pile-up tails. None for noise-free
         windows.
     energy_kev
         Energy of each pulse in keV, shape ``(n,)``. Required for noise.

@@ -17,8 +17,8 @@ from scipy.signal import lfilter
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum, Wander
 from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.remains_law import LIFETIMES, earlier_pulses
-from cpunet.electronics.second_pulses import SecondPulses
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.opening import open_pulses
@@ -207,8 +207,8 @@ class OtherPulses:
     ----------
     added_kev
         Added signal in keV, shape ``(n, length)``.
-    remains_kev
-        Sum of the tails of earlier pulses at the first sample of each trace, in keV.
+    tails_kev
+        Sum of the pile-up tails at the first sample of each trace, in keV.
     n_piled
         Number of additional pulses within each trace.
     piled_kev, piled_ns
@@ -217,7 +217,7 @@ class OtherPulses:
     """
 
     added_kev: FloatArray
-    remains_kev: FloatArray
+    tails_kev: FloatArray
     n_piled: npt.NDArray[np.int64]
     piled_kev: FloatArray
     piled_ns: FloatArray
@@ -231,17 +231,17 @@ def draw_other_pulses(
     Parameters
     ----------
     pulses
-        Pulses of the traces. Second pulses take their shapes.
+        Pulses of the traces. Piled-up pulses take their shapes.
     electronics
         The readout chain with the rates.
     rng
         Random generator.
     """
-    remains, second, slow = rng.spawn(3)
-    added_kev = _remains(len(pulses), electronics, remains)
-    # before hum and second pulses are added
-    remains_kev = added_kev[:, 0].copy()
-    n_piled, piled_kev, piled_ns = _add_second(pulses, electronics, added_kev, second)
+    tails, piled, slow = rng.spawn(3)
+    added_kev = _tails(len(pulses), electronics, tails)
+    # before hum and piled-up pulses are added
+    tails_kev = added_kev[:, 0].copy()
+    n_piled, piled_kev, piled_ns = _add_piled(pulses, electronics, added_kev, piled)
     if electronics.hum is not None:
         added_kev += _hum(len(pulses), electronics, slow)
     if electronics.wander is not None:
@@ -249,11 +249,11 @@ def draw_other_pulses(
         # its own generator, so that it does not change the other random numbers
         (drift,) = rng.spawn(1)
         added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
-    return OtherPulses(added_kev, remains_kev, n_piled, piled_kev, piled_ns)
+    return OtherPulses(added_kev, tails_kev, n_piled, piled_kev, piled_ns)
 
 
-def _remains(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
-    """Tails of earlier pulses in keV, with all decays of the chain, shape ``(n, length)``."""
+def _tails(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
+    """Pile-up tails in keV, with all decays of the chain, shape ``(n, length)``."""
     transfer = electronics.transfer
     longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
     row, kev, before_us = earlier_pulses(
@@ -269,12 +269,12 @@ def _remains(n: int, electronics: Electronics, rng: np.random.Generator) -> Floa
     return np.ascontiguousarray((heights @ decays).real)
 
 
-def _add_second(
+def _add_piled(
     pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Add second pulses anywhere in the record, with shapes of randomly chosen pulses."""
+    """Add piled-up pulses anywhere in the record, with shapes of randomly chosen pulses."""
     dt_ns = electronics.dt_ns
-    second = SecondPulses.draw(
+    piled = InTracePileUp.draw(
         len(pulses),
         electronics.pile_up.rate_kHz,
         electronics.other_pulses_kev,
@@ -282,9 +282,9 @@ def _add_second(
         electronics.length * dt_ns,
         rng,
     )
-    shapes = linear_response(pulses[second.partner], electronics, second.after_ns)
-    np.add.at(added_kev, second.row, second.kev[:, np.newaxis] * shapes)
-    return second.largest()
+    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
+    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
+    return piled.largest()
 
 
 def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
@@ -307,7 +307,7 @@ def _wander(
 
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
-"""Bits of a trace's flags. A baseline decays if its remainder exceeds the noise RMS."""
+"""Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,10 +328,10 @@ class RawTraces:
         Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
         Noise-free pulses at their own clock phase in units of the full charge, without
-        baseline and without earlier or second pulses. Float32, shape ``(n, length)``.
+        baseline and without earlier or piled-up pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
         Scale in keV and offset in ADC counts of each pulse.
-    remains_kev, n_piled, piled_kev
+    tails_kev, n_piled, piled_kev
         Properties of other pulses, see `cpunet.electronics.readout.OtherPulses`.
     piled_ns
         Start of the largest additional pulse after that of the trace's own pulse in ns
@@ -346,7 +346,7 @@ class RawTraces:
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
     baseline_adc: FloatArray
-    remains_kev: FloatArray
+    tails_kev: FloatArray
     n_piled: npt.NDArray[np.int64]
     piled_kev: FloatArray
     piled_ns: FloatArray
@@ -400,7 +400,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
     flags = (
-        np.where(other.remains_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
+        np.where(other.tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
         | np.where(other.n_piled > 0, PILE_UP, 0)
         | np.where(beyond.any(axis=1), SATURATED, 0)
     ).astype(np.uint8)
@@ -418,7 +418,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         response=response.astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
-        remains_kev=other.remains_kev,
+        tails_kev=other.tails_kev,
         n_piled=other.n_piled,
         piled_kev=other.piled_kev,
         piled_ns=other.piled_ns - shift_ns,

@@ -48,7 +48,7 @@ _LIBRARY_FROM_EVENTS = 20_000
 # Truth about each measured trace besides its line, and its name in ``data_labels.npz``.
 OF_DATA = {
     "flags": "flag",
-    "remains_kev": "remains_kev",
+    "tails_kev": "tails_kev",
     "n_piled": "n_piled",
     "piled_kev": "piled_kev",
     "piled_ns": "piled_ns",
@@ -157,7 +157,7 @@ def make_stand(
     trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after ``n_pre``
     samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped included),
     ``data_labels.npz`` (``label``, ``flag``: 1 decaying baseline, 2 pile-up, 4 saturated;
-    ``remains_kev``, ``n_piled``, ``piled_kev``, ``piled_ns``, see
+    ``tails_kev``, ``n_piled``, ``piled_kev``, ``piled_ns``, see
     `cpunet.electronics.readout`) and ``stand.json``, its provenance.
 
     Parameters

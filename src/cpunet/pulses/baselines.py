@@ -1,4 +1,4 @@
-"""What noise and tails of earlier pulses need of raw traces, kept while these are read once."""
+"""What noise and pile-up tails need of raw traces, kept while these are read once."""
 
 from __future__ import annotations
 

@@ -96,8 +96,8 @@ class InputSet:
 
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
-    simulated detector, if the file contains it; ``baselines`` what noise and tails of earlier
-    pulses need of measured traces.
+    simulated detector, if the file contains it; ``baselines`` what noise and pile-up tails need
+    of measured traces.
     """
 
     prepared: Prepared

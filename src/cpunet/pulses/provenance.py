@@ -199,7 +199,7 @@ _DEFAULTS = {
     "noise": True,
     "seed": 0,
     "realisations": 1,
-    "remains": "none",
+    "tails": "none",
     "pile_up_khz": 0.0,
 }
 

@@ -312,10 +312,10 @@ REMEDIES = {
         "the traces end too soon before or after the pulse; write longer ones, or allow more "
         "padding (preparation.max_padding_before, max_padding_after in `settings`)"
     ),
-    Rejection.TAIL_SLOPE: "tails differ: pile-up, or remains of earlier pulses",
-    Rejection.BASELINE: "baselines differ: remains of earlier pulses (cpunet info tells them)",
+    Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
+    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info tells them)",
     Rejection.BASELINE_SLOPE: (
-        "baselines are not flat: remains of earlier pulses (cpunet info tells them)"
+        "baselines are not flat: pile-up tails (cpunet info tells them)"
     ),
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",

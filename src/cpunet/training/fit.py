@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.measured import find_remains, measured_noise
+from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
@@ -121,8 +121,8 @@ def match(
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    remains, drawn, told_of_remains = find_remains(data, recipe.preparation)
-    noise, remark = measured_noise(data, recipe.preparation, remains)
+    tails, drawn, told_of_tails = find_tails(data, recipe.preparation)
+    noise, remark = measured_noise(data, recipe.preparation, tails)
     if isinstance(known, ElectronicsResponse):
         allowed = recipe.matching.training.drift_terms
         if known.config.drift_terms > allowed:
@@ -131,19 +131,19 @@ def match(
     given: dict[str, Any] = {
         "seed": seed,
         "known": known,
-        "remains": drawn,
+        "tails": drawn,
         "listener": listen,
     }
     fitted = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
     simulated, measured = sim.prepared.pulses, data.prepared.pulses
     response, fit = fitted(simulated, measured, noise, recipe, **given)
     told = _described(fit, response, noise, len(sim.prepared), len(data.prepared))
-    told["remains"] = told_of_remains
+    told["tails"] = told_of_tails
     recipe = recipe.model_copy(update={"generator": response.config})
     chain = ResponseGenerator(response.config, sim.dt_ns)
     chain.response = response
     chain.set_noise(noise)
-    chain.remains = drawn
+    chain.tails = drawn
     iren = fit_inverse(chain, simulated.waveforms, simulated.energy_kev, recipe, seed=seed)
     model = nn.ModuleDict({"ren": chain, "iren": iren})
     return Matched(model, FitInfo.model_validate(told), recipe, fit, remark)
@@ -152,7 +152,7 @@ def match(
 def _described(
     fit: Fit, response: Readout, noise: BaselineNoise, n_sim: int, n_data: int
 ) -> dict[str, Any]:
-    """Content of `FitInfo`, without remains."""
+    """Content of `FitInfo`, without tails."""
     parameters = response.describe()
     return {
         "parameters": parameters,

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.measured import find_remains, measured_noise
+from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet
@@ -63,7 +63,7 @@ def train_networks(job: TrainingJob) -> Run:
 def outside_noise(
     sim: InputSet, data: InputSet, recipe: Recipe
 ) -> tuple[Outside | None, FitInfo | None]:
-    """Noise for the translations of the simulated pulses, and what was found of remains.
+    """Noise for the translations of the simulated pulses, and what was found of tails.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def outside_noise(
     if recipe.cyclegan.training.noise == "none":
         return None, None
     try:
-        found = find_remains(data, recipe.preparation)
+        found = find_tails(data, recipe.preparation)
         noise, note = measured_noise(data, recipe.preparation, found.measured)
     except CpunetError as error:
         raise CpunetError(
@@ -84,7 +84,7 @@ def outside_noise(
         log.warning(note)
     drawn = TraceNoise(noise, found.drawn)
     outside = Outside(drawn, sim.prepared.pulses.energy_kev, recipe.preparation)
-    return outside, FitInfo.model_validate({"remains": found.told})
+    return outside, FitInfo.model_validate({"tails": found.told})
 
 
 def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:

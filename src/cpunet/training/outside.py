@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from cpunet.electronics.drawn_remains import TraceNoise
+from cpunet.electronics.drawn_tails import TraceNoise
 from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE
 from cpunet.networks.linear_inverse import stretch
 from cpunet.pulses.container import Pulses

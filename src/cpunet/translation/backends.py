@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.electronics.finishing import PADDING_BEFORE, extended, finish, with_room
-from cpunet.electronics.second_pulses import SecondPulses
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
@@ -30,9 +30,7 @@ from cpunet.translation.graphs import ChainGraph, Graph, NetworkGraph, example_w
 Energies = npt.NDArray[np.float64]
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
-NO_OTHERS = (
-    "other pulses are drawn with the noise, by energies; leave out remains_kev and second"
-)
+NO_OTHERS = "other pulses are drawn with the noise, by energies; leave out tails_kev and piled"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +45,30 @@ class Drawn:
         Whether to add noise.
     generator
         Random generator of the noise.
-    remains_kev
-        Remains of earlier pulses under each pulse, in keV.
-    second
-        Second pulses within the records.
+    tails_kev
+        Pile-up tails under each pulse, in keV.
+    piled
+        Piled-up pulses within the records.
     """
 
     energy_kev: Energies | None = None
     noise: bool = True
     generator: torch.Generator | None = None
-    remains_kev: Energies | None = None
-    second: SecondPulses | None = None
+    tails_kev: Energies | None = None
+    piled: InTracePileUp | None = None
 
     @property
     def others(self) -> bool:
         """Whether there are other pulses under these."""
-        return self.remains_kev is not None or self.second is not None
+        return self.tails_kev is not None or self.piled is not None
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Drawn:
         """The same for some of the pulses."""
         return replace(
             self,
             energy_kev=None if self.energy_kev is None else self.energy_kev[rows],
-            remains_kev=None if self.remains_kev is None else self.remains_kev[rows],
-            second=None if self.second is None else self.second.of_rows(rows),
+            tails_kev=None if self.tails_kev is None else self.tails_kev[rows],
+            piled=None if self.piled is None else self.piled.of_rows(rows),
         )
 
     def device(self, default: torch.device) -> torch.device:
@@ -96,14 +94,14 @@ class Backend(ABC):
         Readout chain, which gives traces of any length (`levels`).
     noise : BaselineNoise or None
         Noise that is added to the output of the network.
-    remains : DrawnRemains or None
-        Distribution of the remains of earlier pulses under the data, if known.
+    tails : DrawnTails or None
+        Distribution of the pile-up tails under the data, if known.
     """
 
     network: nn.Module
     needs_energies: ClassVar[bool] = False
     chain: ResponseGenerator | None = None
-    remains: DrawnRemains | None = None
+    tails: DrawnTails | None = None
 
     @property
     def noise(self) -> BaselineNoise | None:
@@ -147,7 +145,7 @@ class NetworkBackend(Backend):
         if drawn.others:
             raise CpunetError(
                 "a network has what it was shown; other pulses belong to readout chains, so "
-                "leave out remains_kev and second"
+                "leave out tails_kev and piled"
             )
         batch = torch.from_numpy(windows).to(self.device)
         out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
@@ -186,8 +184,8 @@ class NoisyNetworkBackend(NetworkBackend):
         Noise of the data's baselines.
     config
         The preparation of the data, which noisy pulses go through again.
-    remains
-        Distribution of the remains of earlier pulses under the data, if known.
+    tails
+        Distribution of the pile-up tails under the data, if known.
     """
 
     needs_energies = True
@@ -197,10 +195,10 @@ class NoisyNetworkBackend(NetworkBackend):
         network: PositionalUNet,
         kept: KeptNoise,
         config: PreparationConfig,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
     ) -> None:
         super().__init__(network)
-        self.kept, self.config, self.remains = kept, config, remains
+        self.kept, self.config, self.tails = kept, config, tails
 
     @property
     def noise(self) -> BaselineNoise:
@@ -215,7 +213,7 @@ class NoisyNetworkBackend(NetworkBackend):
         CpunetError
             If noise is requested and an energy is unknown.
         """
-        energy_kev, second = drawn.energy_kev, drawn.second
+        energy_kev, piled = drawn.energy_kev, drawn.piled
         if drawn.noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
         if not drawn.noise and drawn.others:
@@ -230,12 +228,12 @@ class NoisyNetworkBackend(NetworkBackend):
         records = with_room(clean, self.config, dt_ns)
         added = None
         if drawn.others:
-            added = _left(self.remains, records, energy_kev, drawn.remains_kev)
-        if second is not None and added is not None:
-            length = records.shape[1] + second.reach(dt_ns)
+            added = _left(self.tails, records, energy_kev, drawn.tails_kev)
+        if piled is not None and added is not None:
+            length = records.shape[1] + piled.reach(dt_ns)
             before = PADDING_BEFORE + self.config.samples_before
-            shapes = extended(clean[second.partner], self.config, dt_ns, length, before)
-            added += second.added(shapes, energy_kev, dt_ns, records.shape[1])
+            shapes = extended(clean[piled.partner], self.config, dt_ns, length, before)
+            added += piled.added(shapes, energy_kev, dt_ns, records.shape[1])
         return finish(
             records,
             self.config,
@@ -255,7 +253,7 @@ class ResponseBackend(Backend):
 
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
         self.network = self.chain = generator.eval()
-        self.remains = generator.remains
+        self.tails = generator.tails
         self.config = config
 
     @property
@@ -272,7 +270,7 @@ class ResponseBackend(Backend):
             If noise is requested and an energy is unknown.
         """
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
-        energy_kev, second = drawn.energy_kev, drawn.second
+        energy_kev, piled = drawn.energy_kev, drawn.piled
         if drawn.noise and energy_kev is None:
             raise CpunetError(NO_ENERGY)
         seed = drawn.seed(self.device)
@@ -280,9 +278,9 @@ class ResponseBackend(Backend):
         if drawn.others:
             if energy_kev is None or not drawn.noise:
                 raise CpunetError(NO_OTHERS)
-            added = _left(self.remains, records, energy_kev, drawn.remains_kev)
-            if second is not None and len(second.row):
-                added += self._second(windows, energy_kev, second, records.shape[1])
+            added = _left(self.tails, records, energy_kev, drawn.tails_kev)
+            if piled is not None and len(piled.row):
+                added += self._piled(windows, energy_kev, piled, records.shape[1])
         return finish(
             records,
             self.config,
@@ -324,21 +322,19 @@ class ResponseBackend(Backend):
         ]
         return levels, clean.codes
 
-    def _second(
-        self, windows: FloatArray, energy_kev: Energies, second: SecondPulses, length: int
+    def _piled(
+        self, windows: FloatArray, energy_kev: Energies, piled: InTracePileUp, length: int
     ) -> npt.NDArray[np.float64]:
-        """Second pulses with shapes of the same batch, at each sample in prepared units."""
+        """Piled-up pulses with shapes of the same batch, at each sample in prepared units."""
         dt_ns = float(self.chain.response.dt_ns)
-        # early second pulses need longer records
-        chosen = np.pad(
-            windows[second.partner], ((0, 0), (0, second.reach(dt_ns))), mode="edge"
-        )
+        # early piled-up pulses need longer records
+        chosen = np.pad(windows[piled.partner], ((0, 0), (0, piled.reach(dt_ns))), mode="edge")
         shapes = self.network(torch.from_numpy(chosen).to(self.device)).cpu().numpy()
         config = self.config.model_copy(update={"saturation_run": shapes.shape[1] + 1})
         clean = prepare(Pulses.of(shapes, dt_ns=dt_ns), config, "measured")
         scale = np.full(len(shapes), np.median(clean.scale))
         scale[clean.index] = clean.scale
-        return second.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
+        return piled.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
 
 
 class InverseBackend(Backend):
@@ -361,8 +357,7 @@ class InverseBackend(Backend):
         """
         if drawn.others:
             raise CpunetError(
-                "the inverse gives charge, without other pulses; leave out remains_kev and "
-                "second"
+                "the inverse gives charge, without other pulses; leave out tails_kev and piled"
             )
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)
@@ -394,27 +389,25 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
         if not forward or recipe.cyclegan.training.noise == "none":
             return NetworkBackend(network)
         kept = run.fill(NOISE, KeptNoise(run.dt_ns), device)
-        return NoisyNetworkBackend(network, kept, preparation, run.remains)
+        return NoisyNetworkBackend(network, kept, preparation, run.tails)
     if forward:
         response = run.fill(part, ResponseGenerator(generator, run.dt_ns), device)
-        response.remains = run.remains
+        response.tails = run.tails
         return ResponseBackend(response, preparation)
     inverse = LinearInverse(Sizes.of(preparation.length, recipe.matching.training))
     return InverseBackend(run.fill(part, inverse, device), preparation, run.dt_ns)
 
 
 def _left(
-    remains: DrawnRemains | None,
+    tails: DrawnTails | None,
     records: FloatArray,
     energy_kev: Energies,
-    remains_kev: Energies | None,
+    tails_kev: Energies | None,
 ) -> npt.NDArray[np.float64]:
-    """Remains of earlier pulses at each sample of the records, in prepared units."""
-    if remains_kev is None:
+    """Pile-up tails at each sample of the records, in prepared units."""
+    if tails_kev is None:
         return np.zeros(records.shape)
-    if remains is None:
-        raise CpunetError(
-            "the run does not tell of remains of earlier pulses; leave out remains_kev"
-        )
-    left = remains_kev * remains.height / energy_kev
-    return np.asarray(left[:, np.newaxis] * remains.decay(records.shape[1]))
+    if tails is None:
+        raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
+    left = tails_kev * tails.height / energy_kev
+    return np.asarray(left[:, np.newaxis] * tails.decay(records.shape[1]))

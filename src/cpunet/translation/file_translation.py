@@ -23,7 +23,7 @@ from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
-from cpunet.translation.learned_remains import wanted_pile_up, wanted_remains
+from cpunet.translation.learned_remains import wanted_pile_up, wanted_tails
 from cpunet.translation.noise_blocks import (
     NOISE_ROWS,
     Counts,
@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 OWN_COLUMNS = frozenset(
-    {"waveform", "energy", "event_number", "rejection", "realisation", "remains_kev"}
+    {"waveform", "energy", "event_number", "rejection", "realisation", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
 )
 
@@ -189,14 +189,14 @@ class FileTranslation:
 
     def _form(self) -> OutputForm:
         adc = self.options.adc
-        remains = wanted_remains(self.translator, self.options.remains, raw=adc is not None)
+        tails = wanted_tails(self.translator, self.options.tails, raw=adc is not None)
         pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
         if adc is None or not isinstance(self.translator, REN):
-            return Normalised(self.translator, remains, pile_up)
+            return Normalised(self.translator, tails, pile_up)
         scale = adc_scale(
             self.run, self.translator, adc_per_kev=adc.adc_per_kev, baseline=adc.baseline
         )
-        return AdcForm(self.translator, scale, adc.length, adc.n_pre, remains, pile_up)
+        return AdcForm(self.translator, scale, adc.length, adc.n_pre, tails, pile_up)
 
     def _require_sampling(self, source: PulseFile, pulses: PulseSource) -> None:
         if not np.isclose(pulses.dt_ns, self.translator.dt_ns):

@@ -1,4 +1,4 @@
-"""Remains of earlier pulses as learned by a run, or at a given rate."""
+"""Pile-up tails as learned by a run, or at a given rate."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.second_pulses import DrawnPileUp
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.in_trace_pile_up import DrawnPileUp
 from cpunet.errors import CpunetError
 from cpunet.translation.options import LEARNED, NONE
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from cpunet.translation.translator import Translator
 
 
-def wanted_remains(
+def wanted_tails(
     translator: Translator, wanted: str | float, *, raw: bool = False
-) -> DrawnRemains | None:
-    """Remains to add to translations.
+) -> DrawnTails | None:
+    """Pile-up tails to add to translations.
 
     Parameters
     ----------
     translator
         Trained run.
     wanted
-        ``"learned"`` for the remains of the data, ``"none"``, or a rate in kHz.
+        ``"learned"`` for the tails of the data, ``"none"``, or a rate in kHz.
     raw
-        Whether the remains are for raw traces, which have not passed any cuts.
+        Whether the tails are for raw traces, which have not passed any cuts.
 
     Raises
     ------
@@ -37,10 +37,10 @@ def wanted_remains(
     if wanted == NONE:
         return None
     rate = None if wanted == LEARNED else _rate(wanted)
-    known = translator.remains
+    known = translator.tails
     if known is None:
         raise CpunetError(
-            f"`remains` {wanted}: the run tells nothing of remains of earlier pulses (a "
+            f"`tails` {wanted}: the run tells nothing of pile-up tails (a "
             "network, trained before they were told, or without raw traces); train a readout "
             "chain on raw traces, or leave it out"
         )
@@ -52,7 +52,7 @@ def wanted_remains(
 
 
 def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | None:
-    """Second pulses to add to translations, with the energies learned by a run.
+    """Piled-up pulses to add to translations, with the energies learned by a run.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
         raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
     if rate_khz == 0:
         return None
-    known = translator.remains
+    known = translator.tails
     if known is None:
         raise CpunetError(
             f"`pile_up_khz` {rate_khz:g}: the run does not tell the energies of other pulses "
@@ -86,5 +86,5 @@ def _rate(wanted: str | float) -> float:
     except ValueError:
         rate = np.nan
     if not (np.isfinite(rate) and rate >= 0):
-        raise CpunetError(f"`remains` {wanted}: expected learned, none, or a rate in kHz")
+        raise CpunetError(f"`tails` {wanted}: expected learned, none, or a rate in kHz")
     return rate

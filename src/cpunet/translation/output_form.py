@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.second_pulses import Columns, DrawnPileUp, SecondPulses
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.in_trace_pile_up import Columns, DrawnPileUp, InTracePileUp
 from cpunet.networks.response_layer import PADDING_BEFORE, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Codes
@@ -30,9 +30,9 @@ class Formed:
     saturated
         Mask of the rows that reach an end of the digitiser's range, shape (n,).
     truth
-        What is known of each trace, arrays of shape (n,) with their units: ``remains_kev``
-        with remains of earlier pulses; ``n_piled``, ``piled_kev`` and ``piled_ns`` with second
-        pulses, see `SecondPulses.largest`; ``realisation`` with several.
+        What is known of each trace, arrays of shape (n,) with their units: ``tails_kev``
+        with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with in-trace pile-up,
+        see `InTracePileUp.largest`; ``realisation`` with several.
     """
 
     pulses: Pulses
@@ -78,10 +78,10 @@ class Normalised:
     ----------
     translator
         Trained run.
-    remains
-        Distribution of the remains of earlier pulses; None for none.
+    tails
+        Distribution of the pile-up tails; None for none.
     pile_up
-        Rate and energies of second pulses; None for none.
+        Rate and energies of piled-up pulses; None for none.
     """
 
     samples: npt.DTypeLike = np.float32
@@ -90,26 +90,26 @@ class Normalised:
     def __init__(
         self,
         translator: Translator,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
         pile_up: DrawnPileUp | None = None,
     ) -> None:
-        self.translator, self.remains, self.pile_up = translator, remains, pile_up
+        self.translator, self.tails, self.pile_up = translator, tails, pile_up
         self.t0_ns = -translator.recipe.preparation.samples_before * translator.dt_ns
 
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
     ) -> Formed:
         """Translate pulses, keeping their rows."""
-        left = drawn_kev(self.remains, len(pulses), generator)
-        second = self._second(len(pulses), generator)
+        left = drawn_kev(self.tails, len(pulses), generator)
+        piled = self._piled(len(pulses), generator)
         done = self.translator.translate_pulses(
-            pulses, noise=noise, generator=generator, remains_kev=left, second=second
+            pulses, noise=noise, generator=generator, tails_kev=left, piled=piled
         )
         saturated = np.zeros(len(pulses), bool)
-        return Formed(done.pulses, done.codes, saturated, truth_of(left, second))
+        return Formed(done.pulses, done.codes, saturated, truth_of(left, piled))
 
-    def _second(self, n: int, generator: torch.Generator | None) -> SecondPulses | None:
-        """Draw second pulses within the records that are prepared to windows."""
+    def _piled(self, n: int, generator: torch.Generator | None) -> InTracePileUp | None:
+        """Draw piled-up pulses within the records that are prepared to windows."""
         if self.pile_up is None:
             return None
         config = self.translator.recipe.preparation
@@ -118,16 +118,16 @@ class Normalised:
 
 
 def drawn_kev(
-    remains: DrawnRemains | None, n: int, generator: torch.Generator | None
+    tails: DrawnTails | None, n: int, generator: torch.Generator | None
 ) -> npt.NDArray[np.float64] | None:
-    """Remains of `n` pulses in keV, drawn from the random generator of the noise."""
-    return None if remains is None else remains.draw_kev(n, rng_of(generator))
+    """Pile-up tails of `n` pulses in keV, drawn from the random generator of the noise."""
+    return None if tails is None else tails.draw_kev(n, rng_of(generator))
 
 
-def truth_of(left: npt.NDArray[np.float64] | None, second: SecondPulses | None) -> Columns:
-    """Columns on remains and on second pulses, as far as there are any."""
-    truth: Columns = {} if left is None else {"remains_kev": (left, "keV")}
-    return truth if second is None else truth | second.columns()
+def truth_of(left: npt.NDArray[np.float64] | None, piled: InTracePileUp | None) -> Columns:
+    """Columns on tails and on piled-up pulses, as far as there are any."""
+    truth: Columns = {} if left is None else {"tails_kev": (left, "keV")}
+    return truth if piled is None else truth | piled.columns()
 
 
 def rng_of(generator: torch.Generator | None) -> np.random.Generator:

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.electronics.finishing import extended
-from cpunet.electronics.second_pulses import DrawnPileUp, SecondPulses
+from cpunet.electronics.in_trace_pile_up import DrawnPileUp, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection, prepare
@@ -131,11 +131,11 @@ class AdcForm:
     length, n_pre
         Number of samples of a trace, and of those before the pulse without noise reaches
         99.9 % of its maximum; the values of the prepared window if None.
-    remains
-        Distribution of the remains of earlier pulses, which raise the baseline at the start
+    tails
+        Distribution of the pile-up tails, which raise the baseline at the start
         of a trace; None for none.
     pile_up
-        Rate and energies of second pulses within a trace; None for none.
+        Rate and energies of piled-up pulses within a trace; None for none.
 
     Raises
     ------
@@ -152,15 +152,15 @@ class AdcForm:
         scale: AdcScale,
         length: int | None = None,
         n_pre: int | None = None,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
         pile_up: DrawnPileUp | None = None,
     ) -> None:
-        self.ren, self.scale, self.remains, self.pile_up = ren, scale, remains, pile_up
+        self.ren, self.scale, self.tails, self.pile_up = ren, scale, tails, pile_up
         self.config = ren.recipe.preparation
         if pile_up is not None and ren.backend.chain is None:
             raise CpunetError(
                 "a network knows no shapes beyond its windows, so it gives no raw traces with "
-                "second pulses; leave out `pile_up_khz` or `adc`"
+                "piled-up pulses; leave out `pile_up_khz` or `adc`"
             )
         self.length = self.config.length if length is None else length
         self.n_pre = self.config.samples_before if n_pre is None else n_pre
@@ -182,12 +182,12 @@ class AdcForm:
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
     ) -> Formed:
         """Translate pulses, keeping their rows; pulses without energy are rejected."""
-        backend, left = self.ren.backend, drawn_kev(self.remains, len(pulses), generator)
-        second = None
+        backend, left = self.ren.backend, drawn_kev(self.tails, len(pulses), generator)
+        piled = None
         if self.pile_up is not None:
-            second = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
+            piled = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
         if backend.chain is not None:
-            windows, codes = self._of_chain(backend, pulses, noise, generator, second)
+            windows, codes = self._of_chain(backend, pulses, noise, generator, piled)
         else:
             done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
             codes = done.codes.copy()
@@ -196,17 +196,17 @@ class AdcForm:
             )
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
-        if left is not None and self.remains is not None:
+        if left is not None and self.tails is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
-                heights = left * self.remains.height / pulses.energy_kev
-            decay = self.remains.decay(self.length, lead_us=0.0)
+                heights = left * self.tails.height / pulses.energy_kev
+            decay = self.tails.decay(self.length, lead_us=0.0)
             windows += heights[:, np.newaxis] * decay
         windows[codes != Rejection.ACCEPTED] = np.nan
         scale = np.where(unknown, 0.0, self.scale.per_kev * pulses.energy_kev)
         traces, saturated = to_adc(windows, scale, self.scale.baseline)
         # single precision represents 16-bit integers exactly
         whole = pulses.with_waveforms(traces.astype(np.float32))
-        return Formed(whole, codes, saturated, truth_of(left, second))
+        return Formed(whole, codes, saturated, truth_of(left, piled))
 
     def _of_chain(
         self,
@@ -214,7 +214,7 @@ class AdcForm:
         pulses: Pulses,
         noise: bool,
         generator: torch.Generator | None,
-        second: SecondPulses | None,
+        piled: InTracePileUp | None,
     ) -> tuple[FloatArray, Codes]:
         """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
         prepared = prepare(pulses, self.config, "simulated")
@@ -232,25 +232,25 @@ class AdcForm:
             energies = pulses.energy_kev[rows]
             if noise and electronic is not None:
                 levels += electronic.draw(energies, self.length, rng)
-            if second is not None:
-                levels += self._second(backend, batch, energies, second.of_rows(rows))
+            if piled is not None:
+                levels += self._piled(backend, batch, energies, piled.of_rows(rows))
             traces[rows] = levels
         return traces, codes
 
-    def _second(
+    def _piled(
         self,
         backend: Backend,
         windows: FloatArray,
         energy_kev: Floats,
-        second: SecondPulses,
+        piled: InTracePileUp,
     ) -> Floats:
-        """Second pulses with shapes of the same batch, in prepared units."""
-        if not len(second.row):
+        """Piled-up pulses with shapes of the same batch, in prepared units."""
+        if not len(piled.row):
             return np.zeros((len(windows), self.length))
-        # early second pulses need longer traces
-        reached = self.length + second.reach(self.ren.dt_ns)
-        shapes, _ = backend.levels(windows[second.partner], self.n_pre, reached)
-        return second.added(np.nan_to_num(shapes), energy_kev, self.ren.dt_ns, self.length)
+        # early piled-up pulses need longer traces
+        reached = self.length + piled.reach(self.ren.dt_ns)
+        shapes, _ = backend.levels(windows[piled.partner], self.n_pre, reached)
+        return piled.added(np.nan_to_num(shapes), energy_kev, self.ren.dt_ns, self.length)
 
 
 def _of_the_data(run: Run) -> tuple[float | None, float | None]:

@@ -30,7 +30,7 @@ def translate(
     *,
     inverse: bool = False,
     noise: bool = True,
-    remains: str | float = NONE,
+    tails: str | float = NONE,
     pile_up_khz: float = 0.0,
     realisations: int = 1,
     adc: bool = False,
@@ -59,10 +59,10 @@ def translate(
         Translate measured pulses to simulation-like ones.
     noise
         Add noise as the data have it.  It is the same in memory and in a file.
-    remains
-        Remains of earlier pulses: ``learned``, ``none``, or a rate in kHz.
+    tails
+        Pile-up tails: ``learned``, ``none``, or a rate in kHz.
     pile_up_khz
-        Rate in kHz of second pulses within a trace.
+        Rate in kHz of piled-up pulses within a trace.
     realisations
         Number of noise draws for each pulse: rows are repeated and numbered.
     adc
@@ -115,7 +115,7 @@ def translate(
         out_table,
         realisations,
         scale if adc else None,
-        remains,
+        tails,
         pile_up_khz,
     )
     files = list(_files(pulses, read, run))

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.second_pulses import SecondPulses
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
@@ -105,7 +105,7 @@ class Translator:
         energy_kev: npt.ArrayLike | None = None,
         noise: bool = True,
         seed: int | None = None,
-        remains_kev: npt.ArrayLike | None = None,
+        tails_kev: npt.ArrayLike | None = None,
     ) -> Waveforms:
         """Translate waveforms, given as a NumPy array or a torch tensor.
 
@@ -121,8 +121,8 @@ class Translator:
             Whether to add noise; without it the result is deterministic.
         seed
             Seed of the noise; None for a random one.
-        remains_kev
-            Remains of earlier pulses under each pulse in keV; `remains` can draw them.
+        tails_kev
+            Pile-up tails under each pulse in keV; `tails` can draw them.
 
         Returns
         -------
@@ -143,11 +143,9 @@ class Translator:
         """
         if isinstance(waveforms, torch.Tensor):
             array = waveforms.detach().cpu().float().numpy()  # NumPy has no bfloat16
-            result = self._translate_array(array, energy_kev, noise, seed, remains_kev)
+            result = self._translate_array(array, energy_kev, noise, seed, tails_kev)
             return torch.from_numpy(result).to(waveforms.device)
-        return self._translate_array(
-            np.asarray(waveforms), energy_kev, noise, seed, remains_kev
-        )
+        return self._translate_array(np.asarray(waveforms), energy_kev, noise, seed, tails_kev)
 
     def translate_pulses(
         self,
@@ -155,8 +153,8 @@ class Translator:
         *,
         noise: bool = True,
         generator: torch.Generator | None = None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
+        tails_kev: Energies | None = None,
+        piled: InTracePileUp | None = None,
     ) -> Translated:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
@@ -169,10 +167,10 @@ class Translator:
             and pulses without energy are rejected.
         generator
             Random generator of the noise.
-        remains_kev
-            Remains of earlier pulses under each pulse in keV, shape ``(n,)``.
-        second
-            Second pulses within the records.
+        tails_kev
+            Pile-up tails under each pulse in keV, shape ``(n,)``.
+        piled
+            Piled-up pulses within the records.
 
         Raises
         ------
@@ -195,14 +193,14 @@ class Translator:
         index = prepared.index[rows]
         waveforms[index], codes[index] = self.apply_with_codes(
             prepared.pulses.waveforms[rows],
-            Drawn(pulses.energy_kev, noise, generator, remains_kev, second).of_rows(index),
+            Drawn(pulses.energy_kev, noise, generator, tails_kev, piled).of_rows(index),
         )
         return Translated(pulses.with_waveforms(waveforms), codes)
 
     @property
-    def remains(self) -> DrawnRemains | None:
-        """Remains of earlier pulses as learned by the run; None if it has no information."""
-        return self.backend.remains
+    def tails(self) -> DrawnTails | None:
+        """Pile-up tails as learned by the run; None if it has no information."""
+        return self.backend.tails
 
     @property
     def needs_energies(self) -> bool:
@@ -216,10 +214,10 @@ class Translator:
         energy_kev: Energies | None = None,
         noise: bool = True,
         generator: torch.Generator | None = None,
-        remains_kev: Energies | None = None,
+        tails_kev: Energies | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        drawn = Drawn(energy_kev, noise, generator, remains_kev)
+        drawn = Drawn(energy_kev, noise, generator, tails_kev)
         return self.apply_with_codes(windows, drawn)[0]
 
     def apply_with_codes(
@@ -251,7 +249,7 @@ class Translator:
         energy_kev: npt.ArrayLike | None,
         noise: bool,
         seed: int | None,
-        remains_kev: npt.ArrayLike | None,
+        tails_kev: npt.ArrayLike | None,
     ) -> FloatArray:
         if not waveforms.ndim:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
@@ -263,10 +261,10 @@ class Translator:
             energies = _one_each("energy_kev", energy_kev, len(pulses))
             pulses = replace(pulses, energy_kev=energies)
         left = None
-        if remains_kev is not None:
-            left = _one_each("remains_kev", remains_kev, len(pulses))
+        if tails_kev is not None:
+            left = _one_each("tails_kev", tails_kev, len(pulses))
         done = self.translate_pulses(
-            pulses, noise=noise, generator=self.seeded(seed), remains_kev=left
+            pulses, noise=noise, generator=self.seeded(seed), tails_kev=left
         )
         if single and not done.valid[0]:
             raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")

@@ -39,7 +39,7 @@ from cpunet.validation.slice_figure import slice_figure
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
-REMAINS = "remains of earlier pulses"
+TAILS = "pile-up tails"
 DRIFT, IN_DRIFT = "clock and blur of the U-Net", 2048  # pulses in it
 SPECTRUM, LOSSES, ROC, DEP = "spectrum", "losses", "A over E survival", "DEP"
 CYCLES = ("forward cycle", "backward cycle")
@@ -52,7 +52,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     peaks = {name: peak.energy_kev for name, peak in found.ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
     made: dict[str, Drawing] = {SPECTRUM: partial(spectrum_figure, energies, peaks)}
-    made |= _remains(found.metrics["remains"] or {})
+    made |= _tails(found.metrics["tails"] or {})
     if methods := found.metrics["ae_energy"].get("methods"):
         made[AE_ENERGY] = partial(ae_energy_figure, methods)
     scored = [peak for peak in found.sets if found.values[peak.name]]
@@ -70,13 +70,13 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     return made
 
 
-def _remains(told: Mapping[str, Any]) -> dict[str, Drawing]:
-    """Sizes of remains with their law, if a training found any and kept them."""
+def _tails(told: Mapping[str, Any]) -> dict[str, Drawing]:
+    """Sizes of tails with their law, if a training found any and kept them."""
     if not (told.get("rate_khz") and "sizes" in told):
         return {}
     wanted = ("rate_khz", "rate_error_khz", "decay_us", "error_kev", "traces")
     known = {name: told[name] for name in wanted}
-    return {REMAINS: partial(sizes_figure, known, told["sizes"], told["drawn"]["energies_kev"])}
+    return {TAILS: partial(sizes_figure, known, told["sizes"], told["drawn"]["energies_kev"])}
 
 
 def _drift(peak: PeakSets, ren: REN) -> dict[str, Drawing]:

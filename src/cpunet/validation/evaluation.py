@@ -101,7 +101,7 @@ def evaluate(
         data_set,
         parse_selection(trained_on, recipe.peaks),
         recipe,
-        remains=ren.remains,
+        tails=ren.tails,
         fitted=baselines,
     )
     made = translate_all(ren, others, sim_set, responses, seed)
@@ -116,7 +116,7 @@ def evaluate(
         )
     details = _details(scored, values, recipe, seed)
     kept = survivals(values, seed)
-    known = None if run.fit is None else run.fit.remains
+    known = None if run.fit is None else run.fit.tails
     metrics = {
         "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
@@ -147,7 +147,7 @@ def evaluate(
             "seed": run.seed,
             "peak": run.peak,
         },
-        "remains": None if known is None else known.model_dump(exclude_unset=True),
+        "tails": None if known is None else known.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,

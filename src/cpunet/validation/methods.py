@@ -22,9 +22,9 @@ from cpunet.electronics.baseline_methods import (
     translate_like_data,
 )
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains, SameNoise, TraceNoise
+from cpunet.electronics.drawn_tails import DrawnTails, SameNoise, TraceNoise
 from cpunet.electronics.finishing import blocks, finish
-from cpunet.electronics.measured import noise_of, remains_of
+from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
@@ -32,7 +32,7 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.learned_remains import wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
@@ -54,7 +54,7 @@ class FittedBaselineMethods:
     methods
         Fitted baseline methods by name.
     noise
-        Noise drawn from the baselines of the data, with remains of earlier pulses if the data
+        Noise drawn from the baselines of the data, with pile-up tails if the data
         have any; None if there are no baselines.
     missing
         Reasons why methods or the noise are missing, by name.
@@ -71,7 +71,7 @@ def fit_baseline_methods(
     fit_on: EnergySelection,
     recipe: Recipe,
     *,
-    remains: DrawnRemains | None = None,
+    tails: DrawnTails | None = None,
     fitted: bool,
 ) -> FittedBaselineMethods:
     """Fit every baseline method to unpaired pulses.
@@ -84,8 +84,8 @@ def fit_baseline_methods(
         Energies on which the methods are fitted: those of the training.
     recipe
         Recipe of the run.
-    remains
-        Remains of earlier pulses as learned by the run.
+    tails
+        Pile-up tails as learned by the run.
     fitted
         Whether to fit the methods; the noise is measured in any case, for the truth.
 
@@ -97,11 +97,11 @@ def fit_baseline_methods(
     config, result = recipe.preparation, FittedBaselineMethods()
     # all but the untranslated simulation, which is scored anyway
     kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
-    there = remains is not None and remains.law.rate_khz > 0
-    found = remains_of(data)[0] if there else None
+    there = tails is not None and tails.law.rate_khz > 0
+    found = tails_of(data)[0] if there else None
     noise = _or_reason(result.missing, "noise", lambda: noise_of(data, found))
     if noise is not None:
-        result.noise = TraceNoise(noise, remains) if there else noise
+        result.noise = TraceNoise(noise, tails) if there else noise
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
@@ -213,7 +213,7 @@ def translate_all(
     true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
     # like the data with which they are compared
-    remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+    tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
     # the random generators of all methods are in the same state
     noise = None if rivals.noise is None else SameNoise(rivals.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
@@ -244,7 +244,7 @@ def translate_all(
                 block.waveforms,
                 energy_kev=block.energy_kev,
                 generator=generator,
-                remains_kev=drawn_kev(remains, len(block), generator),
+                tails_kev=drawn_kev(tails, len(block), generator),
             )
             if truth is not None:
                 truth[rows] = clean["truth"]

@@ -39,7 +39,7 @@ from cpunet.training.fit import match
 from cpunet.training.loop import train
 from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
-from cpunet.translation.learned_remains import wanted_remains
+from cpunet.translation.learned_remains import wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.output_form import drawn_kev
 from cpunet.translation.translator import REN
@@ -330,12 +330,12 @@ class HeldOut:
             If pulses cannot be translated.
         """
         generator = ren.seeded(self.seed)
-        remains = wanted_remains(ren, LEARNED) if ren.remains is not None else None
+        tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
         windows = ren.apply(
             self.sim.waveforms,
             energy_kev=self.sim.energy_kev,
             generator=generator,
-            remains_kev=drawn_kev(remains, len(self.sim), generator),
+            tails_kev=drawn_kev(tails, len(self.sim), generator),
         )
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MAX_LOST:

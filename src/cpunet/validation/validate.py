@@ -168,15 +168,15 @@ def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str
         "distribution do not reach 100 at finite size: the ceiling is what data score "
         "against data at these sizes.",
     ]
-    notes += _of_remains(metrics)
+    notes += _of_tails(metrics)
     if truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
     return notes
 
 
-def _of_remains(metrics: Mapping[str, Any]) -> list[str]:
-    """Remarks on remains of earlier pulses in the data, if they are certain."""
-    told = metrics["remains"] or {}
+def _of_tails(metrics: Mapping[str, Any]) -> list[str]:
+    """Remarks on pile-up tails in the data, if they are certain."""
+    told = metrics["tails"] or {}
     if not told.get("rate_khz"):
         return []
     shares = ", ".join(
@@ -184,8 +184,8 @@ def _of_remains(metrics: Mapping[str, Any]) -> list[str]:
         for size, share in told["percent_above"].items()
     )
     return [
-        f"Traces of the training lie on remains of earlier pulses, {told['rate_khz']:.2f} ± "
+        f"Traces of the training lie on pile-up tails, {told['rate_khz']:.2f} ± "
         f"{told['rate_error_khz']:.2f} kHz decaying with {told['decay_us']:.1f} µs: percent of "
         f"the traces, measured (by the law), {shares}. All translations and the truth have "
-        "remains drawn by this law, as likely as they pass the quality cuts."
+        "tails drawn by this law, as likely as they pass the quality cuts."
     ]

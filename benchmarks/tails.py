@@ -1,6 +1,6 @@
-"""Remains of earlier pulses in a file of raw traces: rate, spreads of slopes, and a picture.
+"""Pile-up tails in a file of raw traces: rate, spreads of slopes, and a picture.
 
-Run with ``python benchmarks/remains.py FILE --kev-per-adc 0.0649 --picture remains.png``.
+Run with ``python benchmarks/tails.py FILE --kev-per-adc 0.0649 --picture tails.png``.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from cpunet.electronics.remains import Remains
+from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
@@ -26,15 +26,15 @@ def main() -> None:
     arguments = parser.parse_args()
     source = open_pulses(arguments.file, kev_per_adc=arguments.kev_per_adc)
     preparation = load_recipe("fast").preparation
-    remains = Remains.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
+    tails = PileUpTails.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
     raw = next(iter(source.blocks(4096)))
     console = Console()
-    for name, value in remains.describe().items():
+    for name, value in tails.describe().items():
         console.print(f"{name}: {value}")
-    after, noise = Slopes.of(raw, remains).spreads
-    console.print(f"slopes without remains {after:.2f} keV, of empty baselines {noise:.2f} keV")
+    after, noise = Slopes.of(raw, tails).spreads
+    console.print(f"slopes without tails {after:.2f} keV, of empty baselines {noise:.2f} keV")
     if arguments.picture:
-        remains_figure(raw, remains).savefig(arguments.picture, dpi=110)
+        remains_figure(raw, tails).savefig(arguments.picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Remains drawn like those of data behind quality cuts."""
+"""Pile-up tails drawn like those of data behind quality cuts."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.drawn_remains import (
+from cpunet.electronics.drawn_tails import (
     SIZES_KEV,
-    DrawnRemains,
+    DrawnTails,
     SameNoise,
     TraceNoise,
     passing,
 )
+from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.electronics.readout import read_out
-from cpunet.electronics.remains import Remains
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import apply_cuts, fit_cuts
@@ -26,9 +26,9 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 
 RECIPE = load_recipe("fast")
-LAW = RemainsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
+LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
 BELOW_30 = tuple(float(kev < 30) for kev in SIZES_KEV)
-DRAWN = DrawnRemains(LAW, 0.9, 0.5, 16.0, BELOW_30)
+DRAWN = DrawnTails(LAW, 0.9, 0.5, 16.0, BELOW_30)
 
 
 def test_what_cuts_take_is_not_drawn():
@@ -51,7 +51,7 @@ def test_another_rate_is_without_cuts():
 
 
 def test_they_are_told_and_read_again():
-    again = DrawnRemains.of(json.loads(json.dumps(DRAWN.describe())))
+    again = DrawnTails.of(json.loads(json.dumps(DRAWN.describe())))
     assert again.describe() == DRAWN.describe()
 
 
@@ -78,7 +78,7 @@ def test_noise_of_several_methods_is_drawn_once_and_is_what_each_would_draw():
         found += 1  # the caller's own
 
 
-def test_records_get_noise_and_remains_in_proportion_to_their_energies():
+def test_records_get_noise_and_tails_in_proportion_to_their_energies():
     noise = BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50)
     energies = np.repeat([500.0, 2000.0], 4000)
     rng = np.random.default_rng(3)
@@ -95,7 +95,7 @@ def test_records_get_noise_and_remains_in_proportion_to_their_energies():
 
 
 @pytest.mark.thorough
-def test_what_passes_is_measured_by_adding_remains_to_traces_without():
+def test_what_passes_is_measured_by_adding_tails_to_traces_without():
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (2500, 1)), 0, 1)
     steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(2500, 2614.5))
@@ -104,13 +104,13 @@ def test_what_passes_is_measured_by_adding_remains_to_traces_without():
     prepared = prepare(raw, RECIPE.preparation, "measured")
     cuts = fit_cuts(prepared, RECIPE.cuts)
     kept = apply_cuts(prepared, cuts)
-    found = Remains.of(Baselines.of([raw], RECIPE.preparation))
+    found = PileUpTails.of(Baselines.of([raw], RECIPE.preparation))
     passed = passing(found, raw[kept.index], RECIPE.preparation, cuts)
     assert passed is not None
     assert passed[0] == 1
     assert passed[-1] == 0
-    drawn = DrawnRemains(found.fit.law, 0.9, 0.0, 16.0, passed)
-    kev, true = drawn.draw_kev(20_000, rng), traces.remains_kev[kept.index]
+    drawn = DrawnTails(found.fit.law, 0.9, 0.0, 16.0, passed)
+    kev, true = drawn.draw_kev(20_000, rng), traces.tails_kev[kept.index]
     for size in (3, 10, 20):
         assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)
     few = passing(found, raw[slice(0, 5)], RECIPE.preparation, cuts)

@@ -1,4 +1,4 @@
-"""What is told of remains of earlier pulses, against stands on which they are known."""
+"""What is told of pile-up tails, against stands on which they are known."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cpunet.electronics.chain import read_electronics
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.electronics.readout import RawTraces, read_out
-from cpunet.electronics.remains import Remains, read_baselines
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -54,29 +54,29 @@ def busy() -> RawTraces:
 
 
 @pytest.fixture(scope="module")
-def found(busy: RawTraces) -> Remains:
-    return Remains.of(Baselines.of(in_blocks(as_pulses(busy)), PREPARATION))
+def found(busy: RawTraces) -> PileUpTails:
+    return PileUpTails.of(Baselines.of(in_blocks(as_pulses(busy)), PREPARATION))
 
 
-def test_each_trace_has_its_remainder(busy: RawTraces, found: Remains):
+def test_each_trace_has_its_tail(busy: RawTraces, found: PileUpTails):
     alone = np.isfinite(found.kev) & (busy.n_piled == 0)
-    off = (found.kev - busy.remains_kev)[alone & (busy.remains_kev < 50)]
+    off = (found.kev - busy.tails_kev)[alone & (busy.tails_kev < 50)]
     assert abs(np.median(off)) < 0.3
     assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.error_kev, rel=0.1)
-    large = alone & (busy.remains_kev > 100)
+    large = alone & (busy.tails_kev > 100)
     # heights of pulses, not their charge, are the scale: 1.5 % less of `ornl`
-    assert np.median(found.kev[large] / busy.remains_kev[large]) == pytest.approx(1, abs=0.02)
+    assert np.median(found.kev[large] / busy.tails_kev[large]) == pytest.approx(1, abs=0.02)
     assert alone.mean() > 0.9
 
 
-def test_the_decay_is_that_of_the_slowest(found: Remains):
+def test_the_decay_is_that_of_the_slowest(found: PileUpTails):
     assert found.coupled
     assert found.decay_error_us is not None
     # tails within the window are 25 % steeper, by the decay of 2.9 us
     assert found.decay_us == pytest.approx(54.6, rel=0.01)
 
 
-def test_the_rate_is_found_without_the_energies(found: Remains):
+def test_the_rate_is_found_without_the_energies(found: PileUpTails):
     assert not found.fit.recorded  # the file has lines alone
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(1, abs=3 * found.fit.rate_error_khz)
@@ -86,7 +86,7 @@ def test_the_rate_is_found_without_the_energies(found: Remains):
 
 @pytest.mark.thorough
 def test_recorded_energies_are_taken_if_they_do():
-    found = Remains.of(Baselines.of([as_pulses(traces_of(0.5, broad=True))], PREPARATION))
+    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.5, broad=True))], PREPARATION))
     assert found.fit.recorded
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(0.5, abs=3 * found.fit.rate_error_khz)
@@ -96,12 +96,12 @@ def test_recorded_energies_are_taken_if_they_do():
     "preset", [pytest.param("ornl", marks=pytest.mark.thorough), "legend200"]
 )
 def test_nothing_is_invented_where_there_is_nothing(preset: str):
-    found = Remains.of(Baselines.of([as_pulses(traces_of(0.0, preset))], PREPARATION))
+    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.0, preset))], PREPARATION))
     assert found.law is None
     assert found.describe()["rate_khz"] == 0
 
 
-def test_remains_are_taken_off(busy: RawTraces, found: Remains):
+def test_tails_are_taken_off(busy: RawTraces, found: PileUpTails):
     raw = as_pulses(busy)
     flat = found.subtracted_from(raw)
     alone = np.isfinite(found.kev) & (busy.n_piled == 0)
@@ -109,10 +109,10 @@ def test_remains_are_taken_off(busy: RawTraces, found: Remains):
         read_baselines(traces.waveforms[:, : found.samples].astype(float), 16, 54.6)[1]
         for traces in (raw, flat)
     ]
-    empty = alone & (busy.remains_kev < 0.01)
+    empty = alone & (busy.tails_kev < 0.01)
     spread = 1.4826 * np.median(np.abs(slopes[1][alone]))
     noise = 1.4826 * np.median(np.abs(slopes[0][empty]))
-    # less than noise alone, of which a part is taken for a remainder and off
+    # less than noise alone, of which a part is taken for a tail and off
     assert 0.5 * noise < spread < 1.1 * noise
     assert slopes[0][alone].std() > 10 * spread
 
@@ -122,29 +122,29 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     raw = as_pulses(busy)
     lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
     blocks = [raw.with_waveforms(lost.astype(np.float32))]
-    found = Remains.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
+    found = PileUpTails.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
     assert not found.coupled
     assert found.describe()["told_by"] == "slope"
-    large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.remains_kev > 100)
-    ratio = np.median(found.kev[large] / busy.remains_kev[large])
+    large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)
+    ratio = np.median(found.kev[large] / busy.tails_kev[large])
     assert ratio == pytest.approx(1, abs=0.1)
-    # noise is measured where slopes are negative: it has all its power, and few remains
+    # noise is measured where slopes are negative: it has all its power, and few tails
     empty = found.empty(blocks[0])
-    assert (busy.remains_kev[empty] > found.error_kev).mean() < 0.05
-    told = np.isfinite(found.kev) & (busy.remains_kev < 0.2 * found.error_kev)
+    assert (busy.tails_kev[empty] > found.error_kev).mean() < 0.05
+    told = np.isfinite(found.kev) & (busy.tails_kev < 0.2 * found.error_kev)
     square, alone = found.kev[told & empty] ** 2, found.kev[told] ** 2
     assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
 
 
 @pytest.mark.thorough
-def test_traces_that_all_lie_on_remains_are_told():
-    with pytest.raises(CpunetError, match="nearly all traces lie on remains"):
-        Remains.of(Baselines.of([as_pulses(traces_of(3.0, "legend200"))], PREPARATION))
+def test_traces_that_all_lie_on_tails_are_told():
+    with pytest.raises(CpunetError, match="nearly all traces lie on pile-up tails"):
+        PileUpTails.of(Baselines.of([as_pulses(traces_of(3.0, "legend200"))], PREPARATION))
 
 
 @pytest.mark.thorough
 def test_slow_decays_are_told_by_their_levels():
-    found = Remains.of(Baselines.of([as_pulses(traces_of(0.3, "legend200"))], PREPARATION))
+    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.3, "legend200"))], PREPARATION))
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(0.3, abs=3 * found.fit.rate_error_khz)
     assert found.decay_us == pytest.approx(570, rel=0.05)
@@ -161,14 +161,14 @@ def test_slow_decays_are_told_by_their_levels():
 )
 def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: str):
     with pytest.raises(CpunetError, match=said) as caught:
-        Remains.of(Baselines.of([change(as_pulses(busy, slice(0, 400)))], PREPARATION))
+        PileUpTails.of(Baselines.of([change(as_pulses(busy, slice(0, 400)))], PREPARATION))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.thorough
 def test_a_bench_detector_follows_the_law(reference_data: Path):
     source = open_pulses(reference_data / "real" / "th228.fcio", kev_per_adc=2614.5 / 40265)
-    found = Remains.of(Baselines.of(source.blocks(1000), PREPARATION))
+    found = PileUpTails.of(Baselines.of(source.blocks(1000), PREPARATION))
     assert found.law is not None
     assert found.fit.recorded
     assert found.decay_us == pytest.approx(85, rel=0.04)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.electronics.remains_fit import fit_rate
-from cpunet.electronics.remains_law import (
-    RemainsLaw,
+from cpunet.electronics.tails_fit import fit_rate
+from cpunet.electronics.tails_law import (
+    TailsLaw,
     characteristic_exponents,
     energies_at,
 )
@@ -17,14 +17,14 @@ TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
 
 
 def test_share_above_is_the_closed_form():
-    law = RemainsLaw(2.0, 50.0, (100, 100))
+    law = TailsLaw(2.0, 50.0, (100, 100))
     expected = 1 - np.exp(-0.1 * np.log([100, 10, 1]))
     assert law.share_above([1, 10, 100]) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("rate_khz", [0.3, 3.0])
-def test_drawn_remains_have_the_characteristic_function_of_the_law(rate_khz: float):
-    law = RemainsLaw(rate_khz, 54.6, TH228)
+def test_drawn_tails_have_the_characteristic_function_of_the_law(rate_khz: float):
+    law = TailsLaw(rate_khz, 54.6, TH228)
     drawn = law.draw(100_000, np.random.default_rng(1))
     assert drawn.mean() == pytest.approx(law.mean_kev, rel=0.1)
     u = np.geomspace(1e-3, 0.5, 10)
@@ -41,7 +41,7 @@ def test_energies_follow_their_quantiles():
 
 @pytest.mark.parametrize("error_kev", [pytest.param(0.3, marks=pytest.mark.thorough), 3.0])
 def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
-    law, rng = RemainsLaw(1.5, 54.6, TH228), np.random.default_rng(3)
+    law, rng = TailsLaw(1.5, 54.6, TH228), np.random.default_rng(3)
     energies = energies_at(rng.random(8000), TH228)
     measured = law.draw(8000, rng) + rng.normal(0, error_kev, 8000)
     found = fit_rate(measured, error_kev, 54.6, energies)
@@ -51,6 +51,6 @@ def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
 
 
 def test_too_many_earlier_pulses_are_refused_before_they_fill_the_memory():
-    endless = RemainsLaw(0.02, 1e12, TH228)
+    endless = TailsLaw(0.02, 1e12, TH228)
     with pytest.raises(CpunetError, match="give a lower rate or a shorter decay"):
         endless.draw(1000, np.random.default_rng(1))
