@@ -24,8 +24,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> cpunet.Report:
 @pytest.mark.thorough
 def test_every_method_and_the_truth_stand_beside_the_ren(whole: cpunet.Report) -> None:
     metrics = whole.to_dict()
-    assert metrics["rivals"]["missing"] == {}
-    assert set(metrics["rivals"]["fits"]) == set(BASELINE_METHODS)
+    assert metrics["baseline_methods"]["missing"] == {}
+    assert set(metrics["baseline_methods"]["fits"]) == set(BASELINE_METHODS)
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         iou = scores["parameters"]["current_amplitude"]["iou"]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Loaded: TypeAlias = Run | Report | Stand | PulseFile
 
 _DPI = 150
-_LOOKED_AT, _TAILS_BLOCK = 256, 4096  # traces read at a time
+_FIRST_PULSES, _TAILS_BLOCK = 256, 4096  # traces read at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -311,7 +311,7 @@ def _is_measured(source: PulseSource) -> bool:
 
     found = recorded_side(source)
     if found is None:
-        first = next(iter(source.blocks(_LOOKED_AT)), None)
+        first = next(iter(source.blocks(_FIRST_PULSES)), None)
         found = None if first is None else apparent_side(first.waveforms)
     # translated windows look measured, but are not raw traces
     return found is not None and found.side == "measured" and "translated" not in found.why

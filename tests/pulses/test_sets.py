@@ -66,19 +66,22 @@ def test_every_pulse_is_kept_or_counted() -> None:
     st.lists(st.sampled_from([1000.0, 50.0, np.nan]), min_size=1, max_size=20),
     st.integers(1, 20),
 )
-def test_counts_add_up(energies: list[float], most: int) -> None:
+def test_counts_add_up(energies: list[float], max_pulses: int) -> None:
     source = source_of([*energies, 1000.0])
-    prepared = load_prepared(source, CONFIG, "measured", select=near_1000, most=most)
+    prepared = load_prepared(
+        source, CONFIG, "measured", select=near_1000, max_pulses=max_pulses
+    )
     assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read
     assert prepared.n_read == len(energies) + 1
-    assert len(prepared) == min(most, energies.count(1000.0) + 1)
+    assert len(prepared) == min(max_pulses, energies.count(1000.0) + 1)
     assert (source.read().energy_kev[prepared.index] == 1000).all()
 
 
 def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     source = source_of([1000.0, 50.0] * 500)
     first, second = (
-        load_prepared(source, CONFIG, "measured", select=near_1000, most=60) for _ in range(2)
+        load_prepared(source, CONFIG, "measured", select=near_1000, max_pulses=60)
+        for _ in range(2)
     )
     assert (len(first), first.n_read) == (60, 1000)
     assert first.rejections == {"energy_outside_selection": 500, "not_drawn": 440}

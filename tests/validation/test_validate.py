@@ -216,7 +216,7 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     pulses = peak.by_method()
     # the others have no noise: these baselines are too short for its spectrum
     assert list(pulses) == ["data", "raw", "ren"]
-    assert set(found.metrics["rivals"]["missing"]) == {"noise"}
+    assert set(found.metrics["baseline_methods"]["missing"]) == {"noise"}
     assert all(len(p) == len(peak.sim_rows) for m, p in pulses.items() if m != "data")
     again = found.ren.apply(
         found.sim.prepared.pulses.waveforms,

@@ -18,7 +18,7 @@ import scipy.fft
 
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.noise_spectrum import FIRST_CLEAN_BIN, spectrum
-from cpunet.electronics.pile_up_tails import MIN_N, SIGMA_PER_MAD
+from cpunet.electronics.pile_up_tails import MIN_BASELINES, SIGMA_PER_MAD
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray, Pulses
@@ -112,10 +112,10 @@ class BaselineNoise:
                 f"{2 * FIRST_CLEAN_BIN} or more, so raise preparation.baseline_samples"
             )
         flat = baselines[_flat(baselines)] if len(baselines) else baselines
-        if len(flat) < MIN_N:
+        if len(flat) < MIN_BASELINES:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {n} traces; give more traces "
-                f"(at least {MIN_N} with known energy)"
+                f"(at least {MIN_BASELINES} with known energy)"
             )
         if not np.ptp(flat, axis=1).any():
             raise CpunetError(
@@ -275,7 +275,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
 
     one = np.zeros(len(flat), np.intp)
-    kinds = min(KINDS, len(flat) // MIN_N)
+    kinds = min(KINDS, len(flat) // MIN_BASELINES)
     bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
     if kinds < 2 or bins < BANDS:
         return one
@@ -293,7 +293,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     with warnings.catch_warnings(action="ignore"):
         centres, which = scipy.cluster.vq.kmeans2(points, kinds, minit="++", rng=rng, iter=50)
     # baselines of kinds with too few are assigned to the nearest kind with enough
-    enough = np.bincount(which, minlength=kinds) >= MIN_N
+    enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
     if not enough.any():
         return one
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
@@ -313,10 +313,10 @@ def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> V
     energy_kev = baselines.first.energy_kev
     known = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
     rows = np.flatnonzero(known[baselines.prepared.index])
-    if len(rows) < MIN_N:
+    if len(rows) < MIN_BASELINES:
         raise CpunetError(
             f"only {len(rows)} of {chosen.sum()} traces have a known energy and can be "
-            f"prepared; give {MIN_N} or more to take the noise from"
+            f"prepared; give {MIN_BASELINES} or more to take the noise from"
         )
     before = baselines.before[rows]
     length = min(int(np.quantile(before, SHORTEST_SHARE)), baselines.first.length)

@@ -24,7 +24,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 
-MIN_N = 30  # minimum number of baselines
+MIN_BASELINES = 30  # minimum number of baselines
 SIGMA_PER_MAD = 1.4826
 MIN_LARGE = 20  # minimum number of large tails to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
@@ -56,11 +56,11 @@ def usable(baselines: Baselines) -> UsableBaselines:
         or the pulses do not decay.
     """
     prepared, length = baselines.prepared, baselines.length
-    if len(prepared) < MIN_N:
+    if len(prepared) < MIN_BASELINES:
         reasons = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
         raise CpunetError(
             f"only {len(prepared)} of {len(baselines)} traces can be prepared "
-            f"({reasons or 'there are no more'}); {MIN_N} or more are needed to tell "
+            f"({reasons or 'there are no more'}); {MIN_BASELINES} or more are needed to tell "
             "pile-up tails"
         )
     if length < MIN_SAMPLES:
@@ -71,10 +71,10 @@ def usable(baselines: Baselines) -> UsableBaselines:
     with np.errstate(divide="ignore"):  # an energy of 0 is left out
         gains = baselines.height / prepared.pulses.energy_kev
     gains = gains[np.isfinite(gains) & (gains > 0)]
-    if len(gains) < MIN_N:
+    if len(gains) < MIN_BASELINES:
         raise CpunetError(
-            f"only {len(gains)} traces have a known energy and can be prepared; {MIN_N} or "
-            "more are needed to tell pile-up tails in keV"
+            f"only {len(gains)} traces have a known energy and can be prepared; "
+            f"{MIN_BASELINES} or more are needed to tell pile-up tails in keV"
         )
     large = prepared.scale >= np.median(prepared.scale)
     slope = float(np.median(prepared.tail_slope[large]))
@@ -141,7 +141,7 @@ def read_baselines(
 def widest(width: FloatArray) -> float:
     """RMS beyond which a baseline holds another pulse."""
     finite = width[np.isfinite(width)]
-    if len(finite) < MIN_N:
+    if len(finite) < MIN_BASELINES:
         raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
     centre = float(np.median(finite))
     sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))

@@ -39,7 +39,7 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
 # and from which a warning tells of it; traces in which a second rate is looked for.
-MAX_APART, FEW_APART, LOOKED_AT = 0.2, 0.1, 512
+MAX_APART, FEW_APART, RATE_TRACES = 0.2, 0.1, 512
 SWAPPED = "are `sim` and `data` swapped?"
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
@@ -134,7 +134,7 @@ def load_pulses(
     recipe: Recipe,
     selection: EnergySelection,
     *,
-    most: int | None = None,
+    max_pulses: int | None = None,
     tell: bool = True,
 ) -> InputSet:
     """Read and prepare the selected pulses of a file; measured ones have their quality cuts.
@@ -147,7 +147,7 @@ def load_pulses(
         Recipe with the preparation, the cuts and the peaks.
     selection
         Energies to use.
-    most
+    max_pulses
         Use a sample of so many pulses, if there are more.
     tell
         Whether the log says what was found.
@@ -166,7 +166,7 @@ def load_pulses(
             side,
             select=selection.select,
             peaks=lambda energies: label_peaks(energies, recipe.peaks),
-            most=most,
+            max_pulses=max_pulses,
             seen=seen,
         )
     except CpunetError as error:
@@ -264,7 +264,7 @@ class _Seen:
         if self._first is None:
             if not (self._recorded or self._insist):
                 require_apparent_side(self._path, block.waveforms, self._side, SWAPPED)
-            self._first = block.waveforms[:LOOKED_AT].copy()
+            self._first = block.waveforms[:RATE_TRACES].copy()
         self._kev.append(block.energy_kev)
         self._amplitudes.append(amplitude(block.waveforms))
         if self._side == "simulated":

@@ -24,7 +24,7 @@ SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
 TRANSLATION = "cpunet_translation"
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 
-_LOOKED_AT = 256  # pulses
+_FIRST_PULSES = 256  # pulses
 _MIN_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
 _FULL_HEIGHT = 10.0  # in ADC counts; smaller whole numbers may be a charge in its own units
 _TURNS = 3  # turning points of the baseline: noise has at least this many, a signal fewer
@@ -73,7 +73,7 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     """
     if require_recorded_side(source, wanted, remedy) or insist:
         return
-    first = next(iter(source.blocks(_LOOKED_AT)))
+    first = next(iter(source.blocks(_FIRST_PULSES)))
     require_apparent_side(source.path, first.waveforms, wanted, remedy)
 
 
@@ -88,7 +88,7 @@ def require_apparent_side(
     path: Path, waveforms: npt.NDArray[np.floating], wanted: Kind, remedy: str
 ) -> None:
     """Refuse pulses that appear to be of the other side by the first ones of them."""
-    _require(apparent_side(waveforms[:_LOOKED_AT]), path, wanted, remedy)
+    _require(apparent_side(waveforms[:_FIRST_PULSES]), path, wanted, remedy)
 
 
 def _require(found: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:

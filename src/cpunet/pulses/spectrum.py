@@ -12,7 +12,7 @@ Values = npt.NDArray[np.float64]
 
 WITHIN = 0.03  # relative half-width of the search range of a line
 BIN_KEV = 1.0
-MIN_N = 30  # minimum counts in the highest bins of a line
+MIN_COUNTS = 30  # minimum counts in the highest bins of a line
 ABOVE = 4.0  # minimum ratio of a line's counts to those beside it
 WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
 
@@ -52,7 +52,7 @@ def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
     centre = 0.5 * (edges[1:] + edges[:-1])
     highest = np.flatnonzero(near == near.max())
     top = int(highest[np.abs(centre[highest] - expected_kev).argmin()])
-    if near[top] < MIN_N or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
+    if near[top] < MIN_COUNTS or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
         return None
     part = slice(max(top - WIDTH_BINS, 0), top + WIDTH_BINS + 1)
     return float(np.average(centre[part], weights=counts[part]))
@@ -140,7 +140,7 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     """
     known = np.asarray(amplitudes, float)
     known = np.log(known[np.isfinite(known) & (known > 0)])
-    if len(known) < MIN_N:
+    if len(known) < MIN_COUNTS:
         return None
     edges = np.arange(known.min() - LOG_BIN, known.max() + 2 * LOG_BIN, LOG_BIN)
     if len(edges) < MIN_BINS:  # one energy

@@ -26,7 +26,7 @@ Values = npt.NDArray[np.float64]
 PeakTable = dict[str, dict[str, float | None]]
 
 ACCEPTANCE = 0.9  # fraction of the DEP that survives
-MIN_N = 20  # events of the DEP: two below the cut
+MIN_PULSES = 20  # events of the DEP: two below the cut
 DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
 
@@ -114,10 +114,10 @@ def ae_survival(
     if bootstraps < 2:
         raise CpunetError(f"bootstraps is {bootstraps}; a spread needs 2 or more")
     dep = dep_ae[np.isfinite(dep_ae)]
-    if dep.size < MIN_N:
+    if dep.size < MIN_PULSES:
         raise CpunetError(
             f"{dep.size} events of the double-escape peak have an A/E; "
-            f"a cut needs {MIN_N} or more"
+            f"a cut needs {MIN_PULSES} or more"
         )
     rng = np.random.default_rng(seed)
     # for this quantile the acceptance of new events is exact on average for any sample size
@@ -184,7 +184,7 @@ def survival_table(
     found: dict[str, Survival | None] = {}
     for method, peaks in sets.items():
         others = {name: peaks[name] for name in data if name != DEP}
-        enough = np.isfinite(peaks[DEP]).sum() >= MIN_N
+        enough = np.isfinite(peaks[DEP]).sum() >= MIN_PULSES
         found[method] = (
             ae_survival(peaks[DEP], others, bootstraps=bootstraps, seed=rng) if enough else None
         )

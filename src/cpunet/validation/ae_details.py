@@ -22,7 +22,7 @@ from cpunet.validation.resampling import Resampled, resampled_twice
 Values = npt.NDArray[np.float64]
 
 QUANTILES = {"q16": 0.16, "median": 0.5, "q84": 0.84}
-MIN_N = 10  # minimum events of a bin for errors of its quantiles
+MIN_PULSES = 10  # minimum events of a bin for errors of its quantiles
 TIME_BINS = 8
 EVENTS_PER_CELL = 10  # with fewer, resampled data agree better than independent data
 MAX_BINS = 25
@@ -153,8 +153,8 @@ def _finite_pairs(method: str, ae: Values, time: Values) -> tuple[Values, Values
 
 def _bin(ae: Values, time: Values) -> dict[str, Any]:
     n = len(ae)
-    if n < MIN_N:
-        return {"n": n, "missing": f"{n} events (at least {MIN_N} are needed)"}
+    if n < MIN_PULSES:
+        return {"n": n, "missing": f"{n} events (at least {MIN_PULSES} are needed)"}
     row: dict[str, Any] = {"n": n, "time_ns": float(np.median(time))}
     for name, p in QUANTILES.items():
         # scatter of the rank of a quantile, which is independent of the distribution

@@ -29,7 +29,7 @@ from cpunet.validation.mean_pulse import known_mean
 Values = npt.NDArray[np.float64]
 
 SLICES = 4
-MIN_N = 10  # minimum pulses of a slice for an error of its mean
+MIN_PULSES = 10  # minimum pulses of a slice for an error of its mean
 EDGE_SAMPLES = 100
 
 
@@ -164,7 +164,7 @@ def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]
         )
     return tuple(
         None
-        if min(measured.n, other.n) < MIN_N
+        if min(measured.n, other.n) < MIN_PULSES
         else Residual(other.mean - measured.mean, np.hypot(other.error, measured.error))
         for measured, other in zip(data.pulses, method.pulses, strict=True)
     )
@@ -236,7 +236,7 @@ def _rows(data: Slices, method: Slices, dt_ns: float, edge_samples: int) -> list
         counts = {"n": own.n, "n_data": measured.n}
         if residual is None:
             few = f"{own.n} pulses beside {measured.n} measured ones"
-            rows.append({**counts, "missing": f"{few} (at least {MIN_N} are needed)"})
+            rows.append({**counts, "missing": f"{few} (at least {MIN_PULSES} are needed)"})
         else:
             rows.append({**counts, **_numbers(residual, near, data.before, dt_ns)})
     return rows

@@ -136,7 +136,7 @@ def evaluate(
         "drift_slices": {name: of_peak.slice_table for name, of_peak in details.items()},
         "noise": {name: _noise(peaks[name]["noise"]) for name in details},
         "linearity": _linearity(ren, max(scored, key=lambda peak: len(peak.sim_rows)), seed),
-        "rivals": {
+        "baseline_methods": {
             "fits": {name: method.describe() for name, method in others.methods.items()},
             "missing": others.missing,
         },
@@ -165,8 +165,8 @@ def _load_both(
     max_pulses: int,
 ) -> tuple[InputSet, InputSet]:
     selection = validation_selection(names, ren.recipe)
-    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, most=max_pulses)
-    data_set = load_pulses(data, "measured", ren.recipe, selection, most=max_pulses)
+    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, max_pulses=max_pulses)
+    data_set = load_pulses(data, "measured", ren.recipe, selection, max_pulses=max_pulses)
     require_same_sampling(sim_set, data_set)
     if not np.isclose(sim_set.dt_ns, ren.dt_ns):
         raise CpunetError(

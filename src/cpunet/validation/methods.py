@@ -164,7 +164,7 @@ class Translations:
     """
 
     ren: REN
-    rivals: FittedBaselineMethods
+    baselines: FittedBaselineMethods
     simulated: Pulses
     noisy: dict[str, FloatArray] = field(default_factory=dict)
     whole: dict[str, Flags] = field(default_factory=dict)
@@ -175,7 +175,7 @@ class Translations:
         """Noise-free windows of some pulses by method, with the truth if it is known."""
         pulses, config = self.simulated[rows], self.ren.recipe.preparation
         found = {"raw": pulses.waveforms}
-        for name, method in self.rivals.methods.items():
+        for name, method in self.baselines.methods.items():
             found[name] = translate_like_data(method, pulses, config).waveforms
         found["ren"] = self.ren.apply(pulses.waveforms, noise=False)
         return found if self.truth is None else found | {"truth": self.truth[rows]}
@@ -183,7 +183,7 @@ class Translations:
 
 def translate_all(
     ren: REN,
-    rivals: FittedBaselineMethods,
+    baselines: FittedBaselineMethods,
     sim: InputSet,
     responses: Responses | None,
     seed: int,
@@ -192,7 +192,7 @@ def translate_all(
 
     Parameters
     ----------
-    ren, rivals
+    ren, baselines
         REN and baseline methods.
     sim
         Prepared simulated pulses.
@@ -202,12 +202,12 @@ def translate_all(
         Seed of the noise, common to all methods.
     """
     pulses, recipe = sim.prepared.pulses, ren.recipe
-    others = [*rivals.methods, *(["truth"] if responses is not None else [])]
+    others = [*baselines.methods, *(["truth"] if responses is not None else [])]
     shape = (len(pulses), recipe.preparation.length)
     noisy = {
         name: np.empty(shape, np.float32)
-        for name in (*rivals.methods, "ren", "truth")  # from the simplest to the truth
-        if name == "ren" or (name in others and rivals.noise is not None)
+        for name in (*baselines.methods, "ren", "truth")  # from the simplest to the truth
+        if name == "ren" or (name in others and baselines.noise is not None)
     }
     truth = None if responses is None else np.empty(shape, np.float32)
     true_records = iter(()) if responses is None else responses.blocks()
@@ -215,7 +215,7 @@ def translate_all(
     # like the data with which they are compared
     tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
     # the random generators of all methods are in the same state
-    noise = None if rivals.noise is None else SameNoise(rivals.noise)
+    noise = None if baselines.noise is None else SameNoise(baselines.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
     with stage("Translating", len(pulses)) as bar:
@@ -226,7 +226,7 @@ def translate_all(
                 records = (
                     next(true_records)
                     if name == "truth"
-                    else rivals.methods[name].translate(block.waveforms)
+                    else baselines.methods[name].translate(block.waveforms)
                 )
                 finished = finish(
                     records,
@@ -253,7 +253,7 @@ def translate_all(
             bar.update(len(block))
     whole = {name: _whole(windows) for name, windows in noisy.items()}
     joined = {name: _joined(found) for name, found in parts.items()}
-    return Translations(ren, rivals, pulses, noisy, whole, joined, truth)
+    return Translations(ren, baselines, pulses, noisy, whole, joined, truth)
 
 
 def _numbers(

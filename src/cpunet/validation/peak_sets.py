@@ -19,7 +19,7 @@ from cpunet.validation.methods import Translations
 from cpunet.validation.paired import PairedScores, scores_of_squares
 from cpunet.validation.when_asked import WhenAsked
 
-MIN_N = 10  # minimum number of pulses of a distribution
+MIN_PULSES = 10  # minimum number of pulses of a distribution
 
 Rows = npt.NDArray[np.int64]
 
@@ -76,7 +76,7 @@ class PeakSets:
         }
         for name, whole in self.made.whole.items():
             rows = self._whole(whole)
-            if len(rows) >= MIN_N or name == "ren":
+            if len(rows) >= MIN_PULSES or name == "ren":
                 makers[name] = partial(self._noisy, name, rows)
         return WhenAsked(makers)
 
@@ -91,7 +91,7 @@ class PeakSets:
         found = {}
         for name, kept in self.made.clean.items():
             rows = self._whole(kept.whole)
-            if name not in ("raw", "ren") and len(rows) >= MIN_N:
+            if name not in ("raw", "ren") and len(rows) >= MIN_PULSES:
                 found[f"{name}{NO_NOISE}"] = {k: v[rows] for k, v in kept.parameters.items()}
         return found
 
@@ -126,8 +126,8 @@ class PeakSets:
     def missing(self) -> str | None:
         """Reason why the peak cannot be scored; None if it can."""
         sides = (("simulated", self.sim_rows), ("measured", self.data_rows))
-        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_N]
-        return f"{' and '.join(few)} pulses (at least {MIN_N} are needed)" if few else None
+        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
+        return f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)" if few else None
 
     def _whole(self, flags: npt.NDArray[np.bool_]) -> Rows:
         return self.sim_rows[flags[self.sim_rows]]

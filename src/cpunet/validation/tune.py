@@ -54,7 +54,7 @@ log = logging.getLogger(__name__)
 JOURNAL, BEST, TABLE = "journal.log", "best.yaml", "trials.csv"
 STARTS = 8  # random trials before the first Gaussian process
 SHARE = 0.3  # share of the pulses of each side that is held out
-MIN_N = 20  # minimum per side for a distribution
+MIN_PULSES = 20  # minimum per side for a distribution
 MAX_LOST = 0.01  # share of lost translations: losing bad ones would improve the score
 # pulses and their comparison must be the same for all trials, so only these may be tuned
 TUNED = ("generator", "discriminator", "training")
@@ -373,10 +373,10 @@ def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
     """The pulses of a side to fit, and those held out."""
     prepared = side.prepared
     rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
-    if n < MIN_N:
+    if n < MIN_PULSES:
         raise CpunetError(
             f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, "
-            f"and {MIN_N} are needed; select more energies (`peak`) or give more"
+            f"and {MIN_PULSES} are needed; select more energies (`peak`) or give more"
         )
     rest = replace(side, prepared=prepared[np.sort(rows[n:])])
     return rest, prepared.pulses[np.sort(rows[:n])]

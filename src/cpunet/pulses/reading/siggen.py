@@ -19,7 +19,7 @@ from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 # (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
 _SPE = struct.Struct("<i8siiiiii")
 
-_MIN_N = 16  # samples: shorter lines are not pulses but some other table
+_MIN_SAMPLES = 16  # samples: shorter lines are not pulses but some other table
 _UNEVEN = 0.1  # of a step: times are printed with few digits
 
 
@@ -66,7 +66,7 @@ class TextSource(PulseSource):
         if length == 2:
             time_ns, self._pulse = np.array(list(_lines(path))).T
             length = len(time_ns)
-        if length < _MIN_N:
+        if length < _MIN_SAMPLES:
             raise CpunetError(
                 f"{path}: {length} numbers are no pulse; give time (ns) and value, "
                 "or one pulse a line"
