@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cpunet.electronics.baseline_methods import BASELINE_METHODS, RC, Raw, translate_like_data
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.fitted_kernels import LEAD, GaussExp, Superpulse, crossing
+from cpunet.electronics.fitted_kernels import LEAD, GaussExp, SuperpulseKernel, crossing
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
@@ -121,7 +121,7 @@ def two_pole_kernel() -> np.ndarray:
 def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     kernel = two_pole_kernel()
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    method = Superpulse.fit(sim, data, DT_NS, ALIGN)
+    method = SuperpulseKernel.fit(sim, data, DT_NS, ALIGN)
     steps = np.cumsum(method.kernel)[np.newaxis]
     time = np.arange(0, 200) * DT_NS
     true = np.interp(time, np.arange(len(kernel)) * FINE_NS, np.cumsum(kernel) / kernel.sum())

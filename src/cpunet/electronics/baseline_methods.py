@@ -19,7 +19,7 @@ from cpunet.electronics.finishing import (
     finish,
     record_length,
 )
-from cpunet.electronics.fitted_kernels import GaussExp, Superpulse
+from cpunet.electronics.fitted_kernels import GaussExp, SuperpulseKernel
 from cpunet.electronics.window_response import (
     Values,
     currents,
@@ -246,5 +246,5 @@ def translate_like_data(
 
 
 BASELINE_METHODS: dict[str, type[BaselineMethod]] = {
-    method.name: method for method in (Raw, RC, GaussExp, Superpulse)
+    method.name: method for method in (Raw, RC, GaussExp, SuperpulseKernel)
 }

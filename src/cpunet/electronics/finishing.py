@@ -75,7 +75,7 @@ def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> F
     return extended(windows, config, dt_ns, record_length(config.length), before)
 
 
-Noise = BaselineNoise | TraceNoise | SameNoise
+RecordNoise = BaselineNoise | TraceNoise | SameNoise
 
 BLOCK = 512  # pulses at a time, to bound memory
 
@@ -108,7 +108,7 @@ def finish(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: Noise | None = None,
+    noise: RecordNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,
@@ -172,7 +172,7 @@ def finish(
 
 
 def _check_noise(
-    noise: Noise,
+    noise: RecordNoise,
     dt_ns: float,
     energy_kev: npt.NDArray[np.float64] | None,
     n: int,

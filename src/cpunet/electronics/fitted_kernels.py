@@ -6,7 +6,7 @@ Their means can, once both datasets are divided at the same quantiles of rise ti
 one slice then originate from the same regions of the detector.
 
 `GaussExp` is the method of LEGEND's production: sigma and tau are fitted to the superpulses.
-`Superpulse` divides their spectra. In each slice the mean measured current is the mean
+`SuperpulseKernel` divides their spectra. In each slice the mean measured current is the mean
 simulated one convolved with the kernel. The transfer function of the kernel is therefore the
 ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener factor suppresses H
 where the measured spectrum does not exceed its statistical error.
@@ -249,7 +249,7 @@ FADE_IN, FADE_OUT = 8, 64  # samples over which the ends of the kernel are taper
 
 
 @dataclass(frozen=True, eq=False)
-class Superpulse:
+class SuperpulseKernel:
     r"""A free kernel followed by an exponential decay.
 
     .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad

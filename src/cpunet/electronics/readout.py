@@ -194,7 +194,7 @@ def noise_of(
     if noise.spectrum is not None:
         unit = coloured_noise(noise.spectrum, n, length, dt_ns, rng)
     else:
-        assert noise.baselines_file is not None  # Noise validates this
+        assert noise.baselines_file is not None  # ReadoutNoise validates this
         unit = cut_noise(read_baselines(noise.baselines_file, length, dt_ns), n, length, rng)
     return unit * np.float32(noise.rms_kev)
 

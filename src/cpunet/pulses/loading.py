@@ -44,7 +44,7 @@ SWAPPED = "are `sim` and `data` swapped?"
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
-class Part(BaseModel):
+class InfoPart(BaseModel):
     """Further entries are kept as they are."""
 
     model_config = ConfigDict(
@@ -56,7 +56,7 @@ class Part(BaseModel):
     )
 
 
-class SideInfo(Part):
+class SideInfo(InfoPart):
     """The pulses of one side of a training, as far as they are known.
 
     Parameters

@@ -33,7 +33,7 @@ import cpunet
 from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.pulses.loading import Part, SideInfo
+from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
 from cpunet.training.loop import Record
@@ -62,14 +62,14 @@ Network = TypeVar("Network", bound=nn.Module)
 _NOT_STORED: Any = {"exclude": True, "repr": False}
 
 
-class TailsInfo(Part):
+class TailsInfo(InfoPart):
     """What was measured of pile-up tails, and what to draw them from."""
 
     rate_khz: float = 0.0
     drawn: dict[str, Any] | None = None
 
 
-class FitInfo(Part):
+class FitInfo(InfoPart):
     """Fit of a readout chain: its parameters, their errors and covariance, and its quality."""
 
     chi_square: float | None = None
@@ -92,7 +92,7 @@ class FitInfo(Part):
         return self.chi_square / self.moments
 
 
-class Run(Part):
+class Run(InfoPart):
     """A training run, returned by `cpunet.train` or opened with `Run.load`.
 
     Parameters
