@@ -5,7 +5,6 @@ from __future__ import annotations
 import h5py
 import lh5
 import numpy as np
-import pytest
 from lgdo import Array, Scalar, Struct
 
 
@@ -62,16 +61,3 @@ def test_a_library_is_made(command, tmp_path):
         assert refused.code == 2
         assert "Traceback" not in refused.err
         assert not (tmp_path / "other.lh5").exists()
-
-
-@pytest.mark.slow
-def test_export(command, trained, tmp_path):
-    out = tmp_path / "ren.onnx"
-    done = command("export", "onnx", trained, "--out", out)
-    assert done.code == 0, done.err
-    assert "of the run" in done.out
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["ren.card.md", "ren.onnx"]
-    card = (tmp_path / "ren.card.md").read_text()
-    assert "recipe paper" in card
-    assert "`epsilon`" in card
-    assert "data.lh5" in card

@@ -60,18 +60,6 @@ def test_pulses_of_a_file(command, hits: Path, tmp_path: Path):
     assert "library pulses" in outcome.out
 
 
-def test_moved_and_mirrored_hits_give_the_same_pulse(command, hits: Path, tmp_path: Path):
-    moved = tmp_path / "moved.npz"
-    columns = {"x_mm": [110.0], "y_mm": [0.0], "z_mm": [-20.0]}
-    np.savez(moved, **columns, edep_keV=[2614.5], offsets=[0, 1])
-    first, second = tmp_path / "a.lh5", tmp_path / "b.lh5"
-    command("simulate", *PPC, "--hits", hits, "--out", first)
-    frame = ["--origin", "100", "0", "0", "--flip-z"]
-    command("simulate", *PPC, "--hits", moved, *frame, "--out", second)
-    a, b = (next(open_pulses(path).blocks()).waveforms for path in (first, second))
-    assert np.array_equal(a, b)
-
-
 def test_a_diode_of_legend_with_its_crystal(command, hits: Path, reference_data, tmp_path):
     metadata, out, diode = (
         reference_data / "legend-metadata",

@@ -1,21 +1,81 @@
-"""What is told of pile-up tails, against stands on which they are known."""
+"""Pile-up tails: their law, what is measured under known ones, and what is drawn."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
+from cpunet.electronics.drawn_tails import (
+    SIZES_KEV,
+    DrawnTails,
+    SameNoise,
+    TraceNoise,
+    passing,
+)
 from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.electronics.readout import RawTraces, read_out
+from cpunet.electronics.tails_fit import fit_rate
+from cpunet.electronics.tails_law import (
+    TailsLaw,
+    characteristic_exponents,
+    energies_at,
+)
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.cuts import apply_cuts, fit_cuts
+from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
+
+TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
+
+
+def test_share_above_is_the_closed_form():
+    law = TailsLaw(2.0, 50.0, (100, 100))
+    expected = 1 - np.exp(-0.1 * np.log([100, 10, 1]))
+    assert law.share_above([1, 10, 100]) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("rate_khz", [0.3, 3.0])
+def test_drawn_tails_have_the_characteristic_function_of_the_law(rate_khz: float):
+    law = TailsLaw(rate_khz, 54.6, TH228)
+    drawn = law.draw(100_000, np.random.default_rng(1))
+    assert drawn.mean() == pytest.approx(law.mean_kev, rel=0.1)
+    u = np.geomspace(1e-3, 0.5, 10)
+    energies = energies_at((np.arange(1000) + 0.5) / 1000, TH228)
+    wanted = np.exp(law.expected * characteristic_exponents(u, energies).mean(axis=1))
+    found = np.exp(1j * u[:, np.newaxis] * drawn).mean(axis=1)
+    np.testing.assert_allclose(found, wanted, atol=0.01)  # three errors of either part
+
+
+def test_energies_follow_their_quantiles():
+    drawn = energies_at(np.random.default_rng(2).random(20_000), TH228)
+    assert np.quantile(drawn, np.linspace(0, 1, 11)) == pytest.approx(TH228, rel=0.05)
+
+
+@pytest.mark.parametrize("error_kev", [pytest.param(0.3, marks=pytest.mark.thorough), 3.0])
+def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
+    law, rng = TailsLaw(1.5, 54.6, TH228), np.random.default_rng(3)
+    energies = energies_at(rng.random(8000), TH228)
+    measured = law.draw(8000, rng) + rng.normal(0, error_kev, 8000)
+    found = fit_rate(measured, error_kev, 54.6, energies)
+    assert found.recorded
+    assert found.law.rate_khz == pytest.approx(1.5, abs=3 * found.rate_error_khz)
+    assert found.sigma_kev == pytest.approx(error_kev, rel=0.05)
+
+
+def test_too_many_earlier_pulses_are_refused_before_they_fill_the_memory():
+    endless = TailsLaw(0.02, 1e12, TH228)
+    with pytest.raises(CpunetError, match="give a lower rate or a shorter decay"):
+        endless.draw(1000, np.random.default_rng(1))
+
 
 PREPARATION = load_recipe("fast").preparation
 N = 3000
@@ -176,3 +236,95 @@ def test_a_bench_detector_follows_the_law(reference_data: Path):
     shares = found.describe()["percent_above"].values()
     for share in shares:  # in percent of a thousand traces
         assert share["measured"] == pytest.approx(share["law"], abs=3)
+
+
+RECIPE = load_recipe("fast")
+LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
+BELOW_30 = tuple(float(kev < 30) for kev in SIZES_KEV)
+DRAWN = DrawnTails(LAW, 0.9, 0.5, 16.0, BELOW_30)
+
+
+def test_what_cuts_take_is_not_drawn():
+    rng = np.random.default_rng(1)
+    kev, all_kev = DRAWN.draw_kev(20_000, rng), DRAWN.uncut().draw_kev(20_000, rng)
+    assert kev.max() < 40
+    assert (all_kev > 40).mean() == pytest.approx(LAW.share_above(40), abs=0.02)
+    # below the cuts it is the same law
+    share = (all_kev > 5).sum() - (all_kev > 20).sum()
+    passed = (all_kev < 30).sum() / len(all_kev)
+    assert ((kev > 5) & (kev < 20)).mean() == pytest.approx(share / len(kev) / passed, rel=0.06)
+
+
+def test_another_rate_is_without_cuts():
+    busy = DRAWN.uncut(20.0)
+    assert busy.passed is None
+    assert busy.draw_kev(4000, np.random.default_rng(1)).mean() == pytest.approx(
+        10 * LAW.mean_kev, rel=0.1
+    )
+
+
+def test_they_are_told_and_read_again():
+    again = DrawnTails.of(json.loads(json.dumps(DRAWN.describe())))
+    assert again.describe() == DRAWN.describe()
+
+
+def test_noise_of_several_methods_is_drawn_once_and_is_what_each_would_draw():
+    noise = TraceNoise(BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50), DRAWN)
+    energies = np.linspace(500.0, 2000.0, 20)
+    # the second as the first; then after another draw, for other pulses, for other records
+    asked = [
+        (1, 0, energies, 600),
+        (1, 0, energies, 600),
+        (1, 1, energies, 600),
+        (1, 0, energies[:9], 600),
+        (1, 0, energies, 700),
+        (2, 0, energies, 700),
+    ]
+    same = SameNoise(noise)
+    for seed, before, kev, length in asked:
+        own, shared = (np.random.default_rng(seed) for _ in range(2))
+        own.random(before), shared.random(before)
+        expected = noise.draw(kev, length, own)
+        found = same.draw(kev, length, shared)
+        np.testing.assert_array_equal(found, expected)
+        assert shared.random() == own.random()
+        found += 1  # the caller's own
+
+
+def test_records_get_noise_and_tails_in_proportion_to_their_energies():
+    noise = BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50)
+    energies = np.repeat([500.0, 2000.0], 4000)
+    rng = np.random.default_rng(3)
+    records = TraceNoise(noise, DRAWN).draw(energies, 600, rng)
+    assert TraceNoise(noise).draw(energies, 600, rng).std() < 1e-3
+    first = records[:, 0] * energies / DRAWN.height
+    for part in (first[:4000], first[4000:]):
+        assert (part > 5).mean() == pytest.approx(
+            (DRAWN.draw_kev(4000, rng) * np.exp(-0.5 / 54.6) > 5).mean(), abs=0.03
+        )
+    large = first > 20
+    ratio = records[large, 500] / records[large, 0]
+    assert ratio == pytest.approx(np.exp(-8 / 54.6), rel=1e-3)
+
+
+@pytest.mark.thorough
+def test_what_passes_is_measured_by_adding_tails_to_traces_without():
+    rng = np.random.default_rng(1)
+    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (2500, 1)), 0, 1)
+    steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(2500, 2614.5))
+    traces = read_out(steps, read_electronics("ornl", {"earlier_pulses.rate_kHz": 1}), seed=2)
+    raw = Pulses.of(traces.waveforms, dt_ns=16, energy_kev=traces.energy_kev)
+    prepared = prepare(raw, RECIPE.preparation, "measured")
+    cuts = fit_cuts(prepared, RECIPE.cuts)
+    kept = apply_cuts(prepared, cuts)
+    found = PileUpTails.of(Baselines.of([raw], RECIPE.preparation))
+    passed = passing(found, raw[kept.index], RECIPE.preparation, cuts)
+    assert passed is not None
+    assert passed[0] == 1
+    assert passed[-1] == 0
+    drawn = DrawnTails(found.fit.law, 0.9, 0.0, 16.0, passed)
+    kev, true = drawn.draw_kev(20_000, rng), traces.tails_kev[kept.index]
+    for size in (3, 10, 20):
+        assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)
+    few = passing(found, raw[slice(0, 5)], RECIPE.preparation, cuts)
+    assert few is None

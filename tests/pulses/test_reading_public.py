@@ -131,16 +131,6 @@ def test_pickled_pulses(tmp_path, lists):
     assert open_pulses(file, energy="tp0", kev_per_adc=2, dt_ns=16).read().energy_kev[1] == 802
 
 
-def test_a_pickle_of_the_oldest_kind_and_numbered_events(tmp_path):
-    entry = {"wf": [0.0, 1.0, 2.0], "event": 77, "energy": 5.0}
-    (tmp_path / "old.pkl").write_bytes(pickle.dumps(entry, protocol=0))
-    pulses = open_pulses(tmp_path / "old.pkl", dt_ns=16).read()
-    assert pulses.waveforms.tolist() == [[0, 1, 2]]
-    assert pulses.event_number.tolist() == [77]
-    (tmp_path / "named otherwise").write_bytes(pickle.dumps(entry))
-    assert len(open_pulses(tmp_path / "named otherwise", dt_ns=16).read()) == 1
-
-
 DEFECTS = {
     "no period": (
         {"dt_ns": None},
