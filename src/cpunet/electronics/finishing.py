@@ -142,10 +142,13 @@ def finish(
     Raises
     ------
     CpunetError
-        If shapes, sampling periods or energies do not match.
+        If the noise has another sampling period, or an energy is not above 0.
     """
-    if noise is not None:
-        _check_noise(noise, dt_ns, energy_kev, len(records))
+    if noise is not None and not np.isclose(noise.dt_ns, dt_ns):
+        raise CpunetError(
+            f"the noise is sampled every {noise.dt_ns:g} ns, the pulses every {dt_ns:g} ns; "
+            "take it from the data of the fit"
+        )
     # A noise-free record may have equal samples at its top; none of them is clipped.
     config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
     rng, n = np.random.default_rng(seed), len(records)
@@ -158,7 +161,8 @@ def finish(
         codes[rows] = clean.codes
         kept = np.arange(n)[rows][clean.index]
         windows[kept] = clean.pulses.waveforms
-        if noise is not None and energy_kev is not None:
+        if noise is not None:
+            assert energy_kev is not None  # noise scales as 1/energy
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
             drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
@@ -169,21 +173,3 @@ def finish(
             codes[kept] = prepared.codes
             noisy[kept[prepared.index]] = prepared.pulses.waveforms
     return Finished(noisy, codes, windows)
-
-
-def _check_noise(
-    noise: RecordNoise,
-    dt_ns: float,
-    energy_kev: npt.NDArray[np.float64] | None,
-    n: int,
-) -> None:
-    if not np.isclose(noise.dt_ns, dt_ns):
-        raise CpunetError(
-            f"the noise is sampled every {noise.dt_ns:g} ns, the pulses every {dt_ns:g} ns; "
-            "take it from the data of the fit"
-        )
-    if energy_kev is None or energy_kev.shape != (n,):
-        raise CpunetError(
-            f"noise for {n} pulses needs {n} energies, since it is scaled by 1/energy; "
-            "give energy_kev"
-        )
