@@ -4,29 +4,16 @@ from __future__ import annotations
 
 import glob
 import logging
-import multiprocessing
-import os
-import signal
-import sys
-import threading
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
-from logging.handlers import QueueHandler
 from pathlib import Path
-from queue import SimpleQueue
-from types import FrameType
 from typing import Any
 
-import torch
-
 from cpunet.errors import CpunetError
-from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.processes import outcomes
 from cpunet.progress import stage
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run
@@ -38,7 +25,6 @@ log = logging.getLogger(__name__)
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 
 Told = dict[str, Any]
-_Outcomes = Generator[tuple["_Task", Told | str]]
 
 
 @dataclass(frozen=True)
@@ -88,12 +74,12 @@ def translate_files(
     failed: list[str] = []
     with (
         stage("Translating", len(tasks)) as bar,
-        closing(_outcomes(make, tasks, jobs)) as outcomes,
+        closing(outcomes(make.work, tasks, jobs, once=True)) as found,
     ):
-        for task, outcome in outcomes:
+        for task, outcome in found:
             bar.update()
-            if isinstance(outcome, str):
-                failed.append(_naming(task, outcome))
+            if isinstance(outcome, CpunetError):
+                failed.append(_naming(task, str(outcome)))
                 log.error(failed[-1])
             else:
                 told.append(outcome)
@@ -134,8 +120,6 @@ class _Maker:
 
     def work(self) -> Callable[[_Task], Told]:
         """Return a function that translates a file."""
-        # the last bits of a network depend on the number of threads, and processes share cores
-        torch.set_num_threads(1)
         translation = FileTranslation(self.run, self.options, self.device)
 
         def work(task: _Task) -> Told:
@@ -148,103 +132,6 @@ class _Maker:
             )
 
         return work
-
-
-def _outcomes(make: _Maker, tasks: Sequence[_Task], jobs: int) -> _Outcomes:
-    """Yield the result of each task, or the reason why it failed."""
-    if (jobs := min(jobs, len(tasks))) > 1:
-        yield from _in_processes(make, tasks, jobs)
-        return
-    with _threads_kept():
-        work = make.work()
-        for task in tasks:
-            yield task, _outcome(partial(work, task))
-
-
-def _outcome(result: Callable[[], Told]) -> Told | str:
-    try:
-        return result()
-    except (CpunetError, OSError) as error:
-        return str(error)
-
-
-def _in_processes(make: _Maker, tasks: Sequence[_Task], jobs: int) -> _Outcomes:
-    """Yield outcomes as they arrive; the processes end when the iterator is closed."""
-    context = multiprocessing.get_context("spawn")  # torch does not survive a fork
-    others = {*multiprocessing.active_children()}
-    noted: set[str] = set()
-    left: dict[Future[tuple[Told | str, list[logging.LogRecord]]], _Task] = {}
-    with ProcessPoolExecutor(jobs, context, _begin, (make,)) as pool:
-        try:
-            left |= {pool.submit(_work, task): task for task in tasks}
-            while left:
-                for future in wait(left, return_when=FIRST_COMPLETED).done:
-                    outcome, records = future.result()
-                    for record in records:
-                        logger = logging.getLogger(record.name)
-                        if record.msg not in noted and logger.isEnabledFor(record.levelno):
-                            logger.handle(record)
-                        noted.add(record.msg)
-                    yield left.pop(future), outcome
-        except BrokenProcessPool as error:
-            raise CpunetError(
-                "a process was ended, perhaps for lack of memory; try fewer `jobs`, and "
-                "continue with `resume`"
-            ) from error
-        finally:
-            if left:
-                for process in {*multiprocessing.active_children()} - others:
-                    process.terminate()
-                pool.shutdown(cancel_futures=True)
-
-
-# in a process of the pool: its work, and what it has to say
-_translate: Callable[[_Task], Told]
-_said: SimpleQueue[logging.LogRecord] = SimpleQueue()
-
-
-def _begin(make: _Maker) -> None:
-    """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    use_threads(1)
-    global _translate
-    _translate = make.work()
-    logger = logging.getLogger("cpunet")
-    logger.addHandler(QueueHandler(_said))
-    logger.setLevel(logging.INFO)
-    logging.getLogger("cpunet.progress").setLevel(logging.ERROR)  # the parent counts files
-
-
-def _leave(number: int, _frame: FrameType | None) -> None:
-    """End in a way that removes the file being written."""
-    signal.signal(number, signal.SIG_IGN)  # the pool repeats it
-    sys.exit(128 + number)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _work(task: _Task) -> tuple[Told | str, list[logging.LogRecord]]:
-    try:
-        outcome = _outcome(partial(_translate, task))
-    except SystemExit:  # which the pool would take for an outcome
-        os._exit(1)
-    return outcome, [_said.get() for _ in range(_said.qsize())]
-
-
-@contextmanager
-def _threads_kept() -> Iterator[None]:
-    before = torch.get_num_threads()
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _name(path: Path) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.channels import ALL, Outcome, Pair, channels_of, one_by_one, own_folder
+from cpunet.pulses.channels import ALL, Outcome, Pair, channels_of, each_channel, own_folder
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run
@@ -191,12 +192,6 @@ def _of_channels(
     run.  The noise depends on the seed and the name of the channel, so that of channels
     differs.
     """
-
-    def act(name: str, pair: Pair, place: Path) -> Translation:
-        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-        target = place.with_name(f"{name}.lh5")
-        return _to_file(as_run(run), pair[0], target, options, noise_key=name, **how)
-
     channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
     if len(channels) == 1 and not isinstance(runs, Run):
         own = (own_folder(Path(runs), name, INFO).is_dir() for name in channels)
@@ -204,4 +199,17 @@ def _of_channels(
             (single,) = channels.values()
             trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
             channels = dict.fromkeys(trained, single) or channels
-    return one_by_one(channels, out, act)
+    return each_channel(channels, out, partial(_of_channel, runs, options, how))
+
+
+def _of_channel(
+    runs: RunLike,
+    options: TranslateOptions,
+    how: Mapping[str, Any],
+    name: str,
+    pair: Pair,
+    place: Path,
+) -> Translation:
+    run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
+    target = place.with_name(f"{name}.lh5")
+    return _to_file(as_run(run), pair[0], target, options, noise_key=name, **how)
