@@ -26,7 +26,7 @@ from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Nuisance, Physics, named
 from cpunet.calibration.search import Search
 from cpunet.calibration.titles import titled
-from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.measured import measured_noise
 from cpunet.plotting import styled
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
@@ -107,8 +107,9 @@ def experiments(
     selection = parse_selection("FEP", recipe.peaks)
     files = [PulseFile(stand / f"{name}.lh5") for name in ("sim", "data")]
     sim = load_pulses(files[0], "simulated", recipe, selection).prepared
-    data = load_pulses(files[1], "measured", recipe, selection).prepared
-    noise, _ = measured_noise(files[1], data.pulses, recipe.preparation)
+    measured = load_pulses(files[1], "measured", recipe, selection)
+    data = measured.prepared
+    noise, _ = measured_noise(measured, recipe.preparation)
     stored = StoredSimulation.read(files[0].path)
     physics = Physics(stored.detector, stored.settings, nuisances)
     truth = true_coordinates(physics, json.loads((stand / "stand.json").read_text())["data"])

@@ -26,7 +26,7 @@ FAILED = 0.9
 
 
 def scores_of(
-    stand: Path, recipe: str, overrides: list[str], seed: int, rivals: bool
+    stand: Path, recipe: str, overrides: list[str], seed: int, baselines: bool
 ) -> dict[str, Any]:
     """Metrics of one run, trained and scored in a temporary folder."""
     sim, data = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
@@ -39,7 +39,7 @@ def scores_of(
             sim,
             data,
             truth=truth if truth.exists() else None,
-            baselines=rivals,
+            baselines=baselines,
             seed=seed,
         ).metrics
 
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--recipe", action="append")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--no-rivals", action="store_false", dest="rivals")
+    parser.add_argument("--no-baselines", action="store_false", dest="baselines")
     arguments = parser.parse_args()
     console = Console(width=110)  # whole rows, also into a file
     for stand in arguments.stands:
@@ -98,7 +98,7 @@ def main() -> None:
             runs = []
             for seed in range(arguments.seeds):
                 try:
-                    more = arguments.overrides, seed, arguments.rivals
+                    more = arguments.overrides, seed, arguments.baselines
                     runs.append(scores_of(stand, recipe, *more))
                 except CpunetError as error:
                     console.print(f"seed {seed} failed: {error}")

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.measured import measured_noise
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
@@ -51,7 +51,7 @@ def judged(stand: Path) -> tuple[np.ndarray, np.ndarray]:
     prepared = prepare(sim, RECIPE.preparation, "simulated")
     rows = np.flatnonzero(truth["label"][prepared.index] == 0)[:1000]
     traces = truth["response"][prepared.index[rows]].astype(np.float32)
-    windows = finish(traces, RECIPE.preparation, dt_ns=sim.dt_ns)
+    windows = finish(traces, RECIPE.preparation, dt_ns=sim.dt_ns).windows
     return prepared.pulses.waveforms[rows], current_amplitude(windows)
 
 
@@ -59,7 +59,7 @@ def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray
     """Median relative error of the translated current amplitude in percent."""
     with torch.no_grad():
         records = response(torch.from_numpy(windows)).numpy()
-    return off(finish(records, RECIPE.preparation, dt_ns=float(response.dt_ns)), wanted)
+    return off(finish(records, RECIPE.preparation, dt_ns=float(response.dt_ns)).windows, wanted)
 
 
 def off(translated: np.ndarray, wanted: np.ndarray) -> float:
@@ -86,9 +86,9 @@ def experiment(
         noise=noise,
         energy_kev=kev,
         seed=1,
-    )
+    ).windows
     data = Pulses.of(measured, dt_ns=sim.dt_ns, energy_kev=kev)
-    true = finish(records(windows), config, dt_ns=sim.dt_ns)
+    true = finish(records(windows), config, dt_ns=sim.dt_ns).windows
     return sim[:half], data, current_amplitude(true)
 
 
@@ -189,8 +189,8 @@ def main() -> None:
     files = [PulseFile(arguments.stand / f"{side}.lh5") for side in ("sim", "data")]
     selection = parse_selection("FEP", RECIPE.peaks)
     sim = load_pulses(files[0], "simulated", RECIPE, selection).prepared.pulses
-    data = load_pulses(files[1], "measured", RECIPE, selection).prepared.pulses
-    noise, _ = measured_noise(files[1], data, RECIPE.preparation)
+    measured = load_pulses(files[1], "measured", RECIPE, selection)
+    data, (noise, _) = measured.prepared.pulses, measured_noise(measured, RECIPE.preparation)
     if arguments.chain is not None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)
     start, _ = response_fit.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)

@@ -87,11 +87,11 @@ def measured(command: list[str]) -> tuple[float, float, float]:
     return wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
 
 
-def validated(folder: Path, n: int, *, rivals: bool) -> str:
+def validated(folder: Path, n: int, *, baselines: bool) -> str:
     sim, data, truth = make_files(folder, n)
     report = folder / f"report_{n}"
     words = ["--sim", str(sim), "--data", str(data), "--truth", str(truth)]
-    words += ["--out", str(report), "--force", "--baselines" if rivals else "--no-baselines"]
+    words += ["--out", str(report), "--force", "--baselines" if baselines else "--no-baselines"]
     wall, cpu, memory_mb = measured(cpunet("validate", str(folder / "run"), *words))
     peaks = json.loads((report / "metrics.json").read_text())["peaks"]
     methods = max(len(peak.get("two_sample", {})) for peak in peaks.values())
@@ -111,8 +111,8 @@ def main() -> None:
         folder.mkdir(exist_ok=True)
         make_run(folder)
         for n in given.pulses:
-            for rivals in (False, True):
-                print(validated(folder, n, rivals=rivals), flush=True)
+            for baselines in (False, True):
+                print(validated(folder, n, baselines=baselines), flush=True)
 
 
 if __name__ == "__main__":

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import gc
-import importlib.util
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
 from hypothesis import settings
 
 from cpunet import progress
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.source import PulseSource
 
 # compilation and a shared machine make single examples slow now and then
 settings.register_profile("cpunet", deadline=None, max_examples=25)
@@ -22,16 +23,6 @@ settings.register_profile("full", deadline=None, max_examples=200)  # see `make 
 settings.load_profile("cpunet")
 
 BEGUN = time.monotonic()
-
-
-def beside(name: str) -> ModuleType:
-    """A module of this folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def pytest_configure() -> None:
@@ -59,12 +50,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(f"the {minutes:g} minutes for slow tests are over")
 
 
-@pytest.fixture(scope="session")
-def held() -> ModuleType:
-    """The program whose trainings wait for a signal, see there."""
-    return beside("held")
-
-
 @pytest.fixture
 def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
     """Total and steps of each stage of the work, by title."""
@@ -75,6 +60,20 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
 
     monkeypatch.setattr(progress.Stage, "update", update)
     return seen
+
+
+@pytest.fixture(scope="module")
+def reads() -> Iterator[Counter[Path]]:
+    """How often the pulses of each file have been read by the tests of a module."""
+    times, blocks = Counter[Path](), PulseSource.blocks
+
+    def counted(source: PulseSource, size: int = 4096) -> Iterator[Pulses]:
+        times[source.path] += 1
+        return blocks(source, size)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PulseSource, "blocks", counted)
+        yield times
 
 
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:

@@ -166,7 +166,7 @@ def small_sides() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
 def prepared_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
     """The noise-free response of each simulated pulse in use, prepared like data."""
     blocks = Responses(path, sim).blocks()
-    return np.concatenate([finish(block, config, dt_ns=sim.dt_ns) for block in blocks])
+    return np.concatenate([finish(block, config, dt_ns=sim.dt_ns).windows for block in blocks])
 
 
 class Files(NamedTuple):

@@ -18,7 +18,6 @@ import yaml
 
 import cpunet
 from cpunet.cli import app
-from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
@@ -103,28 +102,6 @@ def test_the_commands_within_sentences():
             given = {word.strip("[]").partition("=")[0] for word in words}
             options = {word for word in given if word[:2] == "--"}
             assert options <= option_names(words) | {"--help", "--version", "--debug"}, inline
-
-
-def test_a_wrong_option_would_be_found():
-    with pytest.raises(Exception, match="Unknown option"):
-        require_parsed(["train", "--sim", "a", "--data", "b", "--out", "c", "--nonsense"])
-
-
-def test_a_wrong_setting_would_be_found():
-    with pytest.raises(CpunetError, match="no such setting"):
-        require_parsed(
-            [
-                "train",
-                "--recipe",
-                "fast",
-                "--sim",
-                "a",
-                "--data",
-                "b",
-                "--set",
-                "training.none=1",
-            ]
-        )
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("yaml"))
@@ -237,13 +214,6 @@ def test_the_first_tutorial_from_end_to_end(tmp_path):
         assert done.returncode == 0, (words, done.stderr)
     for made in ("check.png", "run/run.json", "translated.lh5", "report/report.html"):
         assert (tmp_path / made).exists()
-
-
-def test_the_readmes_files_are_told_of(home):
-    pulses = cpunet.open_pulses(home / "sim.lh5").read()
-    ren = cpunet.REN.load(home / "run")
-    with pytest.warns(RejectionWarning, match=r"of 260 pulses .* rows of NaN: .*1 constant"):
-        ren.translate(pulses.waveforms, energy_kev=pulses.energy_kev, seed=1)
 
 
 def test_the_distribution_is_not_the_authors():

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-import tracemalloc
 from pathlib import Path
 
 import h5py
 import lh5
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from torch import nn
 
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
 from cpunet.cli import main
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.trace_properties import _last_below, trace_properties, traces_in_words
+from cpunet.pulses.description import trace_properties
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
@@ -65,50 +63,27 @@ def test_a_file_is_opened(tmp_path):
         load(tmp_path / "text")
 
 
-def test_nothing_known_is_none(tmp_path):
-    np.save(tmp_path / "pulses.npy", np.full((2, 20), np.nan))
-    told = info(tmp_path / "pulses.npy", read=DT).values
-    assert (told["energy_kev"], told["samples"], told["peaks"]) == (
-        None,
-        None,
-        dict.fromkeys(RECIPE.peaks, 0),
-    )
-    assert (told["n_not_finite"], told["n_constant"]) == (2, 0)
-    json.dumps(told)
-
-
-def test_memory_does_not_grow_with_the_file(tmp_path):
-    block = Pulses.of(np.zeros((4096, 100)), dt_ns=16)  # 1.6 MB as float32
-    write_pulses(tmp_path / "pulses.lh5", (block for _ in range(12)))
-    tracemalloc.start()
-    try:
-        assert info(tmp_path / "pulses.lh5").values["n_pulses"] == 12 * 4096
-        assert tracemalloc.get_traced_memory()[1] < 10e6
-    finally:
-        tracemalloc.stop()
-
-
 @pytest.mark.thorough
-def test_remains_of_a_bench_detector(reference_data: Path, tmp_path: Path):
+def test_tails_of_a_bench_detector(reference_data: Path, tmp_path: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
     flat = tmp_path / "flat.lh5"
     tails = subtract_tails(PulseFile(path, kev_per_adc=calibrated), flat)
     told = info(path, read=FileOptions(kev_per_adc=calibrated)).values
-    assert told["remains"] == tails.describe()
-    assert told["remains"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
+    assert told["tails"] == tails.describe()
+    assert told["tails"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
     json.dumps(told)
-    left = lh5.read("geds/raw/remains_kev", flat).nda
+    left = lh5.read("geds/raw/tails_kev", flat).nda
     assert len(left) == 1000
     assert np.nanmean(left > 10) == pytest.approx(0.3, abs=0.03)
-    again = info(flat).values["remains"]
+    again = info(flat).values["tails"]
     assert again["rate_khz"] == 0
 
 
-def test_remains_that_cannot_be_told(tmp_path):
+def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
     told = info(path).values
-    assert told["remains"].startswith("not known: only 0 of 40 traces can be prepared")
+    assert told["tails"].startswith("not known: only 0 of 40 traces can be prepared")
     with pytest.raises(CpunetError, match="only 0 of 40 traces"):
         subtract_tails(path, tmp_path / "flat.lh5")
     with pytest.raises(CpunetError, match="is the input"):
@@ -117,36 +92,14 @@ def test_remains_that_cannot_be_told(tmp_path):
 
 def test_a_run_folder(tmp_path):
     recipe = load_recipe("paper", ["generator.width=2"])
-    remains = {"rate_khz": 0.0}
-    fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "remains": remains}
+    tails = {"rate_khz": 0.0}
+    fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "tails": tails}
     write_run(tmp_path, nn.ModuleDict(), recipe, INFO | {"fit": fit})
     lines = dict(info(tmp_path).lines)
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
     assert load(tmp_path).summary() == info(tmp_path).lines
-    assert lines["remains"] == "of earlier pulses: none that are certain"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "no folder of this program; give the folder of a run, which holds run.json"),
-        ("{", r"run.json: damaged \([^\n]*\); train again"),
-        ("[1]", r"run.json: .*no mapping"),
-    ],
-)
-def test_folders_that_are_no_runs(tmp_path, text, message):
-    if text is not None:
-        (tmp_path / "run.json").write_text(text)
-    with pytest.raises(CpunetError, match=message):
-        info(tmp_path)
-
-
-def test_reference_pulses(reference_data: Path):
-    told = info(reference_data / "closure" / "data.lh5").values
-    assert (told["n_pulses"], told["length"], told["dt_ns"]) == (3343, 1200, 16)
-    assert min(told["peaks"].values()) > 500
-    assert (told["n_not_finite"], told["n_constant"]) == (0, 0)
+    assert lines["pile-up tails"] == "none that are certain"
 
 
 def test_every_table_of_a_file(tmp_path):
@@ -182,13 +135,6 @@ def test_amplitudes_suggest_a_calibration(tmp_path):
     noise[:, :20] = 0
     np.save(file, noise)
     assert info(file, read=DT).values["amplitudes"] == "no lines that stand out"
-
-
-def test_the_measured_spectrum_suggests_its_calibration(reference_data):
-    told = info(reference_data / "real" / "th228.fcio").values
-    assert "Th-228" in told["amplitudes"]
-    # as found from its lines by hand
-    assert float(told["amplitudes"].split()[-1]) == pytest.approx(0.06493, rel=0.01)
 
 
 def test_files_of_hits_are_described(tmp_path):
@@ -246,11 +192,6 @@ def test_the_properties_are_those_that_were_made():
         trace_properties([Pulses.of(np.ones((n, 200)), dt_ns=16)], RECIPE)
 
 
-def test_a_pulse_that_is_never_below_a_level():
-    pulses = np.array([[0, 1, 3, 2], [2, 2, 3, 2]], np.float32)
-    assert _last_below(pulses, np.array([2, 2]), np.array([1.5, 1.5])).tolist() == [2, 0]
-
-
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
     told = info(stand_of_one_detector).values
     assert told["provenance"]["made by"].startswith("cpunet simulate")
@@ -272,14 +213,6 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(np.tile(np.arange(300.0), (3, 1)), dt_ns=16), attrs=attrs)
     return path
-
-
-def test_a_crystal_without_the_taper_is_not_turned_over(reference_data: Path):
-    """Upside down more hits would be inside, but the bore would be at the wrong end."""
-    path = reference_data / "geant4" / "g4_h20mm.npz"
-    told = info(path, detector=read_detector("icpc")).values["detectors"][""]["crystal"]
-    assert told["outside_percent"] == pytest.approx(10.5, abs=0.3)
-    assert "fits" not in told
 
 
 def test_hits_are_compared_with_a_crystal(tmp_path):
@@ -310,40 +243,6 @@ def test_traces_that_are_no_numbers(tmp_path):
     assert info(tmp_path / "pulses.npy", read=DT).values["n_not_finite"] == 30
     with pytest.raises(CpunetError, match="no spectrum to draw"):
         info(tmp_path / "pulses.npy", read=DT, out=tmp_path / "e.png")
-
-
-def test_shares_are_percent_whatever_their_time(tmp_path):
-    fit = {"parameters": {"slow_12.5_ns": 0.02, "decay_2.9_us": 0.05, "decay_us": 50.0}}
-    write_run(tmp_path, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
-    lines = dict(info(tmp_path).lines)
-    assert lines["response"] == "slow 12.5 ns 2 %, decay 2.9 µs 5 %, decay 50 µs"
-
-
-def test_all_of_the_traces_are_saturated():
-    traces = {"trigger_sample": [1, 1, 1], "noise_adc": 1.0, "baseline_samples": 1}
-    traces |= {"saturated_percent": 100.0, "pile_up_percent": 0.25, "rejected": {}}
-    lines = dict(traces_in_words(traces | {"looked_at": 9}))
-    assert lines["saturated"] == "100 %"
-    assert lines["pile-up"].startswith("0.25 % ")
-
-
-def test_a_figure_replaces_nothing_unasked(tmp_path):
-    path, out = tmp_path / "pulses.npy", tmp_path / "pulses.png"
-    np.save(path, np.tile(np.arange(300.0), (3, 1)))
-    with pytest.raises(CpunetError, match="is the input"):
-        info(path, read=DT, out=path, force=True)
-    with pytest.raises(CpunetError, match="pictures are made as"):
-        info(path, read=DT, out=tmp_path / "pulses.gif")
-    info(path, read=DT, out=out)
-    with pytest.raises(CpunetError, match="exists already"):
-        info(path, read=DT, out=out)
-
-
-def test_a_run_has_no_spectrum(tmp_path):
-    (tmp_path / "run").mkdir()
-    write_run(tmp_path / "run", nn.ModuleDict(), RECIPE, INFO)
-    with pytest.raises(CpunetError, match="no spectrum to draw"):
-        info(tmp_path / "run", out=tmp_path / "run.png")
 
 
 def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
@@ -384,24 +283,6 @@ def test_impurities_from_the_measured_depletion():
     # given by hand, the scale leads to the same fields
     scale = {"impurity_scale": found.values["impurity_scale"]}
     assert info("ppc", settings=values | scale).lines == found.lines
-
-
-@pytest.mark.thorough
-@pytest.mark.usefixtures("own_cache")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "icpc",
-        pytest.param("bege", marks=pytest.mark.slow),
-        pytest.param("ppc", marks=pytest.mark.slow),
-    ],
-)
-def test_a_figure_of_each_detector(tmp_path: Path, name: str):
-    out = tmp_path / "fields.png"
-    info(name, settings=COARSE, out=out)
-    height, width = imread(out).shape[:2]
-    assert width > 1200
-    assert 0.3 < height / width < 1
 
 
 @pytest.mark.usefixtures("own_cache")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 import tomllib
 from pathlib import Path
 
@@ -30,22 +29,6 @@ def installed(monkeypatch, tmp_path):
     installation.other_package.cache_clear()
 
 
-@pytest.mark.parametrize(
-    "files",
-    [
-        None,
-        ["_editable_impl_cpunet.pth", "cpunet-1.0.0.dist-info/RECORD"],
-        ["cpunet_other/__init__.py"],  # beside this one, not over it
-        [],
-    ],
-)
-def test_alone(installed, files):
-    if files is not None:
-        installed(*files)
-    assert installation.other_package() is None
-    assert cpunet.Pulses
-
-
 def test_over_this_one(installed):
     installed("cpunet/__init__.py", "cpunet/model.py")
     told = (
@@ -55,19 +38,6 @@ def test_over_this_one(installed):
     assert installation.other_package() == told
     with pytest.warns(UserWarning, match="installed over cpunet-hpge"):
         assert cpunet.Pulses
-
-
-def test_the_command_line_tells_it(installed, capsys, monkeypatch):
-    from cpunet.cli import main
-
-    installed("cpunet/__init__.py")
-    monkeypatch.setattr(sys, "argv", ["cpunet", "--version"])
-    with pytest.raises(SystemExit):
-        main()
-    printed = capsys.readouterr()
-    assert printed.out == f"cpunet {cpunet.__version__}\n"
-    assert printed.err.startswith("warning: the package cpunet 1.0.0 is installed over")
-    assert printed.err.count("\n") == 1
 
 
 def test_the_lock_holds_what_the_constraints_say():

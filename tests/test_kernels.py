@@ -74,17 +74,6 @@ def test_a_changed_callee_or_constant_gives_a_new_folder_and_result(home: Path) 
     assert len(list((home.parents[1] / "code").iterdir())) == 3
 
 
-@pytest.mark.thorough
-def test_a_read_only_installation_uses_the_cache_of_the_user(home: Path) -> None:
-    home.chmod(0o555)
-    user = {"NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(home.parents[1] / "user")}
-    for hits in "01":
-        assert words(begin(home, SHOW.format(1), **user)) == ["20", hits]
-    assert not list(home.rglob("*.nb?"))
-    nowhere = {"NUMBA_CACHE_DIR": str(home / "numbers.py")}
-    assert words(begin(home, SHOW.format(1), **nowhere)) == ["20", "0"]
-
-
 def test_of_two_who_compile_at_once_none_has_the_code_of_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,17 +90,6 @@ def test_of_two_who_compile_at_once_none_has_the_code_of_the_other(
     assert sum(later.stats.cache_hits.values()) == 1
 
 
-def test_few_folders_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernels.config, "CACHE_DIR", str(tmp_path))
-    for number in range(12):
-        (tmp_path / f"cpunet-{number:02}").mkdir()
-        os.utime(tmp_path / f"cpunet-{number:02}", (number, number))
-    (tmp_path / "other").mkdir()
-    folder = kernels._folder.__wrapped__()
-    kept = [f"cpunet-{number:02}" for number in range(5, 12)]
-    assert {place.name for place in tmp_path.iterdir()} == {*kept, folder.name, "other"}
-
-
 def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() -> None:
     """Else a process that compiles has other last bits than those that load its code."""
 
@@ -120,17 +98,6 @@ def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() 
 
     assert kernels.kernel(fastmath={"reassoc"})(total).targetoptions["forceinline"]
     assert not kernels.kernel(total).targetoptions.get("forceinline")
-
-
-@pytest.mark.thorough
-def test_threads_can_be_lowered_and_raised_again(home: Path) -> None:
-    program = (
-        "import numba, torch\nfrom cpunet.kernels import use_threads\n"
-        "for count in (1, 3, 9):\n"
-        "    use_threads(count)\n"
-        "    print(numba.get_num_threads(), torch.get_num_threads())"
-    )
-    assert words(begin(home, program, NUMBA_NUM_THREADS="4")) == [*"113349"]
 
 
 @pytest.mark.thorough

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
@@ -23,7 +21,6 @@ from cpunet.outputs import (
     require_replaceable,
     written_aside,
 )
-from cpunet.training.checkpoints import unfinished_folder
 
 RUN = FolderKind("run", "cpunet train", "run.json", r"run\.json|log/[ab]")
 REPORT = FolderKind("report", "cpunet validate", "metrics.json", r"metrics\.json")
@@ -84,37 +81,6 @@ def test_what_failed_leaves_what_was_there(tmp_path, error, old, writer):
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("writer", [written_aside, run_folder_aside])
-def test_a_place_that_cannot_be_written_to(tmp_path, writer):
-    (tmp_path / "file").touch()
-    target = tmp_path / "file" / "out"
-    told = (
-        rf"^{target}: cannot be written \([^\n]*\); make room there, or choose another place$"
-    )
-    with pytest.raises(CpunetError, match=told), writer(target):
-        pass
-
-
-@pytest.mark.parametrize("writer", [written_aside, run_folder_aside, unfinished_folder])
-def test_another_file_that_failed_is_named(tmp_path, writer):
-    missing = tmp_path / "sim.lh5"
-    with pytest.raises(CpunetError, match=rf"\(No such file or directory, {missing}\)"):  # noqa: SIM117
-        with writer(tmp_path / "out"):
-            missing.read_bytes()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_full_disk_is_one_line(tmp_path):
-    target = tmp_path / "out.lh5"
-    with pytest.raises(CpunetError) as error, written_aside(target):
-        raise OSError(28, "No space left on device")
-    assert str(error.value) == (
-        f"{target}: cannot be written (No space left on device); make room there, or choose "
-        "another place"
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_move_that_fails_brings_the_old_folder_back(tmp_path, monkeypatch):
     make(tmp_path / "run", run_json="old")
     replace = Path.replace
@@ -131,15 +97,6 @@ def test_a_move_that_fails_brings_the_old_folder_back(tmp_path, monkeypatch):
 
 
 NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)
-
-
-@given(name=NAME.filter(lambda n: n not in (".", "..") and len(n.encode()) < 200))
-def test_any_name_that_a_file_may_have(name):
-    with TemporaryDirectory() as folder:
-        with written_aside(Path(folder) / name) as aside:
-            aside.write_bytes(name.encode())
-        assert (Path(folder) / name).read_bytes() == name.encode()
-        assert os.listdir(folder) == [name]  # noqa: PTH208
 
 
 @pytest.mark.parametrize(

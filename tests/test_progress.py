@@ -40,26 +40,6 @@ def test_messages_do_not_tear_a_bar() -> None:
     assert "\rfew pulses\n\rReading" in terminal.getvalue()
 
 
-def test_no_bar_if_the_logger_is_silenced(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("ERROR", "cpunet")
-    with redirect_stderr(Terminal()) as terminal, stage("Reading", 2) as bar:
-        bar.update()
-    assert terminal.getvalue() == ""
-
-
-def test_the_first_step_is_not_in_the_remaining_time() -> None:
-    with redirect_stderr(Terminal()), stage("Matching", 1001) as bar:
-        time.sleep(0.5)  # as if loops were compiled
-        bar.update()
-        first = str(bar)
-        for _ in range(100):
-            time.sleep(0.001)
-            bar.update()
-        later = str(bar)
-    assert "<?, ?/s]" in first
-    assert "<00:0" in later
-
-
 def test_a_log_has_lines_with_the_time_left(log: pytest.LogCaptureFixture) -> None:
     with stage("Matching", 2) as bar:
         for _ in range(3):
@@ -80,10 +60,3 @@ def test_a_log_is_told_of_failures_by_others(log: pytest.LogCaptureFixture) -> N
     with pytest.raises(ValueError, match="no"), stage("Reading"):
         raise ValueError("no")
     assert not any("done" in message for message in log.messages)
-
-
-def test_a_short_stage_is_a_line(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO", "cpunet")
-    with stage("Reading", 9) as bar:
-        bar.update(9)
-    assert len(caplog.messages) == 1

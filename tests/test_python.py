@@ -179,28 +179,6 @@ WRONG = {
         lambda home, _: cpunet.train(np.zeros((2, 9)), home / "raw.lh5", home / "new"),
         "ndarray: are no pulses; give a path, a cpunet.PulseFile",
     ),
-    "no such file": (
-        lambda home, _: cpunet.train(home / "none.lh5", home / "raw.lh5", home / "new"),
-        "none.lh5: no such file",
-    ),
-    "no such setting": (
-        lambda home, _: cpunet.train(
-            home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.step": 1}
-        ),
-        r"training.step: no such setting; did you mean steps\?",
-    ),
-    "there already": (
-        lambda home, _: cpunet.train(home / "sim.lh5", home / "raw.lh5", home / "run"),
-        "run: exists",
-    ),
-    "other side": (
-        lambda home, run: run.translate(home / "raw.lh5"),
-        "given as simulated pulses, but these look measured",
-    ),
-    "no run": (
-        lambda home, _: cpunet.translate(home, home / "sim.lh5"),
-        "no finished run",
-    ),
     "other sampling": (
         lambda _, run: run.translate(Pulses.of(np.zeros((1, 900)), dt_ns=10)),
         "sampled every 10 ns, the run was trained on 16 ns; resample",
@@ -245,13 +223,6 @@ def test_what_is_wrong_is_one_line(home, run, case):
         call(home, run)
     assert "\n" not in str(error.value)
     assert not (home / "new").exists()
-
-
-def test_settings_may_be_numbers_of_numpy():
-    settings = {"generator.width": np.int64(16), "training.rate_generators": np.float32(0.5)}
-    recipe = load_recipe("paper", settings | {"training.betas": np.array([0.25, 0.5])})
-    assert (recipe.generator.width, recipe.training.rate_generators) == (16, 0.5)
-    assert tuple(recipe.training.betas) == (0.25, 0.5)
 
 
 def test_a_recipe_and_settings_are_not_both_given():

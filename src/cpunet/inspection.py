@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Loaded: TypeAlias = Run | Report | Stand | PulseFile
 
 _DPI = 150
-_LOOKED_AT, _REMAINS_BLOCK = 256, 4096  # traces read at a time
+_FIRST_PULSES, _TAILS_BLOCK = 256, 4096  # traces read at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -307,11 +307,11 @@ def _pulses(file: PulseFile, recipe: Recipe) -> InfoResult:
 
 def _is_measured(source: PulseSource) -> bool:
     """Whether they are raw traces, by what the file records or by the shape of the pulses."""
-    from cpunet.pulses.side import apparent_side, recorded_side
+    from cpunet.pulses.provenance import apparent_side, recorded_side
 
     found = recorded_side(source)
     if found is None:
-        first = next(iter(source.blocks(_LOOKED_AT)), None)
+        first = next(iter(source.blocks(_FIRST_PULSES)), None)
         found = None if first is None else apparent_side(first.waveforms)
     # translated windows look measured, but are not raw traces
     return found is not None and found.side == "measured" and "translated" not in found.why
@@ -320,9 +320,10 @@ def _is_measured(source: PulseSource) -> bool:
 def _traces(
     source: PulseSource, recipe: Recipe
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Properties of measured traces, and the tails of earlier pulses under them."""
-    from cpunet.electronics.remains import Remains, remains_in_words
-    from cpunet.pulses.trace_properties import BLOCK, trace_properties, traces_in_words
+    """Properties of measured traces, and the pile-up tails under them."""
+    from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
+    from cpunet.pulses.baselines import Baselines
+    from cpunet.pulses.description import BLOCK, trace_properties, traces_in_words
 
     told: dict[str, Any] = {}
     try:
@@ -332,10 +333,10 @@ def _traces(
         told["traces"] = f"cannot be described: {error}"
         lines = [("", told["traces"])]
     try:
-        blocks = source.blocks(_REMAINS_BLOCK)
-        told["remains"] = Remains.of_traces(blocks, recipe.preparation).describe()
-        lines += remains_in_words(told["remains"])
+        baselines = Baselines.of(source.blocks(_TAILS_BLOCK), recipe.preparation)
+        told["tails"] = PileUpTails.of(baselines).describe()
+        lines += tails_in_words(told["tails"])
     except CpunetError as error:
-        told["remains"] = f"not known: {error}"
-        lines += [("remains", told["remains"])]
+        told["tails"] = f"not known: {error}"
+        lines += [("pile-up tails", told["tails"])]
     return told, lines

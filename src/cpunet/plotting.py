@@ -85,8 +85,8 @@ def colours(methods: Iterable[str]) -> Mapping[str, str]:
 
     Examples
     --------
-    >>> colours(["data", "rival"])
-    {'data': 'black', 'rival': '#8C6D1F'}
+    >>> colours(["data", "other"])
+    {'data': 'black', 'other': '#8C6D1F'}
     """
     methods = list(methods)
     others = [method for method in methods if method not in COLOURS]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -54,12 +55,21 @@ def stand(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def calibrated(stand, tmp_path_factory) -> cpunet.Calibration:
-    """A search of one short round, for a chain of few parameters."""
+def calibrated_and_reads(
+    stand, tmp_path_factory, reads
+) -> tuple[cpunet.Calibration, Counter[Path]]:
+    """A search of one short round, for a chain of few parameters; how often files were read."""
+    reads.clear()
     with pytest.MonkeyPatch.context() as patch:
         for name, few in {"ROUNDS": 1, "STEPS": 6, "FIRST_STEPS": 8}.items():
             patch.setattr(f"cpunet.calibration.search.{name}", few)
-        return calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
+        run = calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
+    return run, reads.copy()
+
+
+@pytest.fixture(scope="module")
+def calibrated(calibrated_and_reads) -> cpunet.Calibration:
+    return calibrated_and_reads[0]
 
 
 def require_temperature(run: Path) -> dict[str, Any]:
@@ -84,6 +94,11 @@ def require_temperature(run: Path) -> dict[str, Any]:
 
 def test_the_temperature_is_found(calibrated):
     require_temperature(calibrated.folder)
+
+
+def test_each_side_is_read_once(calibrated_and_reads, stand):
+    _, reads = calibrated_and_reads
+    assert {reads[stand / f"{side}.lh5"] for side in ("sim", "data")} == {1}
 
 
 @pytest.mark.slow

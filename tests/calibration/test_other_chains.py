@@ -44,7 +44,7 @@ def decay_free(monkeypatch):
     return called
 
 
-SETS = SimpleNamespace(remains=SimpleNamespace(known_decay="that of the remains"))
+SETS = SimpleNamespace(tails=SimpleNamespace(known_decay="that of the tails"))
 
 
 def test_what_chance_may_leave_needs_no_other_chain(decay_free):
@@ -56,7 +56,7 @@ def test_what_chance_may_leave_needs_no_other_chain(decay_free):
 def test_a_decay_of_free_time_is_kept_if_chi_square_falls(decay_free, fall, kept):
     found = decaying_chain(compared(141.0, after=141.0 - fall), SETS, RECIPE.matching[1])
     assert found is (OTHER if kept else None)
-    assert decay_free == ["that of the remains"]
+    assert decay_free == ["that of the tails"]
 
 
 def test_each_kind_of_chain_is_tried_in_its_round_and_at_the_end():

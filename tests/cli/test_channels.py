@@ -99,10 +99,3 @@ def test_check_looks_at_each_channel(command, stand, raw, tmp_path):
     assert told.out.partition("ch3:")[2].startswith("\nstop ")
     pictures = sorted(path.name for path in tmp_path.glob("*.png"))
     assert pictures[:2] == ["check-ch1.png", "check-ch2.png"]
-
-
-@pytest.mark.slow
-def test_info_of_all_tables(command, raw):
-    told = command("info", raw, "--table", "all")
-    assert told.code == 0
-    assert told.out.count("trigger ") == 3

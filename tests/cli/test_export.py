@@ -5,8 +5,6 @@ from __future__ import annotations
 import h5py
 import lh5
 import numpy as np
-import pytest
-import torch
 from lgdo import Array, Scalar, Struct
 
 
@@ -63,51 +61,3 @@ def test_a_library_is_made(command, tmp_path):
         assert refused.code == 2
         assert "Traceback" not in refused.err
         assert not (tmp_path / "other.lh5").exists()
-
-
-@pytest.mark.slow
-def test_export(command, trained, tmp_path):
-    out = tmp_path / "ren.onnx"
-    done = command("export", "onnx", trained, "--out", out)
-    assert done.code == 0, done.err
-    assert "of the run" in done.out
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["ren.card.md", "ren.onnx"]
-    card = (tmp_path / "ren.card.md").read_text()
-    assert "recipe paper" in card
-    assert "`epsilon`" in card
-    assert "data.lh5" in card
-
-
-def test_import_weights(command, tmp_path):
-    refused = command("import", "--out", tmp_path / "run")
-    assert refused.code == 2
-    assert "no generator given; name fep_REN.pt (--ren), fep_IREN.pt (--iren)" in refused.err
-    torch.save({"weight": torch.zeros(1)}, tmp_path / "other.pt")
-    refused = command("import", "--ren", tmp_path / "other.pt", "--out", tmp_path / "run")
-    assert refused.code == 2
-    assert "no Positional U-Net" in refused.err
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["library", "translate", "RUN", "FINE", "--format", "simflow"], "for 16 ns alone"),
-        (["library", "translate", "RUN", "COARSE", "--format", "simflow"], "every 16 ns, prod"),
-        (["library", "translate", "RUN", "FINE", "--low-rank", "4"], "of the --format simflow"),
-        (
-            ["library", "translate", "RUN", "FINE", "--format", "simflow", "--detector", "B9"],
-            "no library of B9; the file has V01",
-        ),
-        (["export", "legend", "RUN"], "no response in closed form"),
-    ],
-)
-def test_what_production_cannot_use_is_refused(command, trained, tmp_path, words, told):
-    fine = library_file(tmp_path / "fine.lh5", n_samples=1500, dt_ns=1.0)
-    coarse = library_file(tmp_path / "coarse.lh5")
-    names = {"RUN": trained, "FINE": fine, "COARSE": coarse}
-    refused = command(*(names.get(word, word) for word in words), "--out", tmp_path / "out")
-    assert refused.code == 2
-    assert told in " ".join(refused.err.split())
-    assert len(refused.err.strip().splitlines()) == 1
-    assert not (tmp_path / "out").exists()

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
 from cpunet.cli import COMMANDS
-
-
-def test_no_command_at_all(command):
-    outcome = command()
-    assert outcome.code == 2
-    assert "Usage" in outcome.out + outcome.err
 
 
 def test_help(command):
@@ -81,18 +74,3 @@ def test_plain_files_load_neither_torch_nor_the_lh5_library(stand, tmp_path, nam
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert f"{len(traces)} of {traces.shape[1]} samples, every 16 ns" in done.stdout
-
-
-@pytest.mark.thorough
-def test_the_installed_command(stand):
-    executable = Path(sys.executable).parent / "cpunet"
-    if not executable.is_file():
-        pytest.skip("cpunet is not installed beside this Python")
-
-    def run(program: list[object], *words: object) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [*map(str, [*program, *words])], capture_output=True, text=True, check=False
-        )
-
-    assert "Usage" in run([sys.executable, "-m", "cpunet"], "--help").stdout
-    assert run([executable], "info", stand.sim).returncode == 0

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
-import shutil
+import runpy
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -42,13 +44,6 @@ def words(stand, tiny, tmp_path) -> list[object]:
     return ["train", *stand.inputs, "--out", tmp_path / "run", *SEED, *tiny, *KEPT]
 
 
-def instead(words: list[object], *more: object) -> list[object]:
-    """Words of a command in which further ones replace those of the same options."""
-    replaced = [i for i, word in enumerate(words) if word in more and word != "--set"]
-    kept = [w for i, w in enumerate(words) if not {i, i - 1} & {*replaced}]
-    return [*kept, *more]
-
-
 @pytest.mark.parametrize(
     "how",
     [
@@ -76,73 +71,6 @@ def test_a_signal_stops_between_two_iterations(
     info = json.loads((tmp_path / "run" / "run.json").read_text())
     assert info["resumed_at"] == [3]
     assert info["peak_memory_mb"]["host"] > 50
-
-
-@pytest.mark.thorough
-def test_a_second_signal_stops_at_once(command, words, trained, tmp_path, monkeypatch):
-    def twice() -> None:
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGTERM)
-
-    with monkeypatch.context() as patched:
-        at_record(patched, 2, twice)
-        stopped = command(*words)
-    assert stopped.code == 128 + signal.SIGTERM
-    assert stopped.err.splitlines()[-1].startswith("error: interrupted")
-    assert command(*words, "--resume").code == 0  # from the checkpoint before
-    assert digests(tmp_path / "run") == digests(trained)
-
-
-@pytest.mark.thorough
-def test_what_can_be_done_with_an_unfinished_training(
-    command, words, stand, trained, tmp_path, monkeypatch
-):
-    with monkeypatch.context() as patched:
-        at_record(patched, 2, lambda: signal.raise_signal(signal.SIGINT))
-        command(*words)
-    folder = tmp_path / "run.unfinished"
-    told = json.loads((folder / "unfinished.json").read_text())
-    assert (told["seed"], told["recipe"]["name"]) == (3, "paper")
-
-    def refused(*more: object) -> str:
-        outcome = command(*instead(words, *more))
-        assert outcome.code == 2
-        return outcome.err.splitlines()[-1]
-
-    assert refused() == (
-        f"error: {folder}: an unfinished training; continue with --resume, or begin again with "
-        "--force"
-    )
-    assert refused("--resume", "--set", "training.batch_size=5") == (
-        "error: resumed with another recipe: training.batch_size 4 → 5; give what the training "
-        "was begun with, or begin again with --force"
-    )
-    assert "another seed: 3 → 4;" in refused("--resume", "--seed", 4)
-    assert "another peak: FEP → 2600-;" in refused("--resume", "--peak", "2600-")
-    waveforms, kev = stand.data_waveforms[::-1], stand.data_kev[::-1]
-    other = stand.write(tmp_path / "other.lh5", "geds/raw", waveforms, kev)
-    assert "resumed with another data: sha256 " in refused("--resume", "--data", other)
-    fast = command(*words[:7], "--resume")
-    assert fast.code == 2
-    assert "recipe fast: takes a minute and keeps no checkpoints; give what" in fast.err
-    # what changes no weight may be changed
-    moved = shutil.copy(stand.data, tmp_path / "moved.lh5")
-    same = ("--data", moved, "--set", "training.checkpoint_interval=3")
-    assert command(*instead(words, "--resume", *same)).code == 0
-    assert digests(tmp_path / "run") == digests(trained)
-
-
-@pytest.mark.thorough
-def test_force_begins_again(command, words, trained, tmp_path, monkeypatch):
-    with monkeypatch.context() as patched:
-        at_record(patched, 2, lambda: signal.raise_signal(signal.SIGINT))
-        command(*instead(words, "--seed", 8))
-    # input that cannot be used costs nothing of it
-    assert command(*words, "--force", "--data-table", "none").code == 2
-    assert (tmp_path / "run.unfinished" / CHECKPOINT).is_file()
-    assert command(*words, "--force").code == 0
-    assert digests(tmp_path / "run") == digests(trained)
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 # Each is where a training is killed: what has happened to an iteration, and its number.
@@ -196,8 +124,19 @@ def die_at(moment: str, iteration: int) -> None:
     checkpoints._put_in_place, Path.replace = watched_put, watched_replace
 
 
+def forked(given: dict[str, Any]) -> Any:
+    """Run this file in a process that is forked from one in which all is imported."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(
+        ["cpunet.cli", "cpunet.training.train", "cpunet.pulses.reading.hdf5", "pytest"]
+    )
+    process = context.Process(target=runpy.run_path, args=(__file__, given, PROCESS))
+    process.start()
+    return process
+
+
 @pytest.mark.thorough
-def test_killed_at_any_moment(stand, tiny, held, tmp_path):
+def test_killed_at_any_moment(stand, tiny, tmp_path):
     """Killed by force again and again and resumed: the weights of a training in one go."""
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
     recipe = load_recipe("paper", overrides)
@@ -205,7 +144,7 @@ def test_killed_at_any_moment(stand, tiny, held, tmp_path):
     train(*files, tmp_path / "whole", recipe=recipe, seed=5, device="cpu")
     for moment in MOMENTS:
         given = {"MOMENT": moment, "ARGUMENTS": (*files, tmp_path / "run", recipe)}
-        job = held.forked(__file__, given, PROCESS)
+        job = forked(given)
         job.join()
         assert job.exitcode == -signal.SIGKILL, moment
     train(*files, tmp_path / "run", recipe=recipe, seed=5, device="cpu", resume=True)

@@ -60,18 +60,6 @@ def test_pulses_of_a_file(command, hits: Path, tmp_path: Path):
     assert "library pulses" in outcome.out
 
 
-def test_moved_and_mirrored_hits_give_the_same_pulse(command, hits: Path, tmp_path: Path):
-    moved = tmp_path / "moved.npz"
-    columns = {"x_mm": [110.0], "y_mm": [0.0], "z_mm": [-20.0]}
-    np.savez(moved, **columns, edep_keV=[2614.5], offsets=[0, 1])
-    first, second = tmp_path / "a.lh5", tmp_path / "b.lh5"
-    command("simulate", *PPC, "--hits", hits, "--out", first)
-    frame = ["--origin", "100", "0", "0", "--flip-z"]
-    command("simulate", *PPC, "--hits", moved, *frame, "--out", second)
-    a, b = (next(open_pulses(path).blocks()).waveforms for path in (first, second))
-    assert np.array_equal(a, b)
-
-
 def test_a_diode_of_legend_with_its_crystal(command, hits: Path, reference_data, tmp_path):
     metadata, out, diode = (
         reference_data / "legend-metadata",
@@ -103,14 +91,6 @@ def test_a_diode_of_legend_with_its_crystal(command, hits: Path, reference_data,
         (["--events", "FEP=5e3"], "'5e3' is no number of events; give N or FEP=N,DEP=M"),
         (["--events", "many"], "--events: 'many' is no number of events"),
         (["--events", "0"], "no event is wanted"),
-        (["--events", "5", "--set", "window_kev=0"], "window_kev: Input should be greater"),
-        (["--events", "5", "--set", "dt_ns=1.5"], "dt_ns must be a multiple"),
-        (["--events", "5", "--resolution", "-1", "0"], "give numbers from 0 up"),
-        (["--events", "5", "--set", "bias_V=900"], "does not deplete it"),
-        (["--events", "5", "--set", "temperature_K=300"], "temperature_K"),
-        (["--events", "5", "--set", "diffusion_constant=hot"], "give a number"),
-        (["--events", "5", "--set", "impurity_scale=depletion"], "no measured_depletion_V"),
-        (["--hits", "nowhere.lh5"], "nowhere.lh5: cannot be read"),
         (["--hits", "x", "--origin", "1", "2"], "--origin"),
     ],
 )
@@ -120,16 +100,6 @@ def test_wrong_words_are_one_line(command, tmp_path: Path, words: list[str], sai
     assert outcome.out == ""
     assert said in outcome.err.splitlines()[-1]
     assert "Traceback" not in outcome.err
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("option", "key"), [("--dt-ns", "dt_ns"), ("--length-ns", "length_ns")]
-)
-def test_zero_is_not_the_default_of_a_library(command, tmp_path: Path, option: str, key: str):
-    outcome = command("library", "make", *PPC, option, "0", "--out", tmp_path / "psl.lh5")
-    assert outcome.code == 2
-    assert f"settings: {key}: " in outcome.err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -144,12 +114,3 @@ def test_units_and_windows_of_a_file(command, tmp_path: Path):
     outcome = command("simulate", *words, *units)
     assert "1 of 2 events written (1 800-1200 by" in outcome.out
     assert "check --origin, --flip-z and --hits-detector" in outcome.err
-
-
-def test_output_is_replaced_only_when_told(command, hits: Path, tmp_path: Path):
-    out = tmp_path / "sim.lh5"
-    out.write_text("mine")
-    words = ["simulate", *PPC, "--hits", hits, "--out", out]
-    assert "exists already" in command(*words).err
-    assert out.read_text() == "mine"
-    assert command(*words, "--force").code == 0

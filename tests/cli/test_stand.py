@@ -47,29 +47,10 @@ def test_the_folder_is_read_and_prepared(made: Path):
         flags = dict(stored)
     assert len(flags["label"]) == len(flags["flag"]) == made_by["counts"]["n_data"]
     assert set(flags["label"]) <= {0, 2, 3}
-    left = flags["remains_kev"] > 1
+    left = flags["tails_kev"] > 1
     assert (left == (flags["flag"] & 1 > 0)).mean() > 0.99
     assert 0.1 < left.mean() < 0.6
-    assert set(flags) == {"label", "flag", "remains_kev", "n_piled", "piled_kev", "piled_ns"}
-
-
-def test_rates_are_options_and_are_told(command, tmp_path: Path):
-    values = {
-        "earlier_pulses.rate_kHz": 0,
-        "pile_up.rate_kHz": 40,
-        "hum": "{frequency_Hz: 50, amplitude_kev: 2}",
-        "wander": "{time_us: 500, rms_kev: 3}",
-    }
-    rates = [f"--set={name}={value}" for name, value in values.items()]
-    words = ("stand", "--preset", "ornl", "--events", "DEP=40", *rates)
-    assert command(*words, "--out", tmp_path / "stand").code == 0
-    electronics = json.loads((tmp_path / "stand" / "stand.json").read_text())["electronics"]
-    assert electronics["earlier_pulses"] == {"rate_kHz": 0}
-    assert electronics["hum"] == {"frequency_Hz": 50, "amplitude_kev": 2}
-    assert electronics["wander"] == {"time_us": 500, "rms_kev": 3}
-    with np.load(tmp_path / "stand" / "data_labels.npz") as known:
-        assert (known["remains_kev"] == 0).all()
-        assert 0.3 < (known["flag"] & 2 > 0).mean() < 0.9
+    assert set(flags) == {"label", "flag", "tails_kev", "n_piled", "piled_kev", "piled_ns"}
 
 
 @pytest.mark.slow
@@ -97,50 +78,3 @@ def test_no_ringing_is_invented_for_a_fast_decay(command, tmp_path: Path):
     assert found["fast_decay_1_us"] == pytest.approx(2.9, rel=0.15)
     assert found["decay_us"] == pytest.approx(54.6, rel=0.05)
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
-
-
-@pytest.mark.thorough
-def test_it_is_replaced_with_force_only(command, made: Path):
-    words = ("stand", "--preset", "ornl", "--events", "DEP=5", "--out", made)
-    assert "exists already" in command(*words).err
-    assert command(*words, "--force").code == 0
-    assert not list(made.glob("*.rows"))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--preset", "ornl", "--events", "FEP=0"), "--events FEP=0: give at least 1 event"),
-        (("--preset", "ornl", "--events", "K40=3"), "no known peak"),
-        (("--preset", "orln"), "legend200, ornl, ringing"),
-        (("--preset", "ornl", "--shift", "bias=1"), "bias: no such setting"),
-        (("--preset", "ornl", "--shift", "defualt"), "neither a file nor one of default"),
-        (("--preset", "ornl", "--set", "hole_trapping_per_us=-1"), "hole_trapping_per_us"),
-    ],
-)
-def test_bad_input_is_one_line(command, tmp_path: Path, words: tuple[str, ...], said: str):
-    done = command("stand", *words, "--out", tmp_path / "stand")
-    assert done.code == 2
-    assert said in done.err
-    assert done.err.count("\n") == 1
-    assert not any(tmp_path.iterdir())
-
-
-def test_shift_detector_and_settings_are_told(command, tmp_path: Path):
-    (tmp_path / "shift.yaml").write_text("temperature_K: 1\nhole_velocity_low_factor: 0.97\n")
-    (tmp_path / "settings.yaml").write_text("cloud_fwhm_mm: 0.2\n")
-    done = command(
-        *("stand", "--preset", "ornl", "--events", "DEP=5"),
-        *("--shift", tmp_path / "shift.yaml", "--shift", "temperature_K=1.5"),
-        *("--set", "bias_V=3900", "--set", "self_repulsion=0.5"),
-        *("--settings", tmp_path / "settings.yaml", "--out", tmp_path / "stand"),
-    )
-    assert done.code == 0, done.err
-    made_by = json.loads((tmp_path / "stand" / "stand.json").read_text())
-    sim, data = made_by["sim"], made_by["data"]
-    assert sim["detector"]["bias_V"] == data["detector"]["bias_V"] == 3900
-    assert data["detector"]["temperature_K"] - sim["detector"]["temperature_K"] == 1.5
-    assert data["settings"]["hole_velocity_low_factor"] == 0.97
-    for side in (sim, data):
-        assert side["settings"]["self_repulsion"] == 0.5
-        assert side["settings"]["cloud_fwhm_mm"] == 0.2

@@ -9,9 +9,10 @@ import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.finishing import finish, finish_both
-from cpunet.electronics.noise_traces import coloured_noise, noise_power
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.readout import coloured_noise, noise_power
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -47,7 +48,7 @@ def traces(n: int = 300, seed: int = 0, start: int = 500) -> Pulses:
 
 @pytest.fixture(scope="module")
 def noise() -> BaselineNoise:
-    return BaselineNoise.from_traces(traces(), CONFIG)
+    return BaselineNoise.of(Baselines.of([traces()], CONFIG))
 
 
 def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
@@ -65,7 +66,9 @@ def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
 
 
 def test_the_error_of_the_rms_covers_the_truth() -> None:
-    found = [BaselineNoise.from_traces(traces(100, seed), CONFIG) for seed in range(20, 40)]
+    found = [
+        BaselineNoise.of(Baselines.of([traces(100, seed)], CONFIG)) for seed in range(20, 40)
+    ]
     true = NOISE_KEV * 0.8 / np.exp(-397 * DT_NS / 54_600)
     errors = np.array([noise.rms_error for noise in found])
     pulls = (np.array([noise.rms for noise in found]) - true) / errors
@@ -84,16 +87,16 @@ def test_finished_pulses_have_the_noise_of_the_data(noise) -> None:
     records = shape(200, 1200).astype(np.float32)
     windows = finish(
         records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
-    )
+    ).windows
     raw = traces(200, seed=8)[:]
-    data = finish(raw.waveforms, CONFIG, dt_ns=DT_NS)[raw.energy_kev == 1592.5]
+    data = finish(raw.waveforms, CONFIG, dt_ns=DT_NS).windows[raw.energy_kev == 1592.5]
     assert np.isfinite(windows).all()
     assert np.median(windows[:, :200].std(axis=1)) == pytest.approx(
         np.median(data[:, :200].std(axis=1)), rel=0.05
     )
     again = finish(
         records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
-    )
+    ).windows
     np.testing.assert_array_equal(windows, again)
 
 
@@ -101,22 +104,19 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
     records = shape(600, 1200).astype(np.float32)
     records[3] = 0  # cannot be prepared
     given = {"dt_ns": DT_NS, "noise": noise, "energy_kev": np.full(600, 1592.5), "seed": 3}
-    clean, noisy = finish_both(records, CONFIG, **given)
-    np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS))
-    np.testing.assert_array_equal(noisy, finish(records, CONFIG, **given))
+    noisy, _, clean = finish(records, CONFIG, **given)
+    np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS).windows)
     assert np.isnan(noisy[3]).all()
 
 
 def test_bad_input_is_named(noise) -> None:
     with pytest.raises(CpunetError, match="only 0 of 40 traces have a known energy"):
-        BaselineNoise.from_traces(Pulses.of(traces(40).waveforms, dt_ns=DT_NS), CONFIG)
+        BaselineNoise.of(Baselines.of([Pulses.of(traces(40).waveforms, dt_ns=DT_NS)], CONFIG))
     with pytest.raises(CpunetError, match="samples before the pulse; the noise needs 400"):
-        BaselineNoise.from_traces(traces(start=380), CONFIG)
+        BaselineNoise.of(Baselines.of([traces(start=380)], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
     records = shape(3, 1200).astype(np.float32)
-    with pytest.raises(CpunetError, match="noise for 3 pulses needs 3 energies"):
-        finish(records, CONFIG, dt_ns=DT_NS, noise=noise)
     with pytest.raises(CpunetError, match="noise is sampled every 16 ns, the pulses every 8"):
         finish(records, CONFIG, dt_ns=8.0, noise=noise, energy_kev=np.ones(3))
 
@@ -154,49 +154,9 @@ def test_drawn_noise_has_the_density_it_is_drawn_from() -> None:
     np.testing.assert_allclose(found.mean(axis=0)[positive], wanted, rtol=0.05)
 
 
-@pytest.mark.parametrize("end", [0, -1])
-def test_noise_at_either_end_of_the_spectrum_has_its_power(end: int) -> None:
-    """A level of each trace, or samples of alternating sign."""
-    density = np.zeros(GRID // 2 + 1)
-    density[end] = GRID
-    drawn = of_density(density).draw(np.ones(1500), 3000, np.random.default_rng(15))
-    assert of_density(density).rms == pytest.approx(1)
-    assert drawn.std() == pytest.approx(1, rel=0.08)
-
-
-def test_white_noise_of_different_pulses_has_nothing_in_common() -> None:
-    white = of_density(np.ones(GRID // 2 + 1))
-    drawn = white.draw(np.ones(300), 1400, np.random.default_rng(5))
-    assert white.rms == pytest.approx(1)
-    products = drawn @ drawn.T / drawn.shape[1]
-    np.testing.assert_allclose(np.diag(products), 1, atol=0.25)
-    others = products[~np.eye(len(products), dtype=bool)]
-    assert others.std() == pytest.approx(1 / np.sqrt(1400), rel=0.1)
-    assert np.abs(others).max() < 6 / np.sqrt(1400)
-
-
-def test_the_same_generator_gives_the_same_noise() -> None:
-    white = of_density(np.ones(GRID // 2 + 1))
-    first, again, other = (
-        white.draw(np.ones(5), 700, np.random.default_rng(seed)) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first, again)
-    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.1
-
-
-@pytest.mark.parametrize(("n", "length"), [(0, 100), (1, 7), (3, 8192), (2, 9001)])
-def test_any_number_and_length(n: int, length: int) -> None:
-    white = of_density(np.ones(GRID // 2 + 1))
-    drawn = white.draw(np.ones(n), length, np.random.default_rng(0))
-    assert drawn.shape == (n, length)
-    assert drawn.dtype == np.float32
-    if n * length > 1000:
-        assert drawn.std() == pytest.approx(1, rel=0.05)
-
-
 def test_noise_slower_than_a_baseline_is_found() -> None:
     baselines = 2 * coloured_noise(SPECTRUM, 1500, 1200, DT_NS, np.random.default_rng(6))
-    noise = BaselineNoise.from_traces(on_baselines(baselines), CONFIG)
+    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
     assert noise.n_baselines > 1000
     assert noise.rms == pytest.approx(2 * TO_PREPARED, rel=0.1)
     drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(7)) / TO_PREPARED
@@ -212,20 +172,12 @@ def test_noise_slower_than_a_baseline_is_found() -> None:
     assert found == pytest.approx(4 * power[slow].sum(), rel=0.5)
 
 
-def test_white_noise_has_no_slow_part() -> None:
-    rng = np.random.default_rng(8)
-    noise = BaselineNoise.from_traces(on_baselines(2 * rng.normal(size=(800, 1200))), CONFIG)
-    density = noise.density_of(GRID) / TO_PREPARED**2
-    assert density[1:30].mean() == pytest.approx(4, rel=0.15)
-    assert density[100:-10].mean() == pytest.approx(4, rel=0.03)
-
-
 def test_a_line_is_a_sine_of_its_height() -> None:
     rng = np.random.default_rng(9)
     phase = rng.uniform(0, 2 * np.pi, (800, 1))
     line = 3 * np.sin(2 * np.pi * 0.11 * np.arange(1200) + phase)
     baselines = line + rng.normal(size=(800, 1200))
-    noise = BaselineNoise.from_traces(on_baselines(baselines), CONFIG)
+    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
     drawn = noise.draw(np.ones(800), 1200, np.random.default_rng(10)) / TO_PREPARED
     assert drawn.std() == pytest.approx(np.sqrt(4.5 + 1), rel=0.05)
     wave = np.exp(-2j * np.pi * 0.11 * np.arange(400))
@@ -240,9 +192,8 @@ def test_baselines_of_different_kinds_are_drawn_as_such(n: int) -> None:
     """Also if they are few: small kinds are not drawn with what all have in common."""
     rng = np.random.default_rng(11)
     heights = np.exp(rng.normal(0, 0.3, n))
-    noise = BaselineNoise.from_traces(
-        on_baselines(heights[:, np.newaxis] * rng.normal(size=(n, 1200))), CONFIG
-    )
+    raw = on_baselines(heights[:, np.newaxis] * rng.normal(size=(n, 1200)))
+    noise = BaselineNoise.of(Baselines.of([raw], CONFIG))
     drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(12)) / TO_PREPARED
     width = np.log(drawn.std(axis=1))
     assert np.median(width) == pytest.approx(0, abs=0.1)
@@ -262,22 +213,6 @@ def test_beginnings_of_windows_show_the_fast_part() -> None:
         assert drift(drawn, lag) == pytest.approx(4 * (1 - 0.8**lag), rel=0.05)
 
 
-@pytest.mark.parametrize("samples", [6, 20, 37, 38])
-def test_short_beginnings_of_many_windows_have_one_kind_of_noise(samples: int) -> None:
-    white = np.random.default_rng(14).normal(size=(100, 800))
-    windows = Pulses.of(white, dt_ns=DT_NS, energy_kev=np.full(100, 1000.0))
-    noise = BaselineNoise.from_windows(windows, samples)
-    assert noise.rms == pytest.approx(1000, rel=0.15)
-    with pytest.raises(CpunetError, match="the baselines have 5 samples; the noise needs 6"):
-        BaselineNoise.from_windows(windows, 5)
-
-
 def test_traces_without_noise_are_refused() -> None:
     with pytest.raises(CpunetError, match="most baselines are constant"):
-        BaselineNoise.from_traces(on_baselines(np.zeros((100, 1200))), CONFIG)
-
-
-def test_windows_without_energies_are_refused() -> None:
-    windows = Pulses.of(np.zeros((40, 800)), dt_ns=DT_NS)
-    with pytest.raises(CpunetError, match="only 0 flat baselines among 40 traces"):
-        BaselineNoise.from_windows(windows, 100)
+        BaselineNoise.of(Baselines.of([on_baselines(np.zeros((100, 1200)))], CONFIG))

@@ -73,16 +73,6 @@ def test_sampled_steps_equal_the_analytic_ones(name: str, fine_ns: int):
         assert np.abs(trace - means).max() < 1e-4
 
 
-def test_sampled_impulse_equals_the_analytic_one():
-    chain = read_electronics("ringing")
-    needle = np.zeros((1, 900))
-    needle[0, 0] = 1  # a unit of charge for 4 ns
-    trace = linear_response(Pulses.of(needle, dt_ns=4), chain)[0]
-    inner = (np.arange(chain.length * 64) + 0.5) / 4 - chain.n_pre * chain.dt_ns
-    exact = chain.step_response(inner) - chain.step_response(inner - 4)
-    assert np.abs(trace - exact.reshape(chain.length, 64).mean(axis=1)).max() < 1e-4
-
-
 def test_legend200_rises_as_measured():
     assert 146 <= rise_ns(read_electronics("legend200").step_response(T_NS)) <= 172
 
@@ -95,20 +85,6 @@ def test_ornl_decays_as_measured():
     # prepared pulses end at 0.80, some 6.4 us after their top
     after = step[step.argmax() + round(6400 / 0.5)] / step.max()
     assert 0.93 <= 0.80 / after <= 0.97
-
-
-def test_a_changed_copy_has_its_own_response():
-    chain = read_electronics("ornl")
-    before = chain.step_response(50.0)
-    slower = chain.model_copy(update={"bandwidth_poles_ns": (200.0,)})
-    read_anew = changed("ornl", bandwidth_poles_ns=[200])
-    assert slower.step_response(50.0) == read_anew.step_response(50.0) < before
-
-
-def test_only_the_ringing_preset_rings():
-    rings = read_electronics("ringing").step_response(T_NS)
-    quiet = read_electronics("legend200").step_response(T_NS)
-    assert np.abs(rings - quiet).max() == pytest.approx(0.10, abs=0.01)
 
 
 def test_slew_and_quadratic_bend_tall_pulses_more():
@@ -148,8 +124,3 @@ def test_a_pole_faster_than_the_grid_names_the_field():
     steps = Pulses.of(np.ones((1, 900)), dt_ns=4, energy_kev=[1000])
     with pytest.raises(CpunetError, match="bandwidth_poles_ns means 3 ns"):
         respond(steps, changed(bandwidth_poles_ns=[40, 3]))
-
-
-def test_unknown_names_list_the_known():
-    with pytest.raises(CpunetError, match="legend200, ornl, ringing"):
-        read_electronics("lengend200")

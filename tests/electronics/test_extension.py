@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.electronics.extension import PADDING_BEFORE, record_length, with_room
+from cpunet.electronics.finishing import PADDING_BEFORE, record_length, with_room
 from cpunet.recipes import load_recipe
 
 CONFIG = load_recipe("paper").preparation

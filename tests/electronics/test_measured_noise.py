@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.electronics.measured_noise import measured_noise, noise_of_traces
+from cpunet.electronics.measured import measured_noise, noise_of
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.preparation import prepare
-from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
 CONFIG = load_recipe("fast").preparation
@@ -31,39 +31,31 @@ def traces(n: int = 300, start: int = 560, seed: int = 0) -> Pulses:
     return Pulses.of(15_000 + 10 * kev, dt_ns=DT_NS, energy_kev=energy)
 
 
-def windows(raw: Pulses) -> Pulses:
-    return prepare(raw, CONFIG, "measured").pulses
+def as_input(raw: Pulses) -> InputSet:
+    prepared, baselines = prepare(raw, CONFIG, "measured"), Baselines.of([raw], CONFIG)
+    return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, baselines=baselines)
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "data.lh5"
-
-
-def test_noise_of_raw_traces_needs_no_word(path: Path) -> None:
-    raw = traces()
-    write_pulses(path, raw)
-    noise, note = measured_noise(PulseFile(path), windows(raw), CONFIG)
+def test_noise_of_raw_traces_needs_no_word() -> None:
+    noise, note = measured_noise(as_input(traces()), CONFIG)
     assert note is None
     assert noise.rms == pytest.approx(WANTED, rel=0.03)
     assert noise.n_baselines > 250
 
 
-def test_energies_that_are_not_known_do_not_matter(path: Path) -> None:
+def test_energies_that_are_not_known_do_not_matter() -> None:
     raw = traces(400)
     raw.energy_kev[::4] = np.nan
     raw.energy_kev[1::4] = 0
     raw.waveforms[::4] += np.random.default_rng(1).normal(0, 500, raw.waveforms[::4].shape)
-    write_pulses(path, raw)
-    noise = noise_of_traces(PulseFile(path), CONFIG)
+    noise = noise_of(as_input(raw))
     assert noise.rms == pytest.approx(WANTED, rel=0.04)
     assert noise.n_baselines <= 200
 
 
-def test_prepared_windows_fall_back_on_their_beginnings(path: Path) -> None:
-    prepared = windows(traces())
-    write_pulses(path, prepared)
-    noise, note = measured_noise(PulseFile(path), prepared, CONFIG)
+def test_prepared_windows_fall_back_on_their_beginnings() -> None:
+    windows = prepare(traces(), CONFIG, "measured").pulses
+    noise, note = measured_noise(as_input(windows), CONFIG)
     assert note is not None
     assert note.startswith(
         f"noise is taken from {CONFIG.baseline_samples // 2} samples a pulse"
@@ -74,17 +66,14 @@ def test_prepared_windows_fall_back_on_their_beginnings(path: Path) -> None:
     assert drawn.std() == pytest.approx(WANTED / 2000, rel=0.05)
 
 
-def test_traces_that_begin_late_fall_back_too(path: Path) -> None:
-    raw = traces(start=380)
-    write_pulses(path, raw)
-    noise, note = measured_noise(PulseFile(path), windows(raw), CONFIG)
+def test_traces_that_begin_late_fall_back_too() -> None:
+    noise, note = measured_noise(as_input(traces(start=380)), CONFIG)
     assert note is not None
     assert "samples before the pulse; the noise needs 400 or more" in note
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
 
 
-def test_without_energies_there_is_no_noise(path: Path) -> None:
+def test_without_energies_there_is_no_noise() -> None:
     raw = Pulses.of(traces(60).waveforms, dt_ns=DT_NS)
-    write_pulses(path, raw)
     with pytest.raises(CpunetError, match="only 0 flat baselines among 60 traces"):
-        measured_noise(PulseFile(path), windows(raw), CONFIG)
+        measured_noise(as_input(raw), CONFIG)

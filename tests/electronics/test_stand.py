@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,11 @@ import pytest
 from cpunet import load
 from cpunet.electronics import stand_plan
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.stand import make_stand, write_stand
-from cpunet.electronics.stand_plan import StandPlan
+from cpunet.electronics.stand import make_stand
 from cpunet.errors import CpunetError
 from cpunet.simulation.again import SameHits
-from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.field_lookup import Maps
-from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource, OpenHits
-from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
@@ -70,26 +64,6 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     monkeypatch.setattr(stand_plan, "build_library", build)
     monkeypatch.setattr(LIMIT, sum(EVENTS.values()))
     return built
-
-
-class Dead(GammaSource):
-    """Two hits beside the crystal."""
-
-    def open(self, detector: Detector) -> OpenHits:
-        place = [[0.0, 0.0, 2 * detector.crystal_length]] * 2
-        return OpenHits(2, iter([Hits.of(place, [2614.5] * 2, [0, 1, 2])]))
-
-
-@pytest.mark.parametrize("side", ["sim", "data"])
-def test_a_side_without_any_signal_is_told_in_one_line(tmp_path: Path, side: str) -> None:
-    window = Window("FEP", 2614.0, 2615.0)
-    plan = StandPlan.of(read_electronics("ornl"), DETECTOR, {window: 2})
-    dead = replace(getattr(plan, side), source=Dead((window,), (2,), 20.0, 5.0, 0))
-    with pytest.raises(
-        CpunetError, match="none of 2 events gives a signal in small; give more"
-    ):
-        write_stand(replace(plan, **{side: dead}), tmp_path / "stand")
-    assert list(tmp_path.iterdir()) == []
 
 
 def made(out: Path, seed: int = 0, shift: tuple[str, ...] = ()) -> dict[str, npt.NDArray[Any]]:

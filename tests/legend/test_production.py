@@ -216,7 +216,7 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
 def test_components_of_a_detector_are_its_own(
     chain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cpunet.legend.production.MOST", 20)
+    monkeypatch.setattr("cpunet.legend.production.MAX_TEMPLATES", 20)
     source = write(tmp_path / "ideal.lh5", charge())
     alone = translate_library(
         chain, source, tmp_path / "alone.lh5", low_rank=8, format="simflow"

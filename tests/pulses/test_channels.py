@@ -1,7 +1,8 @@
-"""Channels of a file one after another."""
+"""Channels of a file, each on its own."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import h5py
@@ -12,11 +13,12 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.channels import (
     channel_names,
     channels_of,
-    one_by_one,
-    own_folder,
+    each_channel,
     paired,
 )
 from cpunet.pulses.reading.files import PulseFile
+
+log = logging.getLogger("cpunet.pulses")
 
 
 def made(path: Path, *tables: str) -> Path:
@@ -57,21 +59,30 @@ def test_a_simulation_serves_all_channels_or_its_own(tmp_path):
     found = paired(both, data)
     assert found["ch1"][0].table == "ch1/sim"
     assert str(found["ch2"]).endswith("both.h5: no table of ch2; there are those of ch1, ch3")
+    files = paired(PulseFile(tmp_path / "{channel}" / "sim.h5"), data)
+    assert [pair[0].path.parent.name for pair in files.values()] == ["ch1", "ch2"]
 
 
-def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path, caplog):
+def work(name: str, _pair: object, out: Path) -> str:
+    if name == "ch2":
+        raise CpunetError("too few pulses")
+    log.warning("a doubt")
+    return out.name
+
+
+@pytest.mark.parametrize("cores", ["1", "2"])
+def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path, caplog, monkeypatch, cores):
     caplog.set_level("INFO", "cpunet")
     data = PulseFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw", "ch3/raw"), "all")
 
-    def work(name: str, _pair: object, out: Path) -> str:
-        if name == "ch2":
-            raise CpunetError("too few pulses")
-        return out.name
-
-    outcome = one_by_one(paired(data, data), tmp_path / "out", work)
+    monkeypatch.setenv("OMP_NUM_THREADS", cores)
+    outcome = each_channel(paired(data, data), tmp_path / "out", work)
+    assert list(outcome.done) == ["ch1", "ch3"]
     assert outcome.done == {"ch1": "ch1", "ch3": "ch3"}
     assert outcome.failed == {"ch2": "too few pulses"}
     assert "ch2: failed: too few pulses" in caplog.messages
+    for name in ("ch1", "ch3"):  # each has its own messages
+        assert caplog.messages[caplog.messages.index(f"{name}:") + 1] == "a doubt"
     assert not outcome.ok
     assert str(outcome) == "ch1  ch1\nch3  ch3\nch2  failed: too few pulses"
 
@@ -81,11 +92,4 @@ def test_an_output_of_one_is_refused(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".cpunet.json").write_text("{}")
     with pytest.raises(CpunetError, match="is the output of one channel"):
-        one_by_one(paired(data, data), tmp_path / "run", lambda *_: None)
-
-
-def test_runs_of_channels_are_found(tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "run.json").write_text("{}")
-    assert own_folder(tmp_path / "run", "ch1", "run.json") == tmp_path / "run"
-    assert own_folder(tmp_path / "runs", "ch1", "run.json") == tmp_path / "runs" / "ch1"
+        each_channel(paired(data, data), tmp_path / "run", lambda *_: None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 
-import h5py
 import lh5
 import numpy as np
 import pytest
@@ -151,12 +150,3 @@ def test_contacts_of_one_table_are_told_apart(tmp_path):
     lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
     with pytest.raises(CpunetError, match="contacts 1, 2"):
         open_pulses(tmp_path / "sim.lh5")
-
-
-def test_arrays_that_could_be_traces_are_named(tmp_path):
-    with h5py.File(tmp_path / "dsp.lh5", "w") as file:
-        file["ch1/dsp/blsub"] = np.zeros((3, 50))
-    with pytest.raises(
-        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*`table`"
-    ):
-        open_pulses(tmp_path / "dsp.lh5")

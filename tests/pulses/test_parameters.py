@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from cpunet.errors import CpunetError
-from cpunet.pulses import _current_kernels, parameters
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import (
     PARAMETERS,
@@ -18,6 +18,7 @@ from cpunet.pulses.parameters import (
     pulse_parameters,
     tail_slope,
 )
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, TIME_POINTS, all_parameters
 from cpunet.recipes import load_recipe
 from synthetic import PREPARATION
 
@@ -78,59 +79,11 @@ def test_current_amplitude_equals_the_production_chain(noise):
     assert np.abs(current_amplitude(waveforms) - expected).max() < 1e-6
 
 
-@pytest.mark.parametrize("length", [6, 50, 97, 98, 150])
-def test_current_amplitude_of_short_records_equals_the_production_chain(length):
-    waveforms = multi_site(50, 0.01, seed=2)[:, 300 : 300 + length]
-    assert current_amplitude(waveforms) == pytest.approx(production_chain(waveforms), abs=1e-6)
-
-
-@pytest.mark.parametrize("n", [1, 40])
-def test_averages_of_several_pulses_are_those_of_dspeed_to_the_last_bit(n):
-    from dspeed.processors import avg_current, moving_window_multi, upsampler
-
-    waveforms = multi_site(n, 0.01, seed=4)
-    waveforms[0, 120] = np.nan
-    expected = np.empty((n, waveforms.shape[1] - 1), np.float32)
-    avg_current(waveforms, 1, expected)
-    fine = np.empty((n, (expected.shape[1] - 1) * 16), np.float32)
-    upsampler(expected, 16, fine)
-    smooth = np.empty_like(fine)
-    moving_window_multi(fine, 48, 3, 0, smooth)
-    current, steepest = _current_kernels.currents(waveforms)
-    np.testing.assert_array_equal(current, expected)
-    np.testing.assert_array_equal(steepest[1:], expected.argmax(axis=1)[1:])
-    found = _current_kernels.averaged_maxima(
-        current,
-        np.zeros(n, np.int64),
-        current.shape[1],
-        upsampling=16,
-        steps=48,
-        averages=3,
-        ends=5,
-    )
-    np.testing.assert_array_equal(found, smooth[:, 5:-5].max(axis=1))
-
-
 def test_current_amplitude_finds_a_maximum_far_from_the_steepest_sample():
     # a lone spike of one sample is averaged away, a broad ramp elsewhere is not
     pulse = np.clip((TIME - 600) / 20, 0, 1)
     pulse[100] += 0.08
     assert current_amplitude(pulse[np.newaxis].astype(np.float32)) == pytest.approx(0.05, 1e-4)
-
-
-@pytest.mark.parametrize("sigma", [6.0, 10.0, 20.0])
-def test_current_amplitude_of_a_gaussian_current(sigma):
-    pulse = ndtr((TIME - 380.5) / sigma)[np.newaxis].astype(np.float32)
-    # variances add: differences and steps of one sample, and three averages over three
-    width = np.sqrt(sigma**2 + (1 + 1 + 3 * 9) / 12)
-    assert current_amplitude(pulse) == pytest.approx(1 / (np.sqrt(2 * np.pi) * width), rel=2e-3)
-
-
-def test_current_amplitude_does_not_depend_on_blocks(monkeypatch):
-    waveforms = multi_site(20, 1e-3, seed=3)
-    whole = current_amplitude(waveforms)
-    monkeypatch.setattr(parameters, "BLOCK", 3)
-    np.testing.assert_array_equal(current_amplitude(waveforms), whole)
 
 
 @given(
@@ -150,84 +103,11 @@ def test_drift_time_of_a_ramp(start, samples, height, fraction):
     assert measured == pytest.approx(expected, abs=0.5 * DT_NS)
 
 
-def test_drift_time_is_interpolated_between_samples():
-    crossings = np.linspace(200, 201, 11)[:, np.newaxis]
-    ramps = np.clip((TIME - crossings) / 100, 0, 1)
-    ramps[:, 400:] = 1.5  # so that every pulse has the same first maximum
-    measured = drift_time(ramps.astype(np.float32), DT_NS, 0.2)
-    assert measured == pytest.approx((400 - crossings[:, 0] - 30) * DT_NS, abs=1e-2)
-
-
-def test_drift_time_ignores_what_precedes_the_last_crossing_and_follows_the_maximum():
-    ramp = np.clip((TIME - 300) / 50, 0, 1)
-    expected = drift_time(ramp[np.newaxis].astype(np.float32), DT_NS, 0.01)
-    ramp[100:110] = 0.5
-    ramp[500:] = 0.0
-    assert drift_time(ramp[np.newaxis].astype(np.float32), DT_NS, 0.01) == expected
-
-
-@given(tau_us=st.floats(10, 1000), height=st.floats(0.1, 1e4))
-@settings(max_examples=50, deadline=None)
-def test_tail_slope_gives_the_decay_constant(tau_us, height):
-    decay = height * np.exp(-TIME * DT_NS * 1e-3 / tau_us)
-    slope = tail_slope(decay[np.newaxis].astype(np.float32), DT_NS, 300)
-    assert slope == pytest.approx(-1e3 / tau_us, rel=1e-4)
-
-
 def test_tail_slope_equals_a_polynomial_fit():
     waveforms = multi_site(20, 1e-3, seed=4)
     time_ms = np.arange(300) * DT_NS * 1e-6
     expected = np.polyfit(time_ms, np.log(waveforms[:, -300:].astype(float)).T, 1)[0]
     assert tail_slope(waveforms, DT_NS, 300) == pytest.approx(expected, rel=1e-9)
-
-
-def test_flat_tail_has_slope_zero():
-    slope = tail_slope(np.ones((2, 800), np.float32), DT_NS, 300)
-    assert slope.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize("bad", [0.0, -0.1, np.nan, np.inf])
-def test_a_tail_without_logarithm_gives_nan_for_that_pulse_only(bad):
-    waveforms = np.ones((3, 800), np.float32)
-    waveforms[1, 600] = bad
-    assert np.isnan(tail_slope(waveforms, DT_NS, 300)).tolist() == [False, True, False]
-
-
-def test_a_pulse_with_nan_gives_nan_for_that_pulse_only():
-    waveforms = multi_site(5, 1e-3, seed=5)
-    waveforms[2, 700] = np.nan
-    found = pulse_parameters(Pulses.of(waveforms, dt_ns=DT_NS), PREPARATION, SCORES)
-    assert found.keys() == PARAMETERS.keys()
-    for values in found.values():
-        assert np.isnan(values).tolist() == [False, False, True, False, False]
-
-
-def test_a_constant_pulse_has_no_drift_time_and_no_current():
-    flat = np.full((1, 800), 0.5, np.float32)
-    assert np.isnan(drift_time(flat, DT_NS, 0.01)).all()
-    assert current_amplitude(flat).tolist() == [0.0]
-
-
-def test_no_pulses_give_no_values():
-    found = pulse_parameters(Pulses.of(np.zeros((0, 800)), dt_ns=DT_NS), PREPARATION, SCORES)
-    assert {name: values.shape for name, values in found.items()} == dict.fromkeys(
-        PARAMETERS, (0,)
-    )
-
-
-def test_records_too_short_are_refused_in_one_line():
-    short = np.zeros((2, 5), np.float32)
-    for call in (
-        lambda: current_amplitude(short),
-        lambda: tail_slope(short, DT_NS, 300),
-        lambda: drift_time(short[:, :1], DT_NS, 0.01),
-    ):
-        with pytest.raises(CpunetError, match=r"waveforms have shape \(2, \d\); .* or more$"):
-            call()
-
-
-def test_axis_labels_name_the_unit():
-    assert PARAMETERS["drift_time"].axis_label == "Drift time, 1 % to maximum [ns]"
 
 
 def test_current_amplitude_of_measured_traces_equals_the_production_chain(reference_data):
@@ -238,3 +118,118 @@ def test_current_amplitude_of_measured_traces_equals_the_production_chain(refere
     traces -= traces[:, :200].mean(axis=1, keepdims=True)
     traces /= traces.max(axis=1, keepdims=True)
     assert np.abs(current_amplitude(traces) - production_chain(traces)).max() < 1e-6
+
+
+def parameters_of(waveforms: np.ndarray) -> dict[str, np.ndarray]:
+    pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=DT_NS)
+    return all_parameters(pulses, PREPARATION, SCORES)
+
+
+def smoothed_current(waveforms: np.ndarray) -> np.ndarray:
+    """The current of dspeed's own chain, on the fine grid."""
+    from dspeed.processors import avg_current, moving_window_multi, upsampler
+
+    n, length = waveforms.shape
+    current = np.empty((n, length - 1), np.float32)
+    avg_current(waveforms, 1, current)
+    fine = np.empty((n, (length - 2) * 16), np.float32)
+    upsampler(current, 16, fine)
+    smooth = np.empty_like(fine)
+    moving_window_multi(fine, 48, 3, 0, smooth)
+    return smooth
+
+
+@pytest.mark.parametrize("samples", [30, 97, 200])
+def test_times_and_areas_of_a_ramp(samples):
+    found = parameters_of(np.clip((TIME - 400 + samples) / samples, 0, 1))
+    rise_ns = samples * DT_NS
+    for name, fraction in TIME_POINTS.items():
+        assert found[name] == pytest.approx((fraction - 1) * rise_ns, abs=0.01)
+    assert found["rise_10_90"] == pytest.approx(0.8 * rise_ns, abs=0.01)
+    assert found["rise_01_90"] == pytest.approx(0.89 * rise_ns, abs=0.01)
+    assert found["rise_01_99"] == pytest.approx(0.98 * rise_ns, abs=0.01)
+    assert found["rise_10_99"] == pytest.approx(0.89 * rise_ns, abs=0.01)
+    assert found["rise_90_99"] == pytest.approx(0.09 * rise_ns, abs=0.01)
+    assert found["drift_time"] == pytest.approx(0.99 * rise_ns, abs=0.01)
+    # a triangle of height 0.99
+    assert found["effective_drift_time"] == pytest.approx(0.99**2 / 2 * rise_ns, abs=0.01)
+
+
+def last_crossing(pulse: np.ndarray, level: float) -> float:
+    top = int(np.argmax(pulse))
+    below = np.flatnonzero(pulse[:top] < level)[-1]
+    return float(np.interp(level, pulse[below : below + 2], [below, below + 1]))
+
+
+def area_above(pulse: np.ndarray, height: float, start: float, stop: int) -> float:
+    """Trapezoids between the height and the pulse, which is linear between samples."""
+    grid = np.concatenate([[start], np.arange(np.floor(start) + 1, stop + 1)])
+    return float(np.trapezoid(1 - np.interp(grid, np.arange(len(pulse)), pulse) / height, grid))
+
+
+def test_times_and_effective_drift_time_of_noisy_pulses():
+    waveforms = multi_site(40, 2e-3, seed=1)
+    found = parameters_of(waveforms)
+    for i, pulse in enumerate(waveforms.astype(float)):
+        for name, fraction in TIME_POINTS.items():
+            expected = (last_crossing(pulse, fraction * pulse.max()) - 400) * DT_NS
+            assert found[name][i] == pytest.approx(expected, abs=0.02)
+        start = last_crossing(pulse, 0.01 * pulse.max())
+        area = area_above(pulse, pulse.max(), start, int(pulse.argmax()))
+        assert found["effective_drift_time"][i] == pytest.approx(area * DT_NS, abs=0.05)
+
+
+@pytest.mark.parametrize("noise", [0.0, 7.5e-4, 0.01])
+def test_current_width_is_that_of_dspeeds_own_chain(noise):
+    waveforms = multi_site(100, noise, seed=3)
+    found = parameters_of(waveforms)["current_width"]
+    for current, width in zip(smoothed_current(waveforms).astype(float), found, strict=True):
+        top, half = int(current.argmax()), current.max() / 2
+        left = np.flatnonzero(current[:top] <= half)[-1]
+        right = top + np.flatnonzero(current[top:] <= half)[0]
+        begin = np.interp(half, current[left : left + 2], [left, left + 1])
+        end = np.interp(half, current[[right, right - 1]], [right, right - 1])
+        assert width == pytest.approx((end - begin) * DT_NS / 16, abs=0.05)
+
+
+def test_baseline_rms_is_that_about_a_line():
+    waveforms = multi_site(20, 3e-3, seed=6) + np.float32(1e-4) * TIME.astype(np.float32)
+    found = parameters_of(waveforms)["baseline_rms"]
+    for pulse, rms in zip(waveforms.astype(float), found, strict=True):
+        fit = np.polyfit(TIME[:200], pulse[:200], 1, full=True)
+        assert rms == pytest.approx(np.sqrt(fit[1][0] / 198), rel=1e-6)
+
+
+def test_the_three_parameters_of_the_paper_are_among_them():
+    waveforms = multi_site(20, 1e-3, seed=7)
+    found = parameters_of(waveforms)
+    assert list(found) == list(SHAPE_PARAMETERS)
+    expected = pulse_parameters(Pulses.of(waveforms, dt_ns=DT_NS), PREPARATION, SCORES)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values)
+        assert SHAPE_PARAMETERS[name].axis_label == PARAMETERS[name].axis_label
+    for values in found.values():
+        assert values.dtype == np.float64
+        assert values.shape == (20,)
+        assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("sample", [0, 390, 799])
+def test_a_value_that_is_not_finite_gives_nan_for_that_pulse_only(bad, sample):
+    waveforms = multi_site(5, 1e-3, seed=9)
+    expected = parameters_of(waveforms)
+    waveforms[2, sample] = bad
+    for name, values in parameters_of(waveforms).items():
+        assert np.isnan(values).tolist() == [False, False, True, False, False], name
+        others = [0, 1, 3, 4]
+        assert values[others] == pytest.approx(expected[name][others], rel=1e-9, abs=1e-9)
+
+
+def test_the_documented_table_is_the_registry():
+    page = Path(__file__).parents[2] / "docs" / "parameters.md"
+    rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]
+    assert rows == [
+        f"| `{name}` | {p.unit} | {p.definition} | {p.source} |"
+        for name, p in SHAPE_PARAMETERS.items()
+    ]

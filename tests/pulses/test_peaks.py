@@ -25,11 +25,6 @@ lines = st.dictionaries(
 energies = st.lists(st.floats(allow_nan=True, allow_infinity=True, width=32), max_size=20)
 
 
-def test_windows_include_their_ends_and_nothing_else():
-    labels = label_peaks([1587.511, 1587.5, 1597.511, 1597.52, 2614.0], LINES)
-    assert labels.tolist() == ["DEP", "", "DEP", "", "FEP"]
-
-
 @given(energies, lines)
 def test_the_nearest_line_whose_window_covers_wins(values, peaks):
     labels = label_peaks(values, peaks)
@@ -43,14 +38,6 @@ def test_the_nearest_line_whose_window_covers_wins(values, peaks):
             assert covering[label] == min(covering.values())
         else:
             assert label == ""
-
-
-@given(energies, lines.filter(bool), st.data())
-def test_selecting_lines_is_selecting_labels(values, peaks, data):
-    chosen = data.draw(st.lists(st.sampled_from(sorted(peaks)), min_size=1, unique=True))
-    selection = parse_selection(",".join(chosen), peaks)
-    expected = [label in chosen for label in label_peaks(values, peaks)]
-    assert selection.select(values).tolist() == expected
 
 
 @given(energies, st.integers(0, 3000), st.integers(1, 500))
@@ -98,13 +85,3 @@ def test_lines_in_ranges_are_those_not_chosen_by_name() -> None:
     assert parse_selection("300-", peaks).lines_in_ranges == ["FEP", "SEP", "DEP"]
     assert parse_selection("FEP,1000-1580,1620-2080", peaks).lines_in_ranges == []
     assert parse_selection("FEP,DEP,1500-2700", peaks).lines_in_ranges == ["SEP"]
-
-
-def test_parts_of_a_selection_make_it_up() -> None:
-    selection = parse_selection("FEP,1000-1580,2700-", load_recipe("fast").peaks)
-    assert [part.name for part in selection.parts] == ["FEP", "1000-1580", "2700-"]
-    twice = parse_selection("FEP,300-2614.511,FEP,300-2614.511", selection.peaks)
-    assert [part.name for part in twice.parts] == ["FEP", "300-2614.511"]
-    energies = [2614.5, 1200.0, 1600.0, 3000.0]
-    together = np.any([part.select(energies) for part in selection.parts], axis=0)
-    np.testing.assert_array_equal(together, selection.select(energies))

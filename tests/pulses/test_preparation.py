@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
 from synthetic import PREPARATION as CONFIG
@@ -74,17 +73,6 @@ class TestMeasured:
             assert prepared.align_sample[i] == align
             np.testing.assert_allclose(prepared.pulses.waveforms[i], window, atol=1e-6)
 
-    def test_levels_and_undoing(self) -> None:
-        raw = measured(n=20)
-        prepared = prepared_of(raw)
-        windows = prepared.pulses.waveforms.astype(float)
-        np.testing.assert_allclose(windows[:, :200].mean(1), 0, atol=1e-7)
-        np.testing.assert_allclose(windows[:, -5:].mean(1), 0.80, rtol=1e-6)
-        for i in range(20):
-            start = prepared.align_sample[i] - 400
-            undone = windows[i] * prepared.scale[i] + prepared.baseline[i]
-            np.testing.assert_allclose(undone, raw[i, start : start + 800], atol=0.01)
-
     def test_noise_tail_and_chi_square_are_those_put_in(self) -> None:
         prepared = prepared_of(measured(n=400, noise=10.0, tau_us=54.6))
         rms = prepared.baseline_rms * prepared.scale
@@ -93,37 +81,6 @@ class TestMeasured:
         # Expectation n/(n-2) from the estimated noise; the error of the mean is 0.006.
         assert np.mean(prepared.chi2) == pytest.approx(1.01, abs=0.03)
         assert abs(np.mean(prepared.baseline_slope)) < 0.05
-
-    def test_tail_slope_equals_a_straight_line_fit(self) -> None:
-        prepared = prepared_of(measured(n=5))
-        t_ms = np.arange(300) * DT_NS * 1e-6
-        logs = np.log(prepared.pulses.waveforms[:, -300:].astype(float))
-        expected = np.polyfit(t_ms, logs.T, 1)[0]
-        np.testing.assert_allclose(prepared.tail_slope, expected, rtol=1e-6)
-
-    def test_baseline_slope_of_a_decaying_baseline(self) -> None:
-        raw = measured(n=3, noise=0.0) + np.arange(1200) * -0.5
-        prepared = prepared_of(raw)
-        per_ms = -0.5 / (DT_NS * 1e-6) / prepared.scale
-        np.testing.assert_allclose(prepared.baseline_slope, per_ms, rtol=1e-3)
-
-    @settings(max_examples=30, deadline=None)
-    @given(
-        gain=st.floats(0.01, 50),
-        offset=st.floats(-2e4, 2e4),
-        seed=st.integers(0, 2**32 - 1),
-    )
-    def test_gain_and_offset_do_not_matter(self, gain: float, offset: float, seed: int) -> None:
-        raw = measured(n=4, seed=seed)
-        plain = prepared_of(raw)
-        changed = prepared_of(gain * (raw + offset))
-        # float32 holds an offset trace to 2e-7 of full scale: a tie may move a sample.
-        same = plain.align_sample == changed.align_sample
-        assert np.all(abs(plain.align_sample - changed.align_sample) <= 2)
-        np.testing.assert_allclose(
-            plain.pulses.waveforms[same], changed.pulses.waveforms[same], atol=1e-5
-        )
-        np.testing.assert_allclose(plain.tail_slope[same], changed.tail_slope[same], atol=2e-2)
 
     @settings(max_examples=30, deadline=None)
     @given(
@@ -144,19 +101,6 @@ class TestMeasured:
         np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
         np.testing.assert_allclose(twice.tail_slope, once.tail_slope, atol=1e-3)
 
-    def test_preparing_again_survives_exact_ties_with_the_threshold(self) -> None:
-        # 999 of 1000 is the threshold itself: float32 rounding decides on which side.
-        steps = np.arange(1, 60)[:, None]
-        raw = np.zeros((59, 1200))
-        raw[:, 500:] = np.exp(-np.arange(700) * 0.016 / 60) * 1000
-        raw[:, 499] = 999
-        raw[:, 498] = 990
-        once = prepared_of(raw * steps)
-        assert set(once.align_sample) == {499}
-        twice = prepared_of(once.pulses.waveforms)
-        np.testing.assert_array_equal(twice.align_sample, 400)
-        np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
-
     def test_early_pulse_is_padded_with_zero(self) -> None:
         prepared = prepared_of(measured(start=260.0, length=800))
         padding = 400 - int(prepared.align_sample[0])
@@ -173,10 +117,6 @@ class TestMeasured:
         assert prepared.rejections == {"window_outside_record": 2}
         assert prepared.index.tolist() == [2]
         assert len(prepared_of(late, max_padding_after=200)) == 1
-
-    def test_pile_up_moves_the_window_out_of_the_record(self) -> None:
-        raw = measured() + measured(start=1000.0, offset=0.0)
-        assert prepared_of(raw).rejections == {"window_outside_record": 1}
 
     def test_what_is_not_a_pulse_is_counted_by_reason(self) -> None:
         good = measured()[0]
@@ -197,14 +137,6 @@ class TestMeasured:
         trace = measured()[0]
         trace[900] = 10_000
         assert prepared_of([trace]).rejections == {"tail_not_positive": 1}
-
-    def test_traces_without_samples_are_refused(self) -> None:
-        with pytest.raises(CpunetError, match="no samples"):
-            prepared_of(np.zeros((3, 0)))
-
-    def test_no_traces_are_no_error(self) -> None:
-        prepared = prepared_of(np.zeros((0, 1200)))
-        assert (len(prepared), prepared.n_read, prepared.rejections) == (0, 0, {})
 
     @settings(max_examples=60, deadline=None)
     @given(length=st.integers(1, 900), seed=st.integers(0, 2**32 - 1), kind=st.booleans())
@@ -268,19 +200,6 @@ class TestSimulated:
         offset = prepared_of(3 + 2 * drift, "simulated")
         assert offset.baseline[0] == pytest.approx(3 + 2 * drift[0, 0])
 
-    def test_no_noise_has_no_chi_square_and_no_slope(self) -> None:
-        prepared = prepared_of(simulated(n=5), "simulated")
-        assert np.isnan(prepared.chi2).all()
-        np.testing.assert_allclose(prepared.tail_slope, 0, atol=1e-3)
-
-    @settings(max_examples=30, deadline=None)
-    @given(seed=st.integers(0, 2**32 - 1), length=st.integers(130, 2000))
-    def test_preparing_again_changes_nothing(self, seed: int, length: int) -> None:
-        once = prepared_of(simulated(n=5, seed=seed, length=length), "simulated")
-        twice = prepared_of(once.pulses.waveforms, "simulated")
-        assert len(once) == len(twice) == 5
-        np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
-
 
 class TestSets:
     def test_joining_blocks_equals_one_block(self) -> None:
@@ -296,12 +215,6 @@ class TestSets:
         np.testing.assert_array_equal(joined.pulses.waveforms, whole.pulses.waveforms)
         np.testing.assert_array_equal(joined.pulses.energy_kev, joined.index)
 
-    def test_joining_files_counts_rows_on(self) -> None:
-        first, second = prepared_of(measured(n=4)), prepared_of(measured(n=3, seed=1))
-        joined = Prepared.concatenate([first, second])
-        assert joined.index.tolist() == list(range(7))
-        assert joined.n_read == 7
-
     def test_rejecting_counts_and_choosing_does_not(self) -> None:
         prepared = prepared_of(np.concatenate([np.full((1, 1200), np.nan), measured(n=4)]))
         reasons = np.array([0, Rejection.CHI2, 0, Rejection.CHI2], np.uint8)
@@ -313,25 +226,6 @@ class TestSets:
         chosen = prepared[np.array([2, 0])]
         assert chosen.index.tolist() == [3, 1]
         assert chosen.rejections == {"nan": 1}
-
-
-@pytest.mark.parametrize("kind", ["simulated", "measured"])
-@pytest.mark.parametrize("top", [398, 399, 400, 401])
-def test_pulses_can_be_aligned_at_their_maximum(kind: str, top: int) -> None:
-    t = np.arange(1000)
-    pulse = np.where(t <= top, np.clip((t - 300) / (top - 300), 0, 1), np.exp((top - t) / 3000))
-    prepared = prepared_of(1000 * pulse[np.newaxis], kind, align_fraction=1.0)
-    assert prepared.align_sample.tolist() == [top]
-
-
-def test_closure_data_prepare_twice_alike(reference_data) -> None:  # type: ignore[no-untyped-def]
-    with h5py.File(reference_data / "closure" / "data.lh5") as file:
-        raw = file["geds/raw/waveform/values"][:600]
-    once = prepared_of(raw)
-    assert len(once) > 590
-    twice = prepared_of(once.pulses.waveforms)
-    np.testing.assert_allclose(twice.pulses.waveforms, once.pulses.waveforms, atol=3e-7)
-    assert np.median(once.chi2) == pytest.approx(1, abs=0.3)
 
 
 def test_real_traces(reference_data) -> None:  # type: ignore[no-untyped-def]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -92,13 +91,6 @@ def test_the_digitiser_sets_the_period(tmp_path, bits, dt_ns):
         open_pulses(path, dt_ns=10)
 
 
-def test_blocks_are_bounded(tmp_path):
-    events = [event(i, {0: trace(i)}) for i in range(7)]
-    source = open_pulses(write(tmp_path / "run.fcio", config(1), *events))
-    assert (source.n_pulses, source.length) == (None, LENGTH)
-    assert [len(block) for block in source.blocks(3)] == [3, 3, 1]
-
-
 def test_a_cut_off_file_gives_its_whole_events_and_then_an_error(tmp_path):
     events = [event(i, {0: trace(i)}) for i in range(5)]
     path = write(tmp_path / "run.fcio", config(1), *events)
@@ -112,33 +104,6 @@ def test_a_cut_off_file_gives_its_whole_events_and_then_an_error(tmp_path):
     path.write_bytes(whole[:80])
     with pytest.raises(CpunetError, match=r"run.fcio"):
         open_pulses(path).read()
-
-
-def test_no_events(tmp_path):
-    path = write(tmp_path / "run.fcio", config(1))
-    with pytest.raises(CpunetError, match="holds no pulses"):
-        open_pulses(path).read()
-
-
-def test_energies_of_another_file_must_have_as_many(tmp_path):
-    events = [event(i, {0: trace(i)}) for i in range(5)]
-    path = write(tmp_path / "run.fcio", config(1), *events)
-    with h5py.File(tmp_path / "hit.h5", "w") as h5:
-        h5["right_kev"] = np.arange(5.0)
-        h5["long_kev"] = np.arange(6.0)
-        h5["short_kev"] = np.arange(4.0)
-    hit = tmp_path / "hit.h5"
-    pulses = open_pulses(path, energy=f"{hit}:right_kev").read()
-    assert pulses.energy_kev.tolist() == [0, 1, 2, 3, 4]
-    with pytest.raises(CpunetError, match="5 waveforms, but 6 energies"):
-        open_pulses(path, energy=f"{hit}:long_kev").read()
-    with pytest.raises(CpunetError, match="event 4 has no energy"):
-        open_pulses(path, energy=f"{hit}:short_kev").read()
-
-
-def test_nothing_is_printed(reference_data: Path, capfd):
-    open_pulses(reference_data / "real" / "th228.fcio").read()
-    assert capfd.readouterr() == ("", "")
 
 
 def test_measured_traces_equal_their_copy_in_hdf5(reference_data: Path):

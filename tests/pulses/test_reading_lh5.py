@@ -152,13 +152,6 @@ def test_of_several_columns_the_full_record_is_taken(file, raw):
     assert (other.dt_ns, other.length) == (64.0, 10)
 
 
-def test_one_table_under_two_names_is_one(file, raw):
-    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file, group="ch1")
-    with h5py.File(file, "a") as h5:
-        h5["alias"] = h5["ch1"]
-    assert open_pulses(file).n_pulses == N
-
-
 @pytest.mark.thorough
 def test_encoded_waveforms_are_decoded(file, raw):
     table = waveform_table(raw)
@@ -198,13 +191,6 @@ def test_a_period_that_changes_names_the_event(file, raw):
         list(open_pulses(file).blocks(4))
 
 
-@pytest.mark.parametrize("dt", [np.nan, 0.0, -16.0])
-def test_a_period_that_is_no_period_is_refused(file, raw, dt):
-    lh5.write(Table(col_dict={"waveform": waveform_table(raw, dt)}), "raw", file)
-    with pytest.raises(CpunetError, match=r"pulses.lh5: event 0: the sampling period is"):
-        open_pulses(file)
-
-
 def test_the_users_period_must_agree(file, raw):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
@@ -217,27 +203,6 @@ def test_a_period_without_units_needs_the_user(file, raw):
     with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give `dt_ns`"):
         open_pulses(file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
-
-
-def test_no_waveforms_lists_what_there_is(file):
-    lh5.write(Table(col_dict={"edep": Array(np.arange(3.0))}), "det1", file, group="stp")
-    with pytest.raises(CpunetError, match=r"no waveforms in it; it holds stp/det1"):
-        open_pulses(file)
-
-
-def test_no_events_is_an_error(file):
-    lh5.write(Table(col_dict={"waveform": waveform_table(np.zeros((0, 8)))}), "raw", file)
-    with pytest.raises(CpunetError, match=r"raw/waveform holds no pulses"):
-        open_pulses(file)
-
-
-def test_nan_samples_are_passed_on(file):
-    values = np.ones((3, 8), np.float32)
-    values[1, 2] = np.nan
-    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "raw", file)
-    pulses = open_pulses(file, kev_per_adc=1.0).read()
-    assert np.isnan(pulses.waveforms[1, 2])
-    assert np.isnan(pulses.energy_kev).tolist() == [False, True, False]
 
 
 def test_memory_does_not_grow_with_the_file(file):

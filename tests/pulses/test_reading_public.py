@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import pickle
-import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-import cpunet
-from cpunet.cli import main
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses, tables_of
-from cpunet.pulses.writing import write_pulses
 from synthetic import decay, phased_edges
 
 KEV = 2614.511
@@ -135,16 +131,6 @@ def test_pickled_pulses(tmp_path, lists):
     assert open_pulses(file, energy="tp0", kev_per_adc=2, dt_ns=16).read().energy_kev[1] == 802
 
 
-def test_a_pickle_of_the_oldest_kind_and_numbered_events(tmp_path):
-    entry = {"wf": [0.0, 1.0, 2.0], "event": 77, "energy": 5.0}
-    (tmp_path / "old.pkl").write_bytes(pickle.dumps(entry, protocol=0))
-    pulses = open_pulses(tmp_path / "old.pkl", dt_ns=16).read()
-    assert pulses.waveforms.tolist() == [[0, 1, 2]]
-    assert pulses.event_number.tolist() == [77]
-    (tmp_path / "named otherwise").write_bytes(pickle.dumps(entry))
-    assert len(open_pulses(tmp_path / "named otherwise", dt_ns=16).read()) == 1
-
-
 DEFECTS = {
     "no period": (
         {"dt_ns": None},
@@ -181,56 +167,3 @@ def test_what_is_wrong_with_a_pickle_is_one_line(tmp_path, defect):
     with pytest.raises(CpunetError, match=words) as error:
         open_pulses(file, **options).read()
     assert "\n" not in str(error.value)
-
-
-def test_a_text_named_as_a_pickle(tmp_path):
-    (tmp_path / "notes.pickle").write_text("these are no pulses")
-    with pytest.raises(CpunetError, match="breaks off after 0 entries"):
-        open_pulses(tmp_path / "notes.pickle", dt_ns=16)
-
-
-def told(capsys, monkeypatch, *words: object) -> str:
-    monkeypatch.setattr("sys.argv", ["cpunet", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert not ended.value.code
-    return capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_info_train_and_validate_on_the_majorana_release(tmp_path, capsys, monkeypatch):
-    raw, sim = tmp_path / "MJD_Train_0.hdf5", tmp_path / "sim.lh5"
-    write_majorana(raw)
-    table = told(capsys, monkeypatch, "info", raw, "--dt-ns", 10)
-    assert "column energy [keV]" in table
-    one = told(capsys, monkeypatch, "info", raw, "--table", 5, "--dt-ns", 10)
-    assert "Majorana release" in one
-    assert re.search(rf"^lines +{2 * N * 2 // 3} FEP$", one, re.MULTILINE)
-    simulated = phased_edges(N, np.random.default_rng(3), 500, 1000)
-    pulses = cpunet.Pulses.of(simulated, dt_ns=10, energy_kev=np.full(N, KEV))
-    write_pulses(sim, pulses)
-    data = cpunet.PulseFile(raw, table="5", dt_ns=10)
-    run = cpunet.train(sim, data, tmp_path / "run", settings=SHORT, device="cpu")
-    assert run.data.read == 2 * N * 2 // 3
-    assert run.data.read_as == {"table": "5", "dt_ns": 10}
-    report = cpunet.validate(run, sim, raw, baselines=False, device="cpu")  # read as before
-    assert report.metrics["peaks"]["FEP"]["n_data"] == run.data.used
-    back = cpunet.translate(run, data, tmp_path / "back.lh5", inverse=True)
-    assert "psd_label_dcr" in cpunet.open_pulses(back.path).columns
-
-
-@pytest.mark.slow
-def test_info_train_and_validate_on_pickles(tmp_path, capsys, monkeypatch):
-    rng = np.random.default_rng(5)
-    sim = write_pickles(tmp_path / "fep_wf_sim.pickle", phased_edges(N, rng, 500, 1000))
-    raw = write_pickles(tmp_path / "fep_wf_ornl.pickle", measured(rng, N, 1600, 700))
-    assert "pickled pulses" in told(capsys, monkeypatch, "info", raw, "--dt-ns", 16)
-    sides = cpunet.PulseFile(sim, dt_ns=16), cpunet.PulseFile(raw, dt_ns=16)
-    run = cpunet.train(*sides, tmp_path / "run", settings=SHORT, device="cpu")
-    assert run.sim.read == run.data.read == N
-    report = cpunet.validate(run, *sides, baselines=False, device="cpu")
-    assert report.metrics["peaks"]["FEP"]["n_sim"] == run.sim.used
-    made = cpunet.translate(run, sides[0], tmp_path / "translated.lh5")
-    np.testing.assert_array_equal(
-        cpunet.open_pulses(made.path).columns["tp0"].read(0, 3), [400, 401, 402]
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,8 @@ from hypothesis import strategies as st
 from cpunet.errors import CpunetError
 from cpunet.pulses import sets
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.arrays import MemorySource
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.sets import load_prepared
 from cpunet.recipes.schema import PreparationConfig
 
@@ -31,20 +32,6 @@ CONFIG = PreparationConfig(
 )
 
 
-class MemorySource:
-    """Pulses in memory, given out in blocks."""
-
-    path = Path("run7.lh5")
-
-    def __init__(self, pulses: Pulses) -> None:
-        self.pulses = pulses
-        self.n_pulses = len(pulses)
-
-    def blocks(self, size: int, /) -> Iterator[Pulses]:
-        for start in range(0, len(self.pulses), size):
-            yield self.pulses[start : start + size]
-
-
 def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> MemorySource:
     energy_kev = np.asarray(energies, float)
     t = np.maximum(np.arange(60) - 27, 0)
@@ -52,7 +39,8 @@ def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> Memor
         np.nan_to_num(energy_kev, nan=500.0)[:, None] * np.minimum(t / 5, 1) * np.exp(-t / 300)
     )
     raw[broken or []] = np.nan
-    return MemorySource(Pulses.of(raw, dt_ns=16, energy_kev=energy_kev))
+    pulses = Pulses.of(raw, dt_ns=16, energy_kev=energy_kev)
+    return MemorySource(PulseFile(Path("run7.lh5")), pulses)
 
 
 @pytest.fixture(autouse=True)
@@ -78,39 +66,22 @@ def test_every_pulse_is_kept_or_counted() -> None:
     st.lists(st.sampled_from([1000.0, 50.0, np.nan]), min_size=1, max_size=20),
     st.integers(1, 20),
 )
-def test_counts_add_up(energies: list[float], most: int) -> None:
+def test_counts_add_up(energies: list[float], max_pulses: int) -> None:
     source = source_of([*energies, 1000.0])
-    prepared = load_prepared(source, CONFIG, "measured", select=near_1000, most=most)
+    prepared = load_prepared(
+        source, CONFIG, "measured", select=near_1000, max_pulses=max_pulses
+    )
     assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read
     assert prepared.n_read == len(energies) + 1
-    assert len(prepared) == min(most, energies.count(1000.0) + 1)
-    assert (source.pulses.energy_kev[prepared.index] == 1000).all()
-
-
-def test_without_selection_energies_need_not_be_known() -> None:
-    prepared = load_prepared(source_of([np.nan] * 5), CONFIG, "simulated")
-    assert (len(prepared), prepared.rejections) == (5, {})
-
-
-def test_peaks_are_named() -> None:
-    prepared = load_prepared(
-        source_of([1592, 1000, 1593]),
-        CONFIG,
-        "measured",
-        peaks=lambda energy_kev: np.where(energy_kev > 1500, "DEP", ""),
-    )
-    assert prepared.pulses.peak.tolist() == ["DEP", "", "DEP"]
-
-
-def test_progress_is_told(stages: dict[str, list[float | None]]) -> None:
-    load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
-    assert stages == {"Preparing run7.lh5": [9, 4, 4, 1]}
+    assert len(prepared) == min(max_pulses, energies.count(1000.0) + 1)
+    assert (source.read().energy_kev[prepared.index] == 1000).all()
 
 
 def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     source = source_of([1000.0, 50.0] * 500)
     first, second = (
-        load_prepared(source, CONFIG, "measured", select=near_1000, most=60) for _ in range(2)
+        load_prepared(source, CONFIG, "measured", select=near_1000, max_pulses=60)
+        for _ in range(2)
     )
     assert (len(first), first.n_read) == (60, 1000)
     assert first.rejections == {"energy_outside_selection": 500, "not_drawn": 440}
@@ -122,17 +93,6 @@ def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     whole = load_prepared(source, CONFIG, "measured", select=near_1000)
     same = np.isin(whole.index, first.index)
     assert (whole.pulses.waveforms[same] == first.pulses.waveforms).all()
-
-
-def test_a_sample_that_is_large_enough_is_everything() -> None:
-    source = source_of([1000.0] * 9)
-    assert load_prepared(source, CONFIG, "measured", most=9).rejections == {}
-
-
-def test_only_windows_are_kept() -> None:
-    prepared = load_prepared(source_of([1000.0] * 9), CONFIG, "measured")
-    assert prepared.pulses.waveforms.shape == (9, 40)
-    assert prepared.pulses.waveforms.base is None
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.side import apparent_side, recorded_side, require_side
 from cpunet.pulses.writing import PulseWriter
 
 TIME = np.arange(800)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
-
 import h5py
 import lh5
 import numpy as np
@@ -69,19 +67,6 @@ def test_the_lh5_library_reads_what_was_written(tmp_path_factory, waveforms, dt_
     assert again.dt_ns == pytest.approx(dt_ns)
 
 
-def test_units_attributes_and_compression(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    write_pulses(path, some(), table="ch7/raw", waveform_units="ADC", attrs={"run": "r001"})
-    table = lh5.read("ch7/raw", path)
-    assert table.waveform.values.attrs["sample_units"] == "ADC"
-    assert table.attrs["run"] == "r001"
-    assert lh5.ls(path, "ch7/") == ["ch7/raw"]
-    with h5py.File(path) as h5:
-        values = h5["ch7/raw/waveform/values"]
-        assert (values.compression, values.shuffle) == ("gzip", True)
-        assert values.chunks[1] == 20
-
-
 def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
     build_dsp = pytest.importorskip("dspeed").build_dsp
     path, pulses = tmp_path / "pulses.lh5", some(20, 30)
@@ -105,16 +90,6 @@ def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
     np.testing.assert_allclose(found, pulses.waveforms.max(axis=1))
 
 
-def test_an_existing_file_is_kept_unless_forced(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    write_pulses(path, some(3))
-    with pytest.raises(CpunetError, match="exists already; choose another name"):
-        write_pulses(path, some(4))
-    assert open_pulses(path).n_pulses == 3
-    write_pulses(path, some(4), force=True)
-    assert open_pulses(path).n_pulses == 4
-
-
 def test_a_failure_leaves_no_file(tmp_path):
     def failing():
         yield some()
@@ -132,12 +107,6 @@ def test_no_pulses_leave_no_file(tmp_path, blocks):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("other", [some(length=21), some(dt_ns=8.0)])
-def test_blocks_must_fit_together(tmp_path, other):
-    with pytest.raises(CpunetError, match="write them to separate files"):
-        write_pulses(tmp_path / "pulses.lh5", [some(), other])
-
-
 def test_columns_must_fit(tmp_path):
     path = tmp_path / "pulses.lh5"
     for n in (5, 7):
@@ -150,23 +119,6 @@ def test_columns_must_fit(tmp_path):
         with pytest.raises(CpunetError, match="separate files"):
             writer.append(some())
     assert open_pulses(path).n_pulses == 6
-
-
-def test_empty_blocks_between_others_add_nothing(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    assert write_pulses(path, [some(0), some(2), some(0), some(3, start=2)]) == 5
-    assert open_pulses(path).read().event_number.tolist() == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.thorough
-def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path):
-    block = some(250, 500)  # 0.5 MB
-    tracemalloc.start()
-    try:
-        write_pulses(tmp_path / "pulses.lh5", (block for _ in range(30)))
-        assert tracemalloc.get_traced_memory()[1] < 5e6
-    finally:
-        tracemalloc.stop()
 
 
 def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
@@ -217,14 +169,3 @@ def test_no_column_replaces_another(tmp_path):
     for others in (in_file, beside):
         values = {name: column.nda[0] for name, column in others.read(0, 6).items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
-
-
-def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
-    def full(*_given):
-        raise CpunetError("no space left")
-
-    monkeypatch.setattr("cpunet.pulses.writing.FileInTheMaking", full)
-    writer = PulseWriter(tmp_path / "a.lh5")
-    with pytest.raises(CpunetError, match="no space left"), writer:
-        pass
-    assert list(tmp_path.iterdir()) == []

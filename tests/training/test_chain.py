@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import load_pulses
@@ -22,7 +22,6 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
-from cpunet.training.fit import Sides
 from cpunet.training.networks import outside_noise
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
@@ -169,12 +168,12 @@ def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_remains_of_earlier_pulses_are_learned_without_being_asked(
+def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "cpunet")
     traces, rng = digitised(N, seed=2), np.random.default_rng(7)
-    law = RemainsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
+    law = TailsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
     left = law.draw(N, rng)[:, np.newaxis]
     decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
     data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
@@ -183,35 +182,34 @@ def test_remains_of_earlier_pulses_are_learned_without_being_asked(
     assert fit["chi_square"] < 1.6 * fit["moments"]
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
     assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
-    told = fit["remains"]
+    told = fit["tails"]
     assert np.all(np.diff(told["sizes"]["percent_above"]) <= 0)
     assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
-    assert any(note.startswith("remains of earlier pulses: ") for note in caplog.messages)
+    assert any(note.startswith("pile-up tails: ") for note in caplog.messages)
     ren = REN.load(tmp_path / "run")
-    assert ren.remains is not None
-    assert ren.remains.law.rate_khz == told["rate_khz"]
-    # without remains the noise is that of empty baselines
+    assert ren.tails is not None
+    assert ren.tails.law.rate_khz == told["rate_khz"]
+    # without tails the noise is that of empty baselines
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
     # networks with noise outside are prepared alike
     paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
     chosen = parse_selection("FEP", paper.peaks)
-    sim = load_pulses(files.sim, "simulated", paper, chosen).prepared.pulses
+    sim = load_pulses(files.sim, "simulated", paper, chosen)
     measured = load_pulses(data, "measured", paper, chosen)
-    sides = Sides(sim, measured.prepared.pulses, data, measured)
-    outside, entry = outside_noise(sides, paper)
+    outside, entry = outside_noise(sim, measured, paper)
     assert outside is not None
-    assert outside.noise.remains is not None
-    assert outside.noise.remains.law.rate_khz == told["rate_khz"]
-    assert entry.remains.rate_khz == told["rate_khz"]
+    assert outside.noise.tails is not None
+    assert outside.noise.tails.law.rate_khz == told["rate_khz"]
+    assert entry.tails.rate_khz == told["rate_khz"]
 
 
-def test_data_without_remains_are_given_none(run: Trained) -> None:
-    assert run.run.fit.remains.rate_khz == 0
-    assert not any("remains" in record.getMessage() for record in run.told)
-    remains = REN.load(run.folder).remains
-    assert remains is not None
-    assert remains.law.rate_khz == 0
+def test_data_without_tails_are_given_none(run: Trained) -> None:
+    assert run.run.fit.tails.rate_khz == 0
+    assert not any("pile-up tails" in record.getMessage() for record in run.told)
+    tails = REN.load(run.folder).tails
+    assert tails is not None
+    assert tails.law.rate_khz == 0
 
 
 @pytest.mark.thorough

@@ -62,7 +62,7 @@ def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> Flo
     energy = None if kev is None else np.full(len(sim), kev)
     windows = finish(
         records, RECIPE.preparation, dt_ns=DT_NS, noise=noise, energy_kev=energy, seed=5
-    )
+    ).windows
     assert np.isfinite(windows).all()
     return windows
 
@@ -214,7 +214,7 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
 
 
 def test_many_pulses_are_thinned_out_by_the_seed(monkeypatch):
-    monkeypatch.setattr(inverse_module, "MOST", 250)
+    monkeypatch.setattr(inverse_module, "MAX_PULSES", 250)
     recipe = load_recipe("fast", ["generator.poles_ns=[50, 50]"])
     sim, generator = charge(400, seed=1), readout(NOISE_KEV)
     energy = np.full(len(sim), FEP_KEV)

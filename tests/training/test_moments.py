@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from alignment import at_half_maximum
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.training.moments import BLOCK, MIN_N, Moments
+from cpunet.training.moments import BLOCK, MIN_PULSES, Moments
 from synthetic import two_sites
+from unpaired import at_half_maximum
 
 RECIPE = load_recipe("fast")
 CONFIG, PREPARATION = RECIPE.matching.training, RECIPE.preparation
@@ -181,10 +181,10 @@ def test_the_order_of_the_data_does_not_leave_pulses_out(first: str) -> None:
     assert Moments.of_data(ordered, CONFIG, PREPARATION).left_out == 0
 
 
-@pytest.mark.parametrize("n", [1, 50, MIN_N - 1])
+@pytest.mark.parametrize("n", [1, 50, MIN_PULSES - 1])
 def test_too_few_pulses_are_refused(windows, n: int) -> None:
     with pytest.raises(
-        CpunetError, match=rf"^{n} measured pulses can be used; {MIN_N} or more"
+        CpunetError, match=rf"^{n} measured pulses can be used; {MIN_PULSES} or more"
     ):
         Moments.of_data(windows[:n], CONFIG, PREPARATION)
 

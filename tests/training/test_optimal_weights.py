@@ -60,7 +60,7 @@ def band_behind(poles_ns: tuple[float, float]) -> Band:
     energies = np.full(N, KEV)
     data = finish(
         records, RECIPE.preparation, dt_ns=DT_NS, noise=WHITE, energy_kev=energies, seed=3
-    )
+    ).windows
     moments = Moments.of_data(data, TRAINING, RECIPE.preparation)
     noise = Noise.draw(WHITE, energies, record_length(800), 2, np.random.default_rng(4))
     return Band("FEP", Translated(charge(2), noise, moments, np.ones(N)), np.arange(N))

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from alignment import crossing
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.extension import PADDING_BEFORE, with_room
+from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.finishing import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan, Step, weighted_l1, window_weights
 from cpunet.training.outside import Outside, as_measured, in_room, tolerance
-from derivatives import Values, slopes
+from unpaired import crossing
 
 CONFIG = load_recipe("paper").preparation
 DT_NS, RMS_KEV = 16.0, 4.0
@@ -28,6 +27,33 @@ TINY = (
     "discriminator.hidden=4",
     "discriminator.samples_per_step=16",
 )
+
+Values = dict[str, torch.Tensor]
+
+
+def slopes(
+    function: Callable[[], Values], moved: torch.Tensor, along: torch.Tensor, step: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Derivatives of each value along a direction: by autograd, and by central differences."""
+
+    def values() -> Values:
+        torch.manual_seed(1)  # the same noise every time
+        return function()
+
+    found, wanted = {}, {}
+    for name, value in values().items():
+        (slope,) = torch.autograd.grad(value, moved, retain_graph=True, allow_unused=True)
+        found[name] = 0.0 if slope is None else float((slope * along).sum())
+    with torch.no_grad():
+        start = moved.clone()
+        sides = []
+        for sign in (1, -1):
+            moved.copy_(start + sign * step * along)
+            sides.append(values())
+        moved.copy_(start)
+    for name in found:
+        wanted[name] = float(sides[0][name] - sides[1][name]) / (2 * step)
+    return found, wanted
 
 
 def white(rms_kev: float = RMS_KEV) -> BaselineNoise:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from alignment import at_half_maximum
 from cpunet.electronics.chain import Electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import (
@@ -34,6 +33,7 @@ from unpaired import (
     DT_NS,
     N,
     Unpaired,
+    at_half_maximum,
     charge,
     edge_errors,
     faster,

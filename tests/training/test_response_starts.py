@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from cpunet.electronics.drawn_remains import KnownDecay
+from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit, response_starts
@@ -61,7 +61,7 @@ def test_nothing_else_is_tried_for_another_detector(
 
 
 @pytest.mark.parametrize(
-    ("true_us", "remains", "expected"),
+    ("true_us", "tails", "expected"),
     [
         (300.0, None, 300.0),  # its own decay fits, although tails fall with 100 us
         (101.0, None, 100.0),  # that of the tails does: it is from other data
@@ -69,7 +69,7 @@ def test_nothing_else_is_tried_for_another_detector(
     ],
 )
 def test_a_known_response_starts_with_the_main_decay_that_fits(
-    monkeypatch, true_us, remains, expected
+    monkeypatch, true_us, tails, expected
 ):
     class Problem:
         """A chi-square that knows the main decay."""
@@ -89,7 +89,7 @@ def test_a_known_response_starts_with_the_main_decay_that_fits(
     recipe = load_recipe("fast")
     known = ElectronicsResponse(recipe.matching[0], 16.0)
     known.log_decay_us.data.fill_(math.log(300.0))
-    fitter = Fitter(recipe.matching[1], remains)
+    fitter = Fitter(recipe.matching[1], tails)
     monkeypatch.setattr(fitter, "fit", lambda of, **_: Fitted(of, 0.0, np.eye(1)))
     found = response_starts.from_known(Problem(known), known, fitter)
     assert found is not None

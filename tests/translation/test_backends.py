@@ -141,9 +141,9 @@ def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) ->
     assert "\n" not in str(error.value)
 
 
-def test_the_inverse_adds_no_remains(iren) -> None:
-    with pytest.raises(CpunetError, match="leave out remains_kev"):
-        iren.translate(responded(5, seed=3), remains_kev=100.0)
+def test_the_inverse_adds_no_tails(iren) -> None:
+    with pytest.raises(CpunetError, match="leave out tails_kev"):
+        iren.translate(responded(5, seed=3), tails_kev=100.0)
 
 
 def test_seeds(ren, sim) -> None:

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
-from cpunet.electronics.remains_law import RemainsLaw
-from cpunet.electronics.second_pulses import SecondPulses
+from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.positional_unet import PositionalUNet
@@ -38,8 +38,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = CycleGan(RECIPE, outside)
     folder = tmp_path_factory.mktemp("run")
     info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
-    drawn = DrawnRemains(RemainsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
-    fit = {"remains": {"rate_khz": 2.0, "drawn": drawn.describe()}}
+    drawn = DrawnTails(TailsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
+    fit = {"tails": {"rate_khz": 2.0, "drawn": drawn.describe()}}
     write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu", "fit": fit})
     return folder
 
@@ -71,23 +71,23 @@ def test_noise_goes_as_one_over_the_energy(run, sim):
 
 def test_other_pulses_are_added_with_the_noise(run, sim):
     ren = REN.load(run)
-    assert ren.remains is not None
+    assert ren.tails is not None
     energies = {"energy_kev": np.full(len(sim), 2000.0)}
     plain = ren.apply(sim, generator=ren.seeded(1), **energies)
     left = np.full(len(sim), 500.0)
-    lifted = ren.apply(sim, generator=ren.seeded(1), remains_kev=left, **energies)
+    lifted = ren.apply(sim, generator=ren.seeded(1), tails_kev=left, **energies)
     fall = (lifted - plain)[:, :20].mean() - (lifted - plain)[:, 180:200].mean()
     # 500 keV begin 200 samples before the window and fall within it
     wanted = 0.25 * np.exp(-210 * 0.016 / 50) * -np.expm1(-180 * 0.016 / 50)
     assert fall == pytest.approx(wanted, rel=0.2)
-    second = SecondPulses(
+    piled = InTracePileUp(
         len(sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
     )
-    drawn = Drawn(generator=ren.seeded(1), second=second, **energies)
+    drawn = Drawn(generator=ren.seeded(1), second=piled, **energies)
     result, _ = ren.apply_with_codes(sim, drawn)
     step = result[4] - plain[4]
     # 0.2 of the height of 1, less by the scale: the tail is higher too
     assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)
     assert np.array_equal(result[5], plain[5])
     with pytest.raises(CpunetError, match="drawn with electronic noise"):
-        ren.apply(sim, noise=False, remains_kev=left, **energies)
+        ren.apply(sim, noise=False, tails_kev=left, **energies)

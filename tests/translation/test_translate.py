@@ -20,10 +20,11 @@ from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors, Wavefor
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import SIZES_KEV
+from cpunet.electronics.drawn_tails import SIZES_KEV
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.processes import outcomes
 from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
@@ -34,7 +35,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation import file_translation
 from cpunet.translation.forms import to_adc
-from cpunet.translation.many_files import _in_processes, expanded
+from cpunet.translation.many_files import expanded
 from cpunet.translation.noise_blocks import noise_seed
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
@@ -75,7 +76,7 @@ def run(tmp_path_factory):
     return write_chain(tmp_path_factory.mktemp("runs") / "run", INFO | {"data": DATA})
 
 
-REMAINS = {
+TAILS = {
     "rate_khz": 1.0,
     "drawn": {
         "rate_khz": 1.0,
@@ -91,8 +92,8 @@ REMAINS = {
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory):
-    """A chain of data with remains of earlier pulses."""
-    info = INFO | {"data": DATA, "fit": {"remains": REMAINS}}
+    """A chain of data with pile-up tails."""
+    info = INFO | {"data": DATA, "fit": {"tails": TAILS}}
     return write_chain(tmp_path_factory.mktemp("runs") / "run", info)
 
 
@@ -240,7 +241,7 @@ def test_the_options_of_a_translation_are_told(busy, tmp_path):
         [
             ({}, None),
             ({"noise": False}, "noise False"),
-            ({"seed": 4, "remains": "learned"}, "seed 4, remains learned"),
+            ({"seed": 4, "tails": "learned"}, "seed 4, tails learned"),
             (raw | {"realisations": 2}, "realisations 2, adc baseline 0.0"),
         ]
     ):
@@ -558,13 +559,13 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
 
 
 def left_in(path, table="geds/ren"):
-    return lh5.read(f"{table}/remains_kev", path).nda
+    return lh5.read(f"{table}/tails_kev", path).nda
 
 
-def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
+def test_learned_tails_are_those_behind_the_cuts(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, many = tmp_path / "out.lh5", {"realisations": 40}
-    translate(busy, source, out, remains="learned", **many)
+    translate(busy, source, out, tails="learned", **many)
     left = left_in(out)
     assert len(left) == 40 * N
     assert left.max() < 40
@@ -573,15 +574,15 @@ def test_learned_remains_are_those_behind_the_cuts(busy, tmp_path):
     higher = values(out)[:, 410:440].mean(axis=1)
     share = left / lh5.read("geds/ren/energy", out).nda
     assert np.corrcoef(share, higher)[0, 1] > 0.4
-    translate(busy, source, tmp_path / "rate.lh5", remains="1", **many)
+    translate(busy, source, tmp_path / "rate.lh5", tails="1", **many)
     assert left_in(tmp_path / "rate.lh5").max() > 100
 
 
-def test_remains_lift_the_baselines_of_raw_traces(busy, tmp_path):
+def test_tails_lift_the_baselines_of_raw_traces(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    for remains in ("none", "3"):
-        out = tmp_path / f"{remains}.lh5"
-        translate(busy, source, out, adc=True, scale=ADC, remains=remains, seed=3)
+    for tails in ("none", "3"):
+        out = tmp_path / f"{tails}.lh5"
+        translate(busy, source, out, adc=True, scale=ADC, tails=tails, seed=3)
     left = left_in(tmp_path / "3.lh5")
     none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
     assert (left > 20).sum() > 5
@@ -650,10 +651,10 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
         ({"jobs": 0}, "`jobs` is 0; expected 1 or more"),
         ({"seed": -1}, "`seed` -1: expected a whole number from 0"),
         ({"seed": 2**64}, "expected a whole number from 0"),
-        ({"remains": "many"}, "`remains` many: expected learned, none, or a rate in kHz"),
-        ({"remains": "-1"}, "expected learned, none, or a rate"),
-        ({"remains": "learned", "noise": False}, "or translate with noise"),
-        ({"remains": "learned", "inverse": True}, "leave out `remains`"),
+        ({"tails": "many"}, "`tails` many: expected learned, none, or a rate in kHz"),
+        ({"tails": "-1"}, "expected learned, none, or a rate"),
+        ({"tails": "learned", "noise": False}, "or translate with noise"),
+        ({"tails": "learned", "inverse": True}, "leave out `tails`"),
     ],
 )
 def test_options_that_cannot_be(busy, tmp_path, options, said):
@@ -662,11 +663,11 @@ def test_options_that_cannot_be(busy, tmp_path, options, said):
         translate(busy, source, tmp_path / "out.lh5", **options)
 
 
-def test_runs_that_tell_of_no_remains(run, network, tmp_path):
+def test_runs_that_tell_of_no_tails(run, network, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     for folder in (run, network):
-        with pytest.raises(CpunetError, match="the run tells nothing of remains"):
-            translate(folder, source, tmp_path / "o.lh5", remains="1")
+        with pytest.raises(CpunetError, match="the run tells nothing of pile-up tails"):
+            translate(folder, source, tmp_path / "o.lh5", tails="1")
         with pytest.raises(CpunetError, match="does not tell the energies of other pulses"):
             translate(folder, source, tmp_path / "o.lh5", pile_up_khz=1)
 
@@ -725,7 +726,7 @@ def killed():
 @pytest.mark.thorough
 def test_a_process_that_is_killed_is_told():
     with pytest.raises(CpunetError, match="a process was ended, perhaps for lack of memory"):
-        list(_in_processes(killed, ["a", "b"], 1))
+        list(outcomes(killed, ["a", "b"], 2))
     assert multiprocessing.active_children() == []
 
 

@@ -257,22 +257,22 @@ def parameters(seed: int, shift: float = 0.0) -> dict[str, np.ndarray]:
 
 def test_compare_takes_any_methods_and_is_json_ready():
     data = parameters(0)
-    methods = {"raw": parameters(1, 300.0), "ren": parameters(2), "rival": parameters(3, 50.0)}
+    methods = {"raw": parameters(1, 300.0), "ren": parameters(2), "other": parameters(3, 50.0)}
     methods["raw"]["tail_slope"][:] = np.nan
     result = compare(data, methods, SCORES, seed=1)
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert result.keys() == data.keys()
     drift = result["drift_time"]
-    assert drift["iou"].keys() == {"raw", "ren", "rival", "ceiling"}
-    assert drift["iou"]["raw"] < drift["iou"]["rival"] < drift["iou"]["ren"]
+    assert drift["iou"].keys() == {"raw", "ren", "other", "ceiling"}
+    assert drift["iou"]["raw"] < drift["iou"]["other"] < drift["iou"]["ren"]
     assert drift["iou"]["ren"] == pytest.approx(drift["iou"]["ceiling"], abs=10)
     assert drift["wasserstein"]["raw"] == pytest.approx(300, rel=0.1)
     assert drift["ks"]["raw"] > drift["ks"]["ren"]
     tail = result["tail_slope"]
-    assert tail["missing"] == {"data": 0, "raw": 500, "ren": 0, "rival": 0}
+    assert tail["missing"] == {"data": 0, "raw": 500, "ren": 0, "other": 0}
     assert tail["iou"]["raw"] == 0
     for key in ("wasserstein", "wasserstein_std", "ks", "ks_std"):
-        assert tail[key].keys() == {"raw", "ren", "rival"}
+        assert tail[key].keys() == {"raw", "ren", "other"}
         assert tail[key]["raw"] is None
     assert drift["wasserstein_null"] == pytest.approx(9, rel=0.25)  # of a width of 100
     assert drift["wasserstein"]["ren"] < drift["wasserstein_null"] + 3 * 3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.training.sides_figure import sides_figure
 from cpunet.validation.pulse_figures import (
@@ -110,7 +110,7 @@ def test_the_counts_of_pulses_are_those_of_the_files():
 
 
 def test_the_sizes_that_a_training_keeps_are_drawn_beside_the_law():
-    law = RemainsLaw(1.0, 55.0, (100.0, 2000.0))
+    law = TailsLaw(1.0, 55.0, (100.0, 2000.0))
     kev = np.geomspace(2, 2000, 30)
     summary = {"rate_khz": 1.0, "rate_error_khz": 0.1, "decay_us": 55.0, "error_kev": 2.5}
     sizes = {"kev": kev.tolist(), "percent_above": (100 * law.share_above(kev)).tolist()}

@@ -43,7 +43,7 @@ def pulses(n: int, centre: float = 350.0) -> np.ndarray:
 
 def test_further_parameters_have_a_panel_each():
     rng = np.random.default_rng(0)
-    names = ("rise_10_90", "late_charge", "overshoot", "current_width", "baseline_rms")
+    names = ("rise_10_90", "t50", "tail_slope", "current_width", "baseline_rms")
     values = {
         name: {method: rng.normal(100, 5, 300) for method in ("data", "ren")} for name in names
     }

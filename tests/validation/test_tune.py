@@ -53,12 +53,13 @@ def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:
     selection = parse_selection("FEP", recipe.peaks)
     sim = load_pulses(files.sim, "simulated", recipe, selection)
     data = load_pulses(files.data, "measured", recipe, selection)
-    return HeldOut.of(sim, data, files.data, recipe, seed)
+    return HeldOut.of(sim, data, recipe, seed)
 
 
 def test_held_out_pulses_are_of_the_peak_and_in_no_training(files):
     parts = held_out(files, tiny())
-    for fit, held in ((parts.fit.sim, parts.sim), (parts.fit.data, parts.data)):
+    for side, held in ((parts.fit_sim, parts.sim), (parts.fit_data, parts.data)):
+        fit = side.prepared.pulses
         events = {*fit.event_number.tolist()}, {*held.event_number.tolist()}
         assert not events[0] & events[1]
         assert len(held) == int(0.3 * (len(fit) + len(held)))
@@ -73,7 +74,7 @@ def test_held_out_pulses_are_of_the_peak_and_in_no_training(files):
 class Giving(REN):
     """Gives pulses whatever it is asked to translate."""
 
-    remains = None
+    tails = None
 
     def __init__(self, windows: np.ndarray, recipe: Recipe) -> None:
         self.windows, self.recipe = windows, recipe
@@ -88,7 +89,9 @@ class Giving(REN):
 def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
     recipe = tiny("scores.bootstraps=100")
     parts = held_out(files, recipe)
-    alike = parts.score(Giving(parts.fit.data.waveforms[: len(parts.data)], recipe))
+    alike = parts.score(
+        Giving(parts.fit_data.prepared.pulses.waveforms[: len(parts.data)], recipe)
+    )
     assert 0.3 < alike < 2
     assert parts.score(Giving(parts.data.waveforms, recipe)) == 0
     assert parts.score(Giving(parts.sim.waveforms, recipe)) > 10

@@ -92,7 +92,7 @@ def configuration(metadata: Path) -> dict[str, Any]:
             "translate": ["--format=currents"],
         },
         "events": {"hits": "stp/*.lh5"},
-        "validate": {"rivals": False},
+        "validate": {"baselines": False},
     }
 
 

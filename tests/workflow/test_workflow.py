@@ -100,7 +100,7 @@ def two_detectors() -> dict[str, Any]:
             },
         },
         "train": {"set": ["training.start_factors=[1.0]"]},
-        "validate": {"rivals": False},
+        "validate": {"baselines": False},
     }
 
 
@@ -486,7 +486,7 @@ def test_a_real_run_of_two_detectors(tmp_path):
                     "scores.bootstraps=20",
                 ]
             },
-            "validate": {"rivals": False},
+            "validate": {"baselines": False},
             "seeds": [1, 2],
         }
     )

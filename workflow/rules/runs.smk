@@ -128,8 +128,8 @@ rule validate:
     params:
         reading=reading,
         options=options(seed=config["train"]["seed"], device=config["device"]),
-        rivals="--baselines" if config["validate"]["rivals"] else "--no-baselines",
+        baselines="--baselines" if config["validate"]["baselines"] else "--no-baselines",
     shell:
         "cpunet validate {input.run:q} --sim {input.sim:q} --data {input.data:q}"
-        " {params.reading} {params.options} {params.rivals} --out {output:q} --force"
+        " {params.reading} {params.options} {params.baselines} --out {output:q} --force"
         " > {log:q} 2>&1"

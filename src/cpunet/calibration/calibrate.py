@@ -32,8 +32,7 @@ from cpunet.calibration.nuisances import Physics, known_before
 from cpunet.calibration.result import described, hopeless
 from cpunet.calibration.search import Calibrated, Search
 from cpunet.calibration.titles import titled
-from cpunet.electronics.measured_noise import measured_noise
-from cpunet.electronics.measured_remains import drawn_like, measured_remains
+from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
@@ -187,9 +186,7 @@ class _Job:
         # not stretched: what is off in the drift is for the physics to explain
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
         recipe = self.recipe.model_copy(update={"training": training})
-        job = TrainingJob(
-            recipe, self.peak, self.seed, "cpu", again, sides.data, self.data, folder
-        )
+        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, sides.data, folder)
         run = train_chain(job, calibrated.response)
         content["seconds"] = round(time.perf_counter() - clock, 1)
         assert run.fit is not None  # of a chain
@@ -237,11 +234,11 @@ class _Job:
         """The search, ready to start."""
         measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
         preparation = self.recipe.preparation
-        remains, _ = measured_remains(self.data, preparation)
+        tails, _ = tails_of(sides.data)
         drawn = None
-        if remains is not None and remains.law is not None:
-            drawn = drawn_like(remains, self.data, sides.data, preparation)
-        noise, note = measured_noise(self.data, measured, preparation, remains)
+        if tails is not None and tails.law is not None:
+            drawn = drawn_like(tails, sides.data, preparation)
+        noise, note = measured_noise(sides.data, preparation, tails)
         if note is not None:
             log.warning(note)
         physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors

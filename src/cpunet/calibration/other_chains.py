@@ -47,15 +47,15 @@ def decaying_chain(
 ) -> ElectronicsResponse | None:
     """Return a chain with one early decay of free time if the data need it.
 
-    The main decay is constrained to that of the remains, if these are known.
+    The main decay is constrained to that of the tails, if these are known.
     """
     mean, spread = problem.by_chance
     if _cost(problem) < mean + BEYOND_CHANCE * spread:
         return None
     chain = copy.deepcopy(problem.parameters.chain.response)
     plain = _at_these_physics(problem, chain, sets, training)
-    remains = sets.remains
-    decay = None if remains is None else remains.known_decay
+    tails = sets.tails
+    decay = None if tails is None else tails.known_decay
     other = with_free_decay(plain, Fitter(training, decay))
     if other is None:
         return None

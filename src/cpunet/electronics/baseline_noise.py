@@ -16,18 +16,12 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from cpunet.electronics.baseline_tails import (
-    MIN_N,
-    SHORTEST_SHARE,
-    SIGMA_PER_MAD,
-    samples_before_pulses,
-)
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.noise_spectrum import FIRST_CLEAN_BIN, spectrum
+from cpunet.electronics.pile_up_tails import MIN_BASELINES, SIGMA_PER_MAD
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import prepare
-from cpunet.recipes.schema import PreparationConfig
 
 MIN_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
 TRACES = 64  # drawn at a time, to bound memory
@@ -88,15 +82,15 @@ class BaselineNoise:
     rms_error: float | None = None
 
     @classmethod
-    def from_traces(cls, raw: Pulses, config: PreparationConfig) -> Self:
+    def of(cls, baselines: Baselines, chosen: npt.NDArray[np.bool_] | None = None) -> Self:
         """Estimate the spectrum from the samples before the pulses of raw traces.
 
         Parameters
         ----------
-        raw
-            Measured traces of one channel with their energies, from any mixture of peaks.
-        config
-            Preparation settings, which give the baseline and scale of each trace.
+        baselines
+            Baselines of measured traces of one channel, from any mixture of peaks.
+        chosen
+            Mask of the traces to use; those without a known energy are left out.
 
         Raises
         ------
@@ -104,7 +98,10 @@ class BaselineNoise:
             If too few traces have a known energy and a flat baseline, or the
             baselines are shorter than 400 samples.
         """
-        return cls._of_baselines(_baselines(raw, config), len(raw), raw.dt_ns)
+        if chosen is None:
+            chosen = np.ones(len(baselines), bool)
+        values = _in_prepared_units(baselines, chosen)
+        return cls._of_baselines(values, int(chosen.sum()), baselines.first.dt_ns)
 
     @classmethod
     def _of_baselines(cls, baselines: Values, n: int, dt_ns: float) -> Self:
@@ -115,10 +112,10 @@ class BaselineNoise:
                 f"{2 * FIRST_CLEAN_BIN} or more, so raise preparation.baseline_samples"
             )
         flat = baselines[_flat(baselines)] if len(baselines) else baselines
-        if len(flat) < MIN_N:
+        if len(flat) < MIN_BASELINES:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {n} traces; give more traces "
-                f"(at least {MIN_N} with known energy)"
+                f"(at least {MIN_BASELINES} with known energy)"
             )
         if not np.ptp(flat, axis=1).any():
             raise CpunetError(
@@ -278,7 +275,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
 
     one = np.zeros(len(flat), np.intp)
-    kinds = min(KINDS, len(flat) // MIN_N)
+    kinds = min(KINDS, len(flat) // MIN_BASELINES)
     bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
     if kinds < 2 or bins < BANDS:
         return one
@@ -296,7 +293,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     with warnings.catch_warnings(action="ignore"):
         centres, which = scipy.cluster.vq.kmeans2(points, kinds, minit="++", rng=rng, iter=50)
     # baselines of kinds with too few are assigned to the nearest kind with enough
-    enough = np.bincount(which, minlength=kinds) >= MIN_N
+    enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
     if not enough.any():
         return one
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
@@ -311,28 +308,27 @@ def _band_powers(baselines: Values) -> Values:
     return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
 
 
-def _baselines(raw: Pulses, config: PreparationConfig) -> Values:
+def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> Values:
     """Samples before the pulse in prepared units times keV, the same number for each trace."""
-    known = np.flatnonzero(np.isfinite(raw.energy_kev) & (raw.energy_kev > 0))
-    prepared = prepare(raw[known], config, "measured")
-    if len(prepared) < MIN_N:
+    energy_kev = baselines.first.energy_kev
+    known = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
+    rows = np.flatnonzero(known[baselines.prepared.index])
+    if len(rows) < MIN_BASELINES:
         raise CpunetError(
-            f"only {len(prepared)} of {len(raw)} traces have a known energy and can be "
-            f"prepared; give {MIN_N} or more to take the noise from"
+            f"only {len(rows)} of {chosen.sum()} traces have a known energy and can be "
+            f"prepared; give {MIN_BASELINES} or more to take the noise from"
         )
-    free = samples_before_pulses(prepared, config)
-    length = int(np.quantile(free, SHORTEST_SHARE))
+    before = baselines.before[rows]
+    length = min(int(np.quantile(before, SHORTEST_SHARE)), baselines.first.length)
     if length < MIN_SAMPLES:
         raise CpunetError(
             f"the traces have {max(length, 0)} samples before the pulse; the noise needs "
             f"{MIN_SAMPLES} or more, so give traces with a longer baseline"
         )
-    used = np.flatnonzero(free >= length)
-    samples = raw.waveforms[known[prepared.index[used]], :length].astype(float)
-    kev = prepared.pulses.energy_kev[used] / prepared.scale[used]
-    return np.asarray(
-        (samples - prepared.baseline[used, np.newaxis]) * kev[:, np.newaxis], float
-    )
+    used = baselines.prepared[rows[before >= length]]
+    samples = baselines.first.waveforms[used.index, :length].astype(float)
+    kev = used.pulses.energy_kev / used.scale
+    return np.asarray((samples - used.baseline[:, np.newaxis]) * kev[:, np.newaxis], float)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:

@@ -105,7 +105,7 @@ class NoiseSpectrum(Config):
         return self
 
 
-class Noise(Config):
+class ReadoutNoise(Config):
     """Noise with an RMS of `rms_kev`, independent of the pulse energy.
 
     It is drawn from a spectrum or cut from measured baselines. `baselines_file` holds
@@ -118,7 +118,7 @@ class Noise(Config):
     baselines_file: Path | None = None
 
     @model_validator(mode="after")
-    def _one_source(self) -> Noise:
+    def _one_source(self) -> ReadoutNoise:
         if (self.spectrum is None) == (self.baselines_file is None):
             raise ValueError("give either a spectrum or a baselines_file")
         return self
@@ -131,7 +131,7 @@ class EarlierPulses(Config):
 
 
 class PileUp(Config):
-    """Second pulses within the record, a Poisson process."""
+    """Piled-up pulses within the record, a Poisson process."""
 
     rate_kHz: _Rate
 
@@ -210,7 +210,7 @@ class Electronics(Config):
     decays: Annotated[tuple[Decay, ...], Field(min_length=1, max_length=4)]
     gain_adc_per_kev: Positive
     non_linearity: NonLinearity | None
-    noise: Noise
+    noise: ReadoutNoise
     baseline_mean_adc: NonNegative
     baseline_spread_adc: NonNegative
     trigger_jitter_ns: Annotated[float, Field(ge=0, le=MAX_JITTER_NS)]

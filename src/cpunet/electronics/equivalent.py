@@ -90,7 +90,10 @@ def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
     found, height = scaled(np.array([sigma, tau]))
     peak = BEGIN + int(_averaged(step)[BEGIN:].argmax()) - (WINDOW - 1) * WINDOWS // 2
     kernel = kernel_step(time, sigma, tau)
-    ratios = _ratios(step, kernel)
+    # A of the kernel over A of the chain for constant currents
+    ratios = np.array(
+        [_averaged(kernel, w).max() / _averaged(step, w).max() for w in WIDTHS_NS]
+    )
     return Equivalent(
         sigma_ns=float(sigma),
         tau_ns=float(tau),
@@ -163,8 +166,3 @@ def _about_peak(current: Values) -> Values:
     time = peak + 0.5 * (low - high) / (low - 2 * mid + high)
     at = time + np.arange(-AROUND_NS, AROUND_NS + 1)
     return np.asarray(np.interp(at, np.arange(len(current)), current), np.float64)
-
-
-def _ratios(step: Values, kernel: Values) -> Values:
-    """A of the kernel over A of the chain for constant currents of all `WIDTHS_NS`."""
-    return np.array([_averaged(kernel, w).max() / _averaged(step, w).max() for w in WIDTHS_NS])

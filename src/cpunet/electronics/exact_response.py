@@ -157,10 +157,6 @@ def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
                 f"{where}: {field} means {time_ns:.3g} ns, faster than the pulses' grid of "
                 f"{pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
             )
-    bad = ~np.isfinite(pulses.waveforms).all(axis=1)
-    if bad.any():
-        number = pulses.event_number[int(bad.argmax())]
-        raise CpunetError(f"event {number}: its pulse holds NaN; leave it out")
     return round(ratio)
 
 

@@ -1,20 +1,81 @@
-"""From the response of the electronics to windows prepared exactly as those of the data."""
+"""Records of pulses: windows with room around them, and back to windows prepared like the data.
+
+A window is extended with baseline before it and its own decay after it, so that it can be cut
+anew once noise is added.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import SameNoise, TraceNoise
+from cpunet.electronics.drawn_tails import SameNoise, TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-Noise = BaselineNoise | TraceNoise | SameNoise
+# Samples of padding around a window, so that it can be cut anew if noise moves the maximum and
+# delayed pulses stay within the record. A window of 800 becomes a record of 1400, a fast length
+# of the FFT.
+PADDING_BEFORE, PADDING_AFTER = 200, 400
+
+
+def record_length(window: int) -> int:
+    """Number of samples of the record that a window of `window` samples becomes."""
+    return PADDING_BEFORE + window + PADDING_AFTER
+
+
+def extended(
+    windows: FloatArray, config: PreparationConfig, dt_ns: float, length: int, n_pre: int
+) -> FloatArray:
+    """Cut or extend prepared windows, with 0 before them and their fitted decay after them.
+
+    Parameters
+    ----------
+    windows
+        Shape (n, config.length); a row with a NaN becomes NaN.
+    config
+        Their preparation settings. The last `decay_fit_samples` of each determine its decay.
+    dt_ns
+        Sampling period in ns.
+    length, n_pre
+        Number of samples of the result, and number of samples before the alignment.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32, shape (n, length).
+    """
+    time = np.arange(length) - n_pre + config.samples_before  # as samples of the window
+    inside = (time >= 0) & (time < config.length)
+    result = np.zeros((len(windows), length), np.float32)
+    result[:, inside] = windows[:, time[inside]]
+    late = time >= config.length
+    if late.any():
+        # 0 for a tail that is not positive; a window need not be aligned
+        slope = np.nan_to_num(tail_slope(windows, dt_ns, config.decay_fit_samples))
+        # the mean of the last samples is the level at their centre
+        since = time[late] - (config.length - 0.5 * (config.tail_samples + 1))
+        end = windows[:, -config.tail_samples :].mean(axis=1)
+        decay = np.exp(slope[:, np.newaxis] * dt_ns * 1e-6 * since)
+        result[:, late] = end[:, np.newaxis] * decay
+    result[np.isnan(windows).any(axis=1)] = np.nan
+    return result
+
+
+def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
+    """Extend prepared windows to records, see `record_length`."""
+    before = PADDING_BEFORE + config.samples_before
+    return extended(windows, config, dt_ns, record_length(config.length), before)
+
+
+RecordNoise = BaselineNoise | TraceNoise | SameNoise
 
 BLOCK = 512  # pulses at a time, to bound memory
 
@@ -24,15 +85,34 @@ def blocks(n: int) -> Iterator[slice]:
     return (slice(first, first + BLOCK) for first in range(0, n, BLOCK))
 
 
+class Finished(NamedTuple):
+    """Windows, float32, shape ``(n, config.length)``; a row that cannot be prepared is NaN.
+
+    Parameters
+    ----------
+    windows
+        With noise, if any is added.
+    codes
+        A `cpunet.pulses.preparation.Rejection` for each record.
+    clean
+        Without noise.
+    """
+
+    windows: FloatArray
+    codes: Codes
+    clean: FloatArray
+
+
 def finish(
     records: FloatArray,
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: Noise | None = None,
+    noise: RecordNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
-) -> FloatArray:
+    added: npt.NDArray[np.float64] | None = None,
+) -> Finished:
     """Align and normalise noise-free records as measured traces are, optionally with noise.
 
     Noise is added to the whole record once its tail is at the level of the data's. The
@@ -50,83 +130,30 @@ def finish(
     dt_ns
         Sampling period in ns.
     noise
-        Noise to add, with or without the tails of earlier pulses. None for noise-free
+        Noise to add, with or without the pile-up tails. None for noise-free
         windows.
     energy_kev
         Energy of each pulse in keV, shape ``(n,)``. Required for noise.
     seed
         Seed or random generator of the noise.
-
-    Returns
-    -------
-    numpy.ndarray
-        Windows, float32, shape ``(n, config.length)``. A row is NaN if the pulse cannot be
-        prepared.
+    added
+        Added together with the noise, in prepared units, shape ``(n, samples)``.
 
     Raises
     ------
     CpunetError
-        If shapes, sampling periods or energies do not match.
+        If the noise has another sampling period, or an energy is not above 0.
     """
-    windows, _ = finish_with_codes(
-        records, config, dt_ns=dt_ns, noise=noise, energy_kev=energy_kev, seed=seed
-    )
-    return windows
-
-
-def finish_with_codes(
-    records: FloatArray,
-    config: PreparationConfig,
-    *,
-    dt_ns: float,
-    noise: Noise | None = None,
-    energy_kev: npt.NDArray[np.float64] | None = None,
-    seed: int | np.random.Generator = 0,
-    added: npt.NDArray[np.float64] | None = None,
-) -> tuple[FloatArray, Codes]:
-    """As `finish`, with a `cpunet.pulses.preparation.Rejection` code for each record.
-
-    `added` is added together with the noise, in prepared units, shape ``(n, samples)``.
-    """
-    clean, noisy, codes = _finished(records, config, dt_ns, noise, energy_kev, seed, added)
-    return clean if noise is None else noisy, codes
-
-
-def finish_both(
-    records: FloatArray,
-    config: PreparationConfig,
-    *,
-    dt_ns: float,
-    noise: Noise,
-    energy_kev: npt.NDArray[np.float64],
-    seed: int | np.random.Generator = 0,
-) -> tuple[FloatArray, FloatArray]:
-    """`finish` without and with noise, at the cost of the latter alone."""
-    clean, noisy, _ = _finished(records, config, dt_ns, noise, energy_kev, seed)
-    return clean, noisy
-
-
-def _finished(
-    records: FloatArray,
-    config: PreparationConfig,
-    dt_ns: float,
-    noise: Noise | None,
-    energy_kev: npt.NDArray[np.float64] | None,
-    seed: int | np.random.Generator,
-    added: npt.NDArray[np.float64] | None = None,
-) -> tuple[FloatArray, FloatArray, Codes]:
-    """Windows without noise, windows with noise (empty without one), and rejection codes."""
-    if records.ndim != 2:
+    if noise is not None and not np.isclose(noise.dt_ns, dt_ns):
         raise CpunetError(
-            f"translated waveforms have shape {records.shape}; expected (pulses, samples)"
+            f"the noise is sampled every {noise.dt_ns:g} ns, the pulses every {dt_ns:g} ns; "
+            "take it from the data of the fit"
         )
-    if noise is not None:
-        _check_noise(noise, dt_ns, energy_kev, len(records))
     # A noise-free record may have equal samples at its top; none of them is clipped.
     config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
     rng, n = np.random.default_rng(seed), len(records)
     windows = np.full((n, config.length), np.nan, np.float32)
-    noisy = np.full((0 if noise is None else n, config.length), np.nan, np.float32)
+    noisy = windows if noise is None else windows.copy()
     codes = np.zeros(n, np.uint8)
     for rows in blocks(n):
         block = records[rows]
@@ -134,7 +161,8 @@ def _finished(
         codes[rows] = clean.codes
         kept = np.arange(n)[rows][clean.index]
         windows[kept] = clean.pulses.waveforms
-        if noise is not None and energy_kev is not None:
+        if noise is not None:
+            assert energy_kev is not None  # noise scales as 1/energy
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
             drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
@@ -144,22 +172,4 @@ def _finished(
             prepared = prepare(raw, config, "measured")
             codes[kept] = prepared.codes
             noisy[kept[prepared.index]] = prepared.pulses.waveforms
-    return windows, noisy, codes
-
-
-def _check_noise(
-    noise: Noise,
-    dt_ns: float,
-    energy_kev: npt.NDArray[np.float64] | None,
-    n: int,
-) -> None:
-    if not np.isclose(noise.dt_ns, dt_ns):
-        raise CpunetError(
-            f"the noise is sampled every {noise.dt_ns:g} ns, the pulses every {dt_ns:g} ns; "
-            "take it from the data of the fit"
-        )
-    if energy_kev is None or energy_kev.shape != (n,):
-        raise CpunetError(
-            f"noise for {n} pulses needs {n} energies, since it is scaled by 1/energy; "
-            "give energy_kev"
-        )
+    return Finished(noisy, codes, windows)

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 
 import cpunet
-from cpunet.electronics.remains import Remains
+from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing
+from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import Source, pulse_file
-from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import PreparationConfig
 
@@ -24,10 +25,10 @@ def subtract_tails(
     *,
     preparation: PreparationConfig | None = None,
     force: bool = False,
-) -> Remains:
-    """Write measured traces less the tails of earlier pulses under them.
+) -> PileUpTails:
+    """Write measured traces less the pile-up tails under them.
 
-    The LH5 file has the columns ``remains_kev`` and ``remains_error_kev``. Traces whose tail
+    The LH5 file has the columns ``tails_kev`` and ``tails_error_kev``. Traces whose tail
     cannot be determined are unchanged.
 
     Parameters
@@ -43,7 +44,7 @@ def subtract_tails(
 
     Returns
     -------
-    Remains
+    PileUpTails
         The tails, measured.
 
     Raises
@@ -57,9 +58,8 @@ def subtract_tails(
     refuse_existing(Path(out), *file.files, force=force)
     source = file.open()
     try:
-        tails = Remains.of_traces(
-            source.blocks(_BLOCK), preparation or load_recipe("fast").preparation
-        )
+        config = preparation or load_recipe("fast").preparation
+        tails = PileUpTails.of(Baselines.of(source.blocks(_BLOCK), config))
     except CpunetError as error:
         raise CpunetError(f"{file.path}: {error}") from error
     attrs = {MADE_BY: f"cpunet subtract_tails {cpunet.__version__}", SIDE: "measured"}
@@ -69,6 +69,6 @@ def subtract_tails(
         for block in source.blocks(_BLOCK):
             kev = tails.measure(block)
             error_kev = np.where(np.isfinite(kev), tails.error_kev, np.nan)
-            columns = {"remains_kev": (kev, "keV"), "remains_error_kev": (error_kev, "keV")}
+            columns = {"tails_kev": (kev, "keV"), "tails_error_kev": (error_kev, "keV")}
             writer.append(tails.subtracted_from(block), columns)
     return tails

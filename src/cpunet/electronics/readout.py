@@ -1,22 +1,313 @@
-"""From ideal pulses to raw traces as a digitiser writes them, with the truth kept."""
+"""From ideal pulses to raw traces as a digitiser writes them, with the truth kept.
+
+Noise is drawn from a spectrum or cut from measured baselines; other pulses, mains hum and
+wandering baselines disturb the traces.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy import fft
+from scipy.signal import lfilter
 
-from cpunet.electronics.chain import REFERENCE_KEV, Electronics
+from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum, Wander
 from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.noise_traces import noise_of
-from cpunet.electronics.other_pulses import draw_other_pulses
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
+from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.opening import open_pulses
 from cpunet.simulation.gammas import with_resolution
 
+# Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
+# the record moves its level and the trace's end is independent of its beginning.
+_MIN_SAMPLES = 8192
+_TRACES_AT_A_TIME = 128
+# Measured traces kept for cutting; some tens of MB.
+_MAX_BASELINES = 2000
+
+
+def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatArray:
+    r"""Fraction of the noise power in each frequency bin of a real FFT.
+
+    .. math:: P(\nu) = c\,\frac{1 + e / (1 + (\nu/\nu_e)^2)}{1 + (\nu/\nu_c)^m}
+        + \sum_l a_l\,\delta_{\nu \nu_l}, \qquad \sum_\nu P(\nu) = 1,
+
+    with the symbols of `cpunet.electronics.chain.NoiseSpectrum` and the power fractions
+    :math:`a_l` of its lines.
+
+    Parameters
+    ----------
+    spectrum
+        Shape of the spectrum.
+    dt_ns, n_samples
+        Sampling period in ns and number of samples of the traces.
+
+    Returns
+    -------
+    array
+        Shape ``(n_samples // 2 + 1,)``. Bin 0 is empty: it is the baseline.
+
+    Examples
+    --------
+    At the corner of a steep roll-off the power is half that of the plateau.
+
+    >>> flat = NoiseSpectrum(corner_MHz=10, order=8, excess=0, excess_corner_kHz=1)
+    >>> power = noise_power(flat, dt_ns=10.0, n_samples=1000)
+    >>> round(float(power.sum()), 6), round(float(power[100] / power[1]), 3)
+    (1.0, 0.5)
+    """
+    frequency_MHz = fft.rfftfreq(n_samples, dt_ns * 1e-3)
+    slow = frequency_MHz / (spectrum.excess_corner_kHz * 1e-3)
+    power = (1 + spectrum.excess / (1 + slow**2)) / (
+        1 + (frequency_MHz / spectrum.corner_MHz) ** spectrum.order
+    )
+    power[0] = 0
+    if n_samples % 2 == 0:
+        power[-1] /= 2  # the Nyquist bin covers half a frequency step
+    power *= (1 - sum(line.power_fraction for line in spectrum.lines)) / power.sum()
+    for line in spectrum.lines:
+        power[max(1, np.abs(frequency_MHz - line.frequency_MHz).argmin())] += (
+            line.power_fraction
+        )
+    return np.asarray(power, np.float64)
+
+
+def coloured_noise(
+    spectrum: NoiseSpectrum, n: int, length: int, dt_ns: float, rng: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    r"""Gaussian noise with a given spectrum and an RMS of 1, shape ``(n, length)``.
+
+    Each real FFT bin is a complex Gaussian whose variance follows `noise_power`. Traces are
+    cut from longer ones. The RMS is taken about 0 and includes frequencies down to that of
+    these longer traces (8 kHz at 16 ns), so the scatter within a short trace is slightly lower.
+
+    Examples
+    --------
+    >>> flat = NoiseSpectrum(corner_MHz=10, order=4, excess=0, excess_corner_kHz=1)
+    >>> noise = coloured_noise(flat, 20, 1000, 16.0, np.random.default_rng(1))
+    >>> bool(abs(noise.std() - 1) < 0.05)
+    True
+    """
+    n_long = max(_MIN_SAMPLES, fft.next_fast_len(2 * length, real=True))
+    power = noise_power(spectrum, dt_ns, n_long)
+    # irfft divides by n_long, and each bin but the last represents both signs of frequency
+    scale = n_long * np.sqrt(power / 4)
+    scale[-1] = n_long * np.sqrt(power[-1] / (1 if n_long % 2 == 0 else 4))
+    noise = np.empty((n, length), np.float32)
+    for begin in range(0, n, _TRACES_AT_A_TIME):
+        part = noise[begin : begin + _TRACES_AT_A_TIME]
+        shape = (len(part), len(power))
+        modes = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) * scale
+        if n_long % 2 == 0:
+            modes[:, -1] = modes[:, -1].real
+        part[:] = fft.irfft(modes, n_long, axis=1, overwrite_x=True)[:, :length]
+    return noise
+
+
+def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.float32]:
+    """Measured traces without pulses, shape ``(traces, samples)``, with their means removed.
+
+    Parameters
+    ----------
+    path
+        Waveform file in any format that `open_pulses` reads.
+    length, dt_ns
+        Number of samples and sampling period in ns of the traces to be cut from them.
+
+    Raises
+    ------
+    CpunetError
+        If baselines are too short, sampled differently, not finite, or constant.
+    """
+    source = open_pulses(path)
+    if not np.isclose(source.dt_ns, dt_ns):
+        raise CpunetError(
+            f"{path}: baselines sampled every {source.dt_ns:g} ns, the electronics every "
+            f"{dt_ns:g} ns; give others as noise.baselines_file"
+        )
+    kept: list[npt.NDArray[np.float32]] = []
+    for block in source.blocks(256):
+        if block.length < length:
+            raise CpunetError(
+                f"{path}: baselines of {block.length} samples are shorter than the record of "
+                f"{length}; lower length or give longer noise.baselines_file"
+            )
+        kept.append(block.waveforms - block.waveforms.mean(axis=1, keepdims=True))
+        if sum(map(len, kept)) >= _MAX_BASELINES:
+            break
+    baselines = np.concatenate(kept) if kept else np.zeros((0, length), np.float32)
+    finite = np.isfinite(baselines).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise CpunetError(f"{path}: baseline {bad} is not finite; leave it out")
+    if not baselines.std() > 0:
+        raise CpunetError(f"{path}: no baselines that vary; give another noise.baselines_file")
+    return baselines
+
+
+def cut_noise(
+    baselines: npt.NDArray[np.float32], n: int, length: int, rng: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """Random windows of measured baselines, scaled to a common RMS of 1.
+
+    Parameters
+    ----------
+    baselines
+        Output of `read_baselines`.
+    n, length
+        Number of windows and of samples in each.
+    rng
+        Random generator.
+    """
+    trace = rng.integers(len(baselines), size=n)
+    begin = rng.integers(baselines.shape[1] - length + 1, size=n)
+    windows = baselines[trace[:, None], begin[:, None] + np.arange(length)]
+    return np.asarray(windows / baselines.std(dtype=np.float64), np.float32)
+
+
+def noise_of(
+    electronics: Electronics, n: int, rng: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """Noise in keV of `n` traces of a chain, shape ``(n, electronics.length)``.
+
+    Parameters
+    ----------
+    electronics
+        The readout chain.
+    n
+        Number of traces.
+    rng
+        Random generator.
+
+    Raises
+    ------
+    CpunetError
+        If the file of baselines cannot be used.
+    """
+    noise, length, dt_ns = electronics.noise, electronics.length, electronics.dt_ns
+    if noise.spectrum is not None:
+        unit = coloured_noise(noise.spectrum, n, length, dt_ns, rng)
+    else:
+        assert noise.baselines_file is not None  # ReadoutNoise validates this
+        unit = cut_noise(read_baselines(noise.baselines_file, length, dt_ns), n, length, rng)
+    return unit * np.float32(noise.rms_kev)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherPulses:
+    """The disturbances added to the traces and their truth.
+
+    Parameters
+    ----------
+    added_kev
+        Added signal in keV, shape ``(n, length)``.
+    tails_kev
+        Sum of the pile-up tails at the first sample of each trace, in keV.
+    n_piled
+        Number of additional pulses within each trace.
+    piled_kev, piled_ns
+        Energy of the largest additional pulse, and its start after `n_pre` samples in ns
+        (negative: before them). NaN where there is none.
+    """
+
+    added_kev: FloatArray
+    tails_kev: FloatArray
+    n_piled: npt.NDArray[np.int64]
+    piled_kev: FloatArray
+    piled_ns: FloatArray
+
+
+def draw_other_pulses(
+    pulses: Pulses, electronics: Electronics, rng: np.random.Generator
+) -> OtherPulses:
+    """Draw the other pulses of each trace, see `cpunet.electronics.chain`.
+
+    Parameters
+    ----------
+    pulses
+        Pulses of the traces. Piled-up pulses take their shapes.
+    electronics
+        The readout chain with the rates.
+    rng
+        Random generator.
+    """
+    tails, piled, slow = rng.spawn(3)
+    added_kev = _tails(len(pulses), electronics, tails)
+    # before hum and piled-up pulses are added
+    tails_kev = added_kev[:, 0].copy()
+    n_piled, piled_kev, piled_ns = _add_piled(pulses, electronics, added_kev, piled)
+    if electronics.hum is not None:
+        added_kev += _hum(len(pulses), electronics, slow)
+    if electronics.wander is not None:
+        wander, dt_ns = electronics.wander, electronics.dt_ns
+        # its own generator, so that it does not change the other random numbers
+        (drift,) = rng.spawn(1)
+        added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
+    return OtherPulses(added_kev, tails_kev, n_piled, piled_kev, piled_ns)
+
+
+def _tails(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
+    """Pile-up tails in keV, with all decays of the chain, shape ``(n, length)``."""
+    transfer = electronics.transfer
+    longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
+    row, kev, before_us = earlier_pulses(
+        n, electronics.earlier_pulses.rate_kHz, longest_us, electronics.other_pulses_kev, rng
+    )
+    # a step response is a sum of exponentials, and so is the sum of many tails
+    weights = transfer.residues / transfer.poles
+    modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
+    heights = np.zeros((n, len(weights)), np.complex128)
+    np.add.at(heights, row, modes * weights)
+    centres_ns = (np.arange(electronics.length) + 0.5) * electronics.dt_ns
+    decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
+    return np.ascontiguousarray((heights @ decays).real)
+
+
+def _add_piled(
+    pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
+) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+    """Add piled-up pulses anywhere in the record, with shapes of randomly chosen pulses."""
+    dt_ns = electronics.dt_ns
+    piled = InTracePileUp.draw(
+        len(pulses),
+        electronics.pile_up.rate_kHz,
+        electronics.other_pulses_kev,
+        electronics.n_pre * dt_ns,
+        electronics.length * dt_ns,
+        rng,
+    )
+    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
+    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
+    return piled.largest()
+
+
+def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
+    """Mains hum with random phases in keV, shape ``(n, length)``."""
+    assert electronics.hum is not None  # checked by the caller
+    phase = rng.uniform(0, 2 * np.pi, size=(n, 1))
+    turns = np.arange(electronics.length) * electronics.dt_ns * 1e-9
+    wave = np.sin(2 * np.pi * electronics.hum.frequency_Hz * turns + phase)
+    return np.asarray(electronics.hum.amplitude_kev * wave, float)
+
+
+def _wander(
+    n: int, length: int, dt_ns: float, wander: Wander, rng: np.random.Generator
+) -> FloatArray:
+    """Slow wandering in keV, shape ``(n, length)``: exact samples of its process."""
+    lost = 1e-3 * dt_ns / wander.time_us
+    steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(-2 * lost)), (n, length))
+    steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # stationary from the start
+    return np.asarray(lfilter([1.0], [1.0, -np.exp(-lost)], steps, axis=1), float)
+
+
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
-"""Bits of a trace's flags. A baseline decays if its remainder exceeds the noise RMS."""
+"""Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +328,11 @@ class RawTraces:
         Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
         Noise-free pulses at their own clock phase in units of the full charge, without
-        baseline and without earlier or second pulses. Float32, shape ``(n, length)``.
+        baseline and without earlier or piled-up pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
         Scale in keV and offset in ADC counts of each pulse.
-    remains_kev, n_piled, piled_kev
-        Properties of other pulses, see `cpunet.electronics.other_pulses.OtherPulses`.
+    tails_kev, n_piled, piled_kev
+        Properties of other pulses, see `cpunet.electronics.readout.OtherPulses`.
     piled_ns
         Start of the largest additional pulse after that of the trace's own pulse in ns
         (negative: before it). NaN where there is none.
@@ -55,7 +346,7 @@ class RawTraces:
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
     baseline_adc: FloatArray
-    remains_kev: FloatArray
+    tails_kev: FloatArray
     n_piled: npt.NDArray[np.int64]
     piled_kev: FloatArray
     piled_ns: FloatArray
@@ -109,7 +400,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
     flags = (
-        np.where(other.remains_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
+        np.where(other.tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
         | np.where(other.n_piled > 0, PILE_UP, 0)
         | np.where(beyond.any(axis=1), SATURATED, 0)
     ).astype(np.uint8)
@@ -127,7 +418,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         response=response.astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
-        remains_kev=other.remains_kev,
+        tails_kev=other.tails_kev,
         n_piled=other.n_piled,
         piled_kev=other.piled_kev,
         piled_ns=other.piled_ns - shift_ns,

@@ -15,14 +15,13 @@ import numpy.typing as npt
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import respond
-from cpunet.electronics.growing_archive import GrowingArchive
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
 from cpunet.electronics.stand_plan import LABELS, OTHER, Labels, Side, StandPlan
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.side import MADE_BY, SIDE
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, read_settings, require_seed
@@ -49,7 +48,7 @@ _LIBRARY_FROM_EVENTS = 20_000
 # Truth about each measured trace besides its line, and its name in ``data_labels.npz``.
 OF_DATA = {
     "flags": "flag",
-    "remains_kev": "remains_kev",
+    "tails_kev": "tails_kev",
     "n_piled": "n_piled",
     "piled_kev": "piled_kev",
     "piled_ns": "piled_ns",
@@ -158,7 +157,7 @@ def make_stand(
     trace of each pulse of ``sim.lh5`` in units of the full charge, beginning after ``n_pre``
     samples; ``label``: 0 DEP, 1 SEP, 2 FEP, 3 other, by collected energy, trapped included),
     ``data_labels.npz`` (``label``, ``flag``: 1 decaying baseline, 2 pile-up, 4 saturated;
-    ``remains_kev``, ``n_piled``, ``piled_kev``, ``piled_ns``, see
+    ``tails_kev``, ``n_piled``, ``piled_kev``, ``piled_ns``, see
     `cpunet.electronics.readout`) and ``stand.json``, its provenance.
 
     Parameters
@@ -242,17 +241,26 @@ def _write_sim(
     labels: list[Labels] = []
     electronics, side = plan.electronics, plan.sim
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
-    writer = PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated"))
-    with GrowingArchive(folder / "truth.npz", "response", electronics.length) as truth:
-        with writer:
-            for fine, label, hits in side.blocks("Simulated events", library):
-                writer.append(_block_means(fine, per_sample))
-                writer.append_rows(HIT_TABLE, hit_columns(hits))
-                truth.append(respond(fine, electronics))
-                labels.append(label)
-            writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
-        label = np.concatenate(labels)
-        truth.close(label=label, n_pre=np.array(electronics.n_pre))
+    # the truth grows in a file of its own: it may be larger than memory
+    rows = folder / "truth.rows"
+    with (
+        rows.open("wb") as truth,
+        PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated")) as writer,
+    ):
+        for fine, label, hits in side.blocks("Simulated events", library):
+            writer.append(_block_means(fine, per_sample))
+            writer.append_rows(HIT_TABLE, hit_columns(hits))
+            truth.write(respond(fine, electronics).astype(np.float32).tobytes())
+            labels.append(label)
+        writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
+    label = np.concatenate(labels)
+    np.savez(
+        folder / "truth.npz",
+        response=np.memmap(rows, np.float32, "r", shape=(len(label), electronics.length)),
+        label=label,
+        n_pre=np.array(electronics.n_pre),
+    )
+    rows.unlink()
     stand.n_sim = len(label)
     stand.sim_lines = _by_line(label)
 

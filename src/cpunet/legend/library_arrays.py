@@ -12,7 +12,7 @@ import numpy.typing as npt
 from cpunet.hdf5_files import text_attribute
 from cpunet.legend.templates import AFTER_NS, BEFORE_NS, aligned_currents
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.reading.columns import TIME_UNITS
+from cpunet.pulses.reading.energies import TIME_UNITS
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, text_attribute
-from cpunet.pulses.reading.columns import TIME_UNITS
+from cpunet.pulses.reading.energies import TIME_UNITS
 
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 # Templates of charge end near their maximum; templates of current do not.

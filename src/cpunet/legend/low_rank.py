@@ -15,7 +15,7 @@ import scipy.linalg
 from cpunet.errors import CpunetError
 from cpunet.legend.peak_currents import PEAK
 
-MOST = 2000  # maximum number of templates that determine the components
+MAX_TEMPLATES = 2000  # maximum number of templates that determine the components
 Floats = npt.NDArray[np.float32]
 
 

@@ -26,7 +26,7 @@ from cpunet.legend.ideal_library import (
     require_complete,
 )
 from cpunet.legend.library_file import n_not_ending, require_charge
-from cpunet.legend.low_rank import MOST, Loss, components
+from cpunet.legend.low_rank import MAX_TEMPLATES, Loss, components
 from cpunet.legend.peak_currents import (
     LENGTH,
     currents_about_peak,
@@ -140,7 +140,7 @@ def _look(
     step[:, STEP_SAMPLE:] = 1
     _, delay = currents_about_peak(translate(step)[0])
     rng = np.random.default_rng(0)
-    share = min(1.0, 2 * MOST / max(library.n_templates, 1))
+    share = min(1.0, 2 * MAX_TEMPLATES / max(library.n_templates, 1))
     amplitudes, kept, inside = [], [], {}
     moving = not_ending = 0
     with stage(f"A/E of {library.path}", library.n_templates) as bar:
@@ -163,8 +163,8 @@ def _look(
     require_complete(inside, library, source)
     mode = most_frequent(np.concatenate(amplitudes))
     some = np.concatenate(kept)
-    if len(some) > MOST:
-        some = some[np.sort(rng.choice(len(some), MOST, replace=False))]
+    if len(some) > MAX_TEMPLATES:
+        some = some[np.sort(rng.choice(len(some), MAX_TEMPLATES, replace=False))]
     return _Looked(
         translate, float(delay[0]) - STEP_SAMPLE, mode, some / np.float32(mode), inside
     )

@@ -19,7 +19,7 @@ import scipy.interpolate
 import torch
 from torch import Tensor, nn
 
-from cpunet.electronics.extension import PADDING_BEFORE
+from cpunet.electronics.finishing import PADDING_BEFORE
 from cpunet.networks.drift_clock import at_times
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_layer import (

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from cpunet.electronics.drawn_remains import DrawnRemains, TraceNoise
+from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -24,8 +24,8 @@ class ResponseGenerator(KeptNoise):
         Sampling period in ns.
     """
 
-    remains: DrawnRemains | None = None
-    """Remains of earlier pulses, which are added to records with the noise."""
+    tails: DrawnTails | None = None
+    """Pile-up tails, which are added to records with the noise."""
 
     def __init__(self, config: ResponseConfig | LearnedConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
@@ -42,8 +42,8 @@ class ResponseGenerator(KeptNoise):
 
     @property
     def trace_noise(self) -> TraceNoise:
-        """The noise, and remains if there are any."""
-        return TraceNoise(self.noise, self.remains)
+        """The noise, and tails if there are any."""
+        return TraceNoise(self.noise, self.tails)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 # exported again: records of all methods begin and end at the same samples of a window
-from cpunet.electronics.extension import PADDING_AFTER as PADDING_AFTER
-from cpunet.electronics.extension import PADDING_BEFORE as PADDING_BEFORE
-from cpunet.electronics.extension import record_length as record_length
+from cpunet.electronics.finishing import PADDING_AFTER as PADDING_AFTER
+from cpunet.electronics.finishing import PADDING_BEFORE as PADDING_BEFORE
+from cpunet.electronics.finishing import record_length as record_length
 from cpunet.networks.drift_clock import DriftClock
 from cpunet.recipes.network_settings import ResponseConfig
 

@@ -143,7 +143,7 @@ def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-d
 
     The baseline part of a window can contain the start of a slow pulse, whose slope would
     make the quality cuts remove long drift times.  A pulse that begins in the first half of
-    that part is not slow: it is a second pulse, which is left in so that the cuts find it.
+    that part is not slow: it is a piled-up pulse, which is left in so that the cuts find it.
     """
     level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
     begun = crossing(trace, min(align, len(trace) - 1), level)

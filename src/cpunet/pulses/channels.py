@@ -1,10 +1,11 @@
-"""Process the channels of a file one by one, each with its own output."""
+"""Process the channels of a file on all cores, each with its own output."""
 
 from __future__ import annotations
 
 import logging
 import re
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -12,6 +13,8 @@ from urllib.parse import quote
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import MARKER
+from cpunet.processes import outcomes, usable_cores
+from cpunet.progress import stage
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import tables_of
 
@@ -81,9 +84,12 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
     """The simulation and the data of each channel of the data.
 
     A single table of simulated pulses is used for all channels.  If its table is ``"all"`` too,
-    channels are matched by name; a channel without a simulation has an error instead.
+    channels are matched by name; if ``{channel}`` stands in the name of its file, each channel
+    has the file of its name.  A channel without a simulation has an error instead.
     """
     measured = channels_of(data)
+    if CHANNEL in str(sim.path):
+        return {name: (_own_file(sim, name), file) for name, file in measured.items()}
     if sim.table != ALL:
         return {name: (sim, file) for name, file in measured.items()}
     simulated = channels_of(sim)
@@ -94,6 +100,10 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
         else CpunetError(f"{sim.path}: no table of {name}; there are those of {there}")
         for name, file in measured.items()
     }
+
+
+def _own_file(sim: PulseFile, name: str) -> PulseFile:
+    return replace(sim, path=Path(str(sim.path).replace(CHANNEL, name)))
 
 
 @dataclass(frozen=True)
@@ -115,12 +125,10 @@ class Outcome(Generic[R]):
         return "\n".join(f"{name:<{width}}  {line}" for name, line in lines.items())
 
 
-def one_by_one(
-    channels: Mapping[str, Pair | CpunetError],
-    out: Path,
-    do: Callable[[str, Pair, Path], R],
+def each_channel(
+    channels: Mapping[str, Pair | CpunetError], out: Path, do: Callable[[str, Pair, Path], R]
 ) -> Outcome[R]:
-    """Process each channel; a failed channel does not stop the others.
+    """Process each channel, on all cores; a failed channel does not stop the others.
 
     Parameters
     ----------
@@ -129,7 +137,8 @@ def one_by_one(
     out
         Folder of the outputs; each is a folder (or file) named after its channel.
     do
-        Function called with the name of a channel, its two files and the path of its output.
+        Function called with the name of a channel, its two files and the path of its output;
+        it and its result are pickled.
 
     Raises
     ------
@@ -141,17 +150,41 @@ def one_by_one(
             f"{out}: is the output of one channel; choose another `out` for the folders of "
             f"{len(channels)}"
         )
-    outcome: Outcome[R] = Outcome()
-    for name, pair in channels.items():
-        try:
-            if isinstance(pair, CpunetError):
-                raise pair
-            log.info(f"{name}:")
-            outcome.done[name] = do(name, pair, out / name)
-        except CpunetError as error:
-            outcome.failed[name] = str(error)
-            log.info(f"{name}: failed: {error}")
-    return outcome
+    work = _Work(dict(channels), out, do)
+    done: dict[str, R] = {}
+    failed: dict[str, str] = {}
+    with (
+        stage("Channels", len(channels)) as bar,
+        closing(outcomes(work.ready, list(channels), usable_cores())) as found,
+    ):
+        for name, outcome in found:
+            bar.update()
+            if isinstance(outcome, CpunetError):
+                failed[name] = str(outcome)
+                log.info(f"{name}: failed: {outcome}")
+            else:
+                done[name] = outcome
+    in_order = {name: done[name] for name in channels if name in done}
+    return Outcome(in_order, {name: failed[name] for name in channels if name in failed})
+
+
+@dataclass(frozen=True)
+class _Work(Generic[R]):
+    """The work of each process: one channel after another."""
+
+    channels: dict[str, Pair | CpunetError]
+    out: Path
+    do: Callable[[str, Pair, Path], R]
+
+    def ready(self) -> Callable[[str], R]:
+        return self.channel
+
+    def channel(self, name: str) -> R:
+        pair = self.channels[name]
+        if isinstance(pair, CpunetError):
+            raise pair
+        log.info(f"{name}:")
+        return self.do(name, pair, self.out / name)
 
 
 def own_folder(folder: Path, name: str, file: str) -> Path:

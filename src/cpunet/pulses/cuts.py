@@ -21,7 +21,7 @@ from cpunet.recipes.schema import CutConfig
 from cpunet.settings import Config
 
 # With fewer pulses the MAD is meaningless and no window is set.
-_MIN_N = 10
+_MIN_PULSES = 10
 _SIGMA_PER_MAD = 1.4826
 _FLOAT32_ROUNDING = 2.0**-23
 
@@ -91,7 +91,7 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
     for name, k in sigmas.items():
         values, weights = _values(prepared, name, amplitude, noise)
         finite = np.isfinite(values)
-        if finite.sum() < _MIN_N:
+        if finite.sum() < _MIN_PULSES:
             continue
         centre = float(np.median(values[finite]))
         deviations = np.abs((values - centre) * weights)[finite]

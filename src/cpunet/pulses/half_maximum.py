@@ -5,14 +5,65 @@ Both use the cubic spline through the samples: linear interpolation would smooth
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses import _half_maximum_kernels as kernels
+from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
+
+_compiled: Any = kernel(error_model="numpy")
+
+
+@_compiled
+def _weights(t):  # type: ignore[no-untyped-def]
+    """Weights of the coefficients at -1, 0, 1, 2 for a time between 0 and 1."""
+    s = 1 - t
+    return (
+        s * s * s / 6,
+        (3 * t * t * t - 6 * t * t + 4) / 6,
+        (3 * s * s * s - 6 * s * s + 4) / 6,
+        t * t * t / 6,
+    )
+
+
+@_compiled
+def _crossings(coefficients, before, pad, levels, bisections, times):  # type: ignore[no-untyped-def]
+    for row in range(len(levels)):
+        at = before[row] + pad
+        near = coefficients[row, at - 1 : at + 3]
+        low, high = 0.0, 1.0
+        for _ in range(bisections):
+            middle = 0.5 * (low + high)
+            a, b, c, d = _weights(middle)
+            if a * near[0] + b * near[1] + c * near[2] + d * near[3] < levels[row]:
+                low = middle
+            else:
+                high = middle
+        times[row] = before[row] + 0.5 * (low + high)
+
+
+@_compiled
+def _shifted(coefficients, times, pad, n_before, moved):  # type: ignore[no-untyped-def]
+    n_after = moved.shape[1] - n_before
+    for row in range(len(times)):
+        start = int(np.floor(times[row]))
+        known = coefficients.shape[1] - 2 * pad
+        if times[row] > start:
+            known -= 1
+        a, b, c, d = _weights(times[row] - start)
+        first, stop = max(start - n_before, 0), min(start + n_after, known)
+        if first >= stop:
+            continue
+        near = coefficients[row, first + pad - 1 : stop + pad + 2]
+        shown = moved[row, first - start + n_before : stop - start + n_before]
+        for i in range(len(shown)):
+            shown[i] = a * near[i] + b * near[i + 1] + c * near[i + 2] + d * near[i + 3]
+
 
 BISECTIONS = 30  # of one sample: a precision of 1e-9
 BLOCK = 512  # pulses per block: bounds memory
@@ -36,7 +87,9 @@ class Splines:
 
     def crossing(self, before: npt.NDArray[np.intp], level: Values) -> Values:
         """Time, in samples, at which each pulse reaches `level` after sample `before`."""
-        return kernels.crossings(self.coefficients, before, PAD, level, BISECTIONS)
+        times = np.empty(len(level))
+        _crossings(self.coefficients, before, PAD, level, BISECTIONS, times)
+        return times
 
     def shifted(self, times: Values, n_before: int, n_after: int) -> Values:
         """Each pulse from `n_before` samples before its time to `n_after` samples after it.
@@ -46,7 +99,9 @@ class Splines:
         numpy.ndarray
             Shape ``(n, n_before + n_after)``; NaN outside the record.
         """
-        return kernels.shifted(self.coefficients, times, PAD, n_before, n_after)
+        moved = np.full((len(times), n_before + n_after), np.nan)
+        _shifted(self.coefficients, times, PAD, n_before, moved)
+        return moved
 
 
 def last_below_half(

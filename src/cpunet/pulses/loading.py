@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,18 +13,23 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.doubts import apart, go_down, second_rate
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import Kind, Prepared
+from cpunet.pulses.provenance import (
+    recorded_detector,
+    require_apparent_side,
+    require_recorded_side,
+)
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.sets import load_prepared
-from cpunet.pulses.side import recorded_detector, require_side
 from cpunet.pulses.spectrum import suggested_calibration
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import PreparationConfig, Recipe
 
 log = logging.getLogger(__name__)
 
@@ -35,11 +39,12 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 LOW_KEV = 300.0  # at lower energies noise hides the pulse shapes
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
 # and from which a warning tells of it; traces in which a second rate is looked for.
-MAX_APART, FEW_APART, LOOKED_AT = 0.2, 0.1, 512
+MAX_APART, FEW_APART, RATE_TRACES = 0.2, 0.1, 512
+SWAPPED = "are `sim` and `data` swapped?"
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
-class Part(BaseModel):
+class InfoPart(BaseModel):
     """Further entries are kept as they are."""
 
     model_config = ConfigDict(
@@ -51,7 +56,7 @@ class Part(BaseModel):
     )
 
 
-class SideInfo(Part):
+class SideInfo(InfoPart):
     """The pulses of one side of a training, as far as they are known.
 
     Parameters
@@ -91,7 +96,8 @@ class InputSet:
 
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
-    simulated detector, if the file contains it.
+    simulated detector, if the file contains it; ``baselines`` what noise and pile-up tails need
+    of measured traces.
     """
 
     prepared: Prepared
@@ -101,6 +107,7 @@ class InputSet:
     cuts: CutWindows | None = None
     read_as: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None
+    baselines: Baselines | None = None
 
     def provenance(self) -> SideInfo:
         """File, counts, and a fingerprint of the pulses used."""
@@ -127,7 +134,7 @@ def load_pulses(
     recipe: Recipe,
     selection: EnergySelection,
     *,
-    most: int | None = None,
+    max_pulses: int | None = None,
     tell: bool = True,
 ) -> InputSet:
     """Read and prepare the selected pulses of a file; measured ones have their quality cuts.
@@ -140,7 +147,7 @@ def load_pulses(
         Recipe with the preparation, the cuts and the peaks.
     selection
         Energies to use.
-    most
+    max_pulses
         Use a sample of so many pulses, if there are more.
     tell
         Whether the log says what was found.
@@ -151,25 +158,25 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     source = file.open()
-    require_side(source, side, "are `sim` and `data` swapped?", insist=file.insist)
-    watched = _Watched(source)
+    seen = _Seen(source, side, recipe.preparation, insist=file.insist)
     try:
         prepared = load_prepared(
-            watched,
+            source,
             recipe.preparation,
             side,
             select=selection.select,
             peaks=lambda energies: label_peaks(energies, recipe.peaks),
-            most=most,
+            max_pulses=max_pulses,
+            seen=seen,
         )
     except CpunetError as error:
-        explained = watched.explained(error, selection)
+        explained = seen.explained(error, selection)
         if explained is error:
             raise
         raise explained from error
     cuts = None
     if side == "measured":
-        watched.require_sense(insist=file.insist)
+        seen.require_sense()
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
@@ -188,8 +195,8 @@ def load_pulses(
             + (f" (left out: {rejected})" if rejected else "")
         )
     return InputSet(
-        prepared, source.dt_ns, file.path, watched.energies_kev, cuts, file.options,
-        recorded_detector(source),
+        prepared, source.dt_ns, file.path, seen.energies_kev, cuts, file.options,
+        recorded_detector(source), None if cuts is None else seen.baselines(prepared),
     )  # fmt: skip
 
 
@@ -239,22 +246,40 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
         )
 
 
-class _Watched:
-    """A file of raw traces; keeps what they betray of mistakes while they are read once."""
+class _Seen:
+    """What is kept of raw traces while they are read once: baselines, signs of mistakes."""
 
-    def __init__(self, source: PulseSource) -> None:
-        self.path, self.n_pulses, self._source = source.path, source.n_pulses, source
+    def __init__(
+        self, source: PulseSource, side: Kind, config: PreparationConfig, *, insist: bool
+    ) -> None:
+        self._path, self._side, self._config, self._insist = source.path, side, config, insist
+        self._recorded = require_recorded_side(source, side, SWAPPED)
         self._kev, self._amplitudes = list[Energies](), list[Energies]()
         self._first: npt.NDArray[np.float32] | None = None
+        self._baselines = list[Baselines]()
+        self._whole, self._rows = list[Pulses](), list[npt.NDArray[np.int64]]()
 
-    def blocks(self, size: int, /) -> Iterator[Pulses]:
-        """The file's pulses in order."""
-        for block in self._source.blocks(size):
-            self._kev.append(block.energy_kev)
-            self._amplitudes.append(amplitude(block.waveforms))
-            if self._first is None:
-                self._first = block.waveforms[:LOOKED_AT]
-            yield block
+    def __call__(self, block: Pulses, usable: Prepared) -> None:
+        """Keep what is needed of a block, of which some pulses can be used."""
+        if self._first is None:
+            if not (self._recorded or self._insist):
+                require_apparent_side(self._path, block.waveforms, self._side, SWAPPED)
+            self._first = block.waveforms[:RATE_TRACES].copy()
+        self._kev.append(block.energy_kev)
+        self._amplitudes.append(amplitude(block.waveforms))
+        if self._side == "simulated":
+            return
+        if sum(map(len, self._baselines)) < TRACES:
+            like = self._baselines[:1]
+            self._baselines.append(Baselines.of_block(block, self._config, *like))
+        if (wanted := WHOLE - sum(map(len, self._whole))) > 0:
+            self._rows.append(usable.index[:wanted])
+            self._whole.append(block[self._rows[-1] - usable.first_index])
+
+    def baselines(self, kept: Prepared) -> Baselines:
+        """Baselines, and whole traces of the pulses that are kept."""
+        stay = np.isin(np.concatenate(self._rows), kept.index)
+        return Baselines.concatenate(self._baselines, Pulses.concatenate(self._whole)[stay])
 
     @property
     def energies_kev(self) -> Energies:
@@ -266,7 +291,7 @@ class _Watched:
         """Why no pulse can be used, if what was read tells: polarity, energies, calibration."""
         if self._first is not None and go_down(self._first):
             return CpunetError(
-                f"{self.path}: the traces go down: their polarity is negative",
+                f"{self._path}: the traces go down: their polarity is negative",
                 "turn them round, as by pulses.with_waveforms(-pulses.waveforms) in Python",
             )
         known = self.energies_kev
@@ -278,12 +303,14 @@ class _Watched:
             return error
         return CpunetError(f"{error}; their amplitudes look like {found}")
 
-    def require_sense(self, *, insist: bool) -> None:
+    def require_sense(self) -> None:
         """Refuse energies that are of other pulses; warn of a second rate."""
-        if insist or self._first is None:
+        if self._insist or self._first is None:
             return
         share = apart(np.concatenate(self._kev), np.concatenate(self._amplitudes))
-        told = f"{self.path}: {100 * share:.0f} % of amplitudes and energies do not go together"
+        told = (
+            f"{self._path}: {100 * share:.0f} % of amplitudes and energies do not go together"
+        )
         if share > MAX_APART:
             raise CpunetError(
                 f"{told}: these energies are not those of these traces",
@@ -292,7 +319,7 @@ class _Watched:
         if share > FEW_APART:
             log.warning(told)
         if (found := second_rate(self._first)) is not None:
-            log.warning(f"{self.path}: {found}; cut the traces there, or resample them")
+            log.warning(f"{self._path}: {found}; cut the traces there, or resample them")
 
 
 def _where_energies_are(energies: Energies) -> str:

@@ -80,7 +80,12 @@ class EnergySelection:
         """Its lines and ranges, each as a selection of its own."""
         lines = [EnergySelection(name, self.peaks, (name,)) for name in self.chosen]
         return lines + [
-            EnergySelection(_range_name(low, high), self.peaks, (), ((low, high),))
+            EnergySelection(
+                f"{low:.12g}-" if high == np.inf else f"{low:.12g}-{high:.12g}",
+                self.peaks,
+                (),
+                ((low, high),),
+            )
             for low, high in self.ranges_kev
         ]
 
@@ -145,8 +150,3 @@ def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelecti
     # what is given twice counts once
     lines_once, ranges_once = tuple(dict.fromkeys(chosen)), tuple(dict.fromkeys(ranges))
     return EnergySelection(text, peaks, lines_once, ranges_once)
-
-
-def _range_name(low: float, high: float) -> str:
-    """A range in keV as the user writes it; an open one has no upper end."""
-    return f"{low:.12g}-" if high == np.inf else f"{low:.12g}-{high:.12g}"

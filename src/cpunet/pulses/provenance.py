@@ -1,23 +1,197 @@
-"""How the pulses of a file were made, as far as this program recorded it."""
+"""Side and origin of the pulses of a file: as recorded by this program, or as they look."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.hdf5_files import opened, text_attribute
+from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading.source import PulseSource
-from cpunet.pulses.side import (
-    MADE_BY,
-    RUN,
-    SIDE,
-    SIMULATION,
-    TRANSLATED_BY,
-    TRANSLATION,
-    recorded_attributes,
-)
+
+# attributes of a table, and of a file
+SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
+    "side", "made_by", "translated_by", "run", "simulation",
+)  # fmt: skip
+TRANSLATION = "cpunet_translation"
+REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
+
+_FIRST_PULSES = 256  # pulses
+_MIN_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
+_FULL_HEIGHT = 10.0  # in ADC counts; smaller whole numbers may be a charge in its own units
+_TURNS = 3  # turning points of the baseline: noise has at least this many, a signal fewer
+_SMALL = 1e-5  # of the height: rounding of a flat line
+_MIN_END = 0.98  # of the height: without electronics a pulse ends at its maximum
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """Recognised side of a set of pulses.
+
+    Parameters
+    ----------
+    side
+        Simulated or measured; translated pulses count as the side they imitate.
+    why
+        Reason, phrased to follow "these".
+    certain
+        Whether the file states the side; otherwise it is a guess.
+    """
+
+    side: Kind
+    why: str
+    certain: bool
+
+
+def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool) -> None:
+    """Refuse pulses of the wrong side.
+
+    Parameters
+    ----------
+    source
+        File of pulses.
+    wanted
+        Side that the user states.
+    remedy
+        Remedy to suggest if the pulses are of the other side.
+    insist
+        Whether to override a guess.
+
+    Raises
+    ------
+    CpunetError
+        If the file states that its pulses are of the other side, or if they appear to be
+        and `insist` is False.
+    """
+    if require_recorded_side(source, wanted, remedy) or insist:
+        return
+    first = next(iter(source.blocks(_FIRST_PULSES)))
+    require_apparent_side(source.path, first.waveforms, wanted, remedy)
+
+
+def require_recorded_side(source: PulseSource, wanted: Kind, remedy: str) -> bool:
+    """Refuse pulses whose file states the other side; whether it states one at all."""
+    found = recorded_side(source)
+    _require(found, source.path, wanted, remedy)
+    return found is not None
+
+
+def require_apparent_side(
+    path: Path, waveforms: npt.NDArray[np.floating], wanted: Kind, remedy: str
+) -> None:
+    """Refuse pulses that appear to be of the other side by the first ones of them."""
+    _require(apparent_side(waveforms[:_FIRST_PULSES]), path, wanted, remedy)
+
+
+def _require(found: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
+    if found is not None and found.side != wanted:
+        begin = " If" if remedy.endswith("?") else "; if"
+        sure = "" if found.certain else f"{begin} they are {wanted}, say so with `insist`"
+        raise CpunetError(
+            f"{path}: given as {wanted} pulses, but these {found.why}", f"{remedy}{sure}"
+        )
+
+
+def recorded_side(source: PulseSource) -> Recognised | None:
+    """Side recorded in a file that this program wrote; None for other files."""
+    told = recorded_attributes(source)
+    side, made_by, translated_by = (
+        told.get(name, "") for name in (SIDE, MADE_BY, TRANSLATED_BY)
+    )
+    if translated_by in (REN, IREN):
+        kind: Kind = "measured" if translated_by == REN else "simulated"
+        name = translated_by.rpartition(" ")[2].upper()
+        return Recognised(kind, f"were translated by {name} already", certain=True)
+    if made_by.startswith(SIMULATE) or side == "simulated":
+        return Recognised("simulated", f"were simulated by {made_by}", certain=True)
+    if side == "measured":
+        return Recognised(
+            "measured", f"are traces behind electronics ({made_by})", certain=True
+        )
+    return None
+
+
+def recorded_attributes(source: PulseSource) -> dict[str, str]:
+    """Attributes in which this program records how it made the pulses; none in other files."""
+    told = source.describe()
+    if told["format"] not in ("LH5", "HDF5"):
+        return {}
+    with opened(source.path) as file:
+        table = file[told["table"].rpartition("/")[0] or "/"]
+        names = (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION)
+        found = {name: text_attribute(table, name) for name in names}
+        found[TRANSLATION] = text_attribute(file, TRANSLATION)
+    return {name: text for name, text in found.items() if text}
+
+
+def recorded_detector(source: PulseSource) -> str | None:
+    """Name of the simulated detector; None if the file does not contain it."""
+    try:
+        detector = json.loads(recorded_attributes(source).get(SIMULATION, "{}"))["detector"]
+        name = detector["name"]
+    except (ValueError, LookupError, TypeError):
+        return None
+    return name if isinstance(name, str) else None
+
+
+def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
+    """Side that pulses appear to be of; None if it is ambiguous.
+
+    Whole numbers with noise before the pulse are measured; pulses with neither noise nor a
+    decay are simulated.  A charge signal with noise, or a trace without its baseline, may be
+    either.
+
+    Parameters
+    ----------
+    waveforms
+        Traces of shape ``(n, samples)``.
+
+    Examples
+    --------
+    >>> time = np.arange(400)
+    >>> charge = 1 / (1 + np.exp((200 - time) / 5))
+    >>> apparent_side(charge[None]).side
+    'simulated'
+    >>> noise = np.random.default_rng(1).normal(0, 10, 400)
+    >>> apparent_side(np.round(3000 * charge + noise)[None]).side
+    'measured'
+    >>> apparent_side((charge + noise / 3000)[None]) is None
+    True
+    """
+    known = waveforms[np.isfinite(waveforms).all(axis=1)].astype(float)
+    known = known[np.ptp(known, axis=1) > 0] if known.size else known
+    if not len(known) or known.shape[1] < _MIN_SAMPLES:
+        return None
+    height = np.ptp(known, axis=1)
+    few = known.shape[1] // 10
+    before = np.median(_turns(known[:, :few], height))
+    after = np.median(_turns(known[:, -few:], height))
+    whole = (known == np.round(known)).all() and np.median(height) > _FULL_HEIGHT
+    if whole and before >= _TURNS:
+        why = "look measured (whole numbers with noise before the pulse)"
+        return Recognised("measured", why, certain=False)
+    end = (known[:, -few:].mean(axis=1) - known.min(axis=1)) / height
+    if max(before, after) < _TURNS and np.median(end) > _MIN_END:
+        return Recognised("simulated", "look simulated (no noise, no decay)", certain=False)
+    return None
+
+
+def _turns(
+    part: npt.NDArray[np.float64], height: npt.NDArray[np.float64]
+) -> npt.NDArray[np.int64]:
+    """Number of turning points of each trace."""
+    steps = np.diff(part, axis=1)
+    signs = np.where(np.abs(steps) > _SMALL * height[:, np.newaxis], np.sign(steps), 0)
+    return np.array([np.count_nonzero(np.diff(row[row != 0])) for row in signs])
+
 
 # default values of the options of a translation; that of all others is None
 _DEFAULTS = {
@@ -25,7 +199,7 @@ _DEFAULTS = {
     "noise": True,
     "seed": 0,
     "realisations": 1,
-    "remains": "none",
+    "tails": "none",
     "pile_up_khz": 0.0,
 }
 

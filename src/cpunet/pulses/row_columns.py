@@ -13,7 +13,7 @@ import numpy as np
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 
 from cpunet.hdf5_files import lh5_rows, opened, text_attribute
-from cpunet.pulses.reading.columns import ENERGY_UNITS, Column
+from cpunet.pulses.reading.energies import ENERGY_UNITS, Column
 
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
 _NUMBERS = "iufb"

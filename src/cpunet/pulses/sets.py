@@ -44,7 +44,7 @@ _REMEDIES = {
 }
 
 
-class Source(Protocol):
+class RawPulses(Protocol):
     """A source of raw pulses in blocks, such as a reader."""
 
     @property
@@ -60,13 +60,14 @@ class Source(Protocol):
 
 
 def load_prepared(
-    source: Source,
+    source: RawPulses,
     config: PreparationConfig,
     kind: Kind,
     *,
     select: Select | None = None,
     peaks: PeakNames | None = None,
-    most: int | None = None,
+    max_pulses: int | None = None,
+    seen: Callable[[Pulses, Prepared], None] | None = None,
 ) -> Prepared:
     """Read, select, prepare and collect the pulses of a file.
 
@@ -81,9 +82,11 @@ def load_prepared(
         are wanted, even those of unknown energy.
     peaks
         Function that returns the name of the peak of each energy in keV.
-    most
+    max_pulses
         Maximum number of accepted pulses to keep.  If there are more, a random sample of them
         is kept, always the same for the same file.  This bounds the memory.
+    seen
+        Function that is given each block of the file, and those of its pulses that can be used.
 
     Returns
     -------
@@ -101,32 +104,34 @@ def load_prepared(
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
             part = _prepare_selected(block, config, kind, select, peaks, n_read)
+            if seen is not None:
+                seen(block, part)
             n_read += len(block)
             n_kept += len(part)
             sets.append(part)
             drawn.append(rng.random(len(part)))
-            if most is not None and n_kept > 1.5 * most:
-                n_kept = _thin(sets, drawn, most)
+            if max_pulses is not None and n_kept > 1.5 * max_pulses:
+                n_kept = _thin(sets, drawn, max_pulses)
             bar.update(len(block))
     if not n_kept:
         raise _nothing_left(source, sets)
-    if most is not None and n_kept > most:
-        n_kept = _thin(sets, drawn, most)
+    if max_pulses is not None and n_kept > max_pulses:
+        n_kept = _thin(sets, drawn, max_pulses)
     return _joined(sets, n_kept)
 
 
-def _thin(sets: list[Prepared], drawn: list[FloatColumn], most: int) -> int:
-    """Keep the `most` pulses with the smallest random numbers; return their number.
+def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> int:
+    """Keep the `max_pulses` pulses with the smallest random numbers; return their number.
 
     A pulse dropped now would also be dropped after all later pulses were read, so the result is
     a uniform random sample of the whole file.
     """
-    bound = np.partition(np.concatenate(drawn), most)[most]
+    bound = np.partition(np.concatenate(drawn), max_pulses)[max_pulses]
     for number, part in enumerate(sets):
         stays = drawn[number] < bound
         codes = np.where(stays, Rejection.ACCEPTED, Rejection.NOT_DRAWN).astype(np.uint8)
         sets[number], drawn[number] = part.rejected(codes), drawn[number][stays]
-    return most
+    return max_pulses
 
 
 def _joined(sets: list[Prepared], n: int) -> Prepared:
@@ -172,7 +177,7 @@ def _prepare_selected(
     )
 
 
-def _nothing_left(source: Source, sets: list[Prepared]) -> CpunetError:
+def _nothing_left(source: RawPulses, sets: list[Prepared]) -> CpunetError:
     codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
     if not len(codes):
         return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")

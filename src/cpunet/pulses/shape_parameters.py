@@ -1,4 +1,4 @@
-"""Further pulse-shape parameters: times, late charge, tail, current, noise.
+"""Further pulse-shape parameters: times, current, noise.
 
 `cpunet.pulses.parameters` defines the three parameters by which a translation is
 evaluated.  This module adds others on which an analysis may cut, each with its definition
@@ -36,10 +36,6 @@ RISE_TIMES = {
     "rise_10_99": ("t10", "t99"),
     "rise_90_99": ("t90", "t99"),
 }
-LATE_FRACTION = 0.8  # charge that arrives after 80 % of the height is late (Majorana)
-# Time constant of the fast decay.  The window only constrains how a tail differs from a slow
-# decay, so a second free time constant would fit the noise.
-FAST_DECAY_NS = 4000.0
 
 
 @dataclass(frozen=True)
@@ -103,45 +99,11 @@ SHAPE_PARAMETERS: dict[str, ShapeParameter] = {
         "maximum",
         "LEGEND, dt_eff (there pole-zero corrected, over 4 µs)",
     ),
-    "late_charge": ShapeParameter(
-        "Late charge LQ80",
-        "ns",
-        "area between the plateau and the pole-zero corrected pulse, from 80 % of the plateau "
-        "to the end, divided by the plateau (the mean of the last `decay_fit_samples`)",
-        "Majorana, arXiv:2207.07638; LEGEND, lq80",
-    ),
-    "overshoot": ShapeParameter(
-        "Overshoot",
-        "%",
-        "maximum of the pole-zero corrected pulse before the plateau, divided by the plateau, "
-        "less 1",
-        "as in `cpunet response`",
-    ),
     "tail_slope": ShapeParameter(
         "Tail slope",
         "1/ms",
         "slope of a straight line through the logarithm of the last `decay_fit_samples`",
         f"{_PAPER}, section 4.3.3",
-    ),
-    "slow_tail_slope": ShapeParameter(
-        "Slow tail slope",
-        "1/ms",
-        "slope of the logarithm of the slow one of two decays fitted to the last "
-        "`decay_fit_samples`, the fast one having 4 µs",
-        "least squares, one free time",
-    ),
-    "fast_share": ShapeParameter(
-        "Fast share of the tail",
-        "%",
-        "share of the fast decay in the sum of the two, both traced back to the aligned sample",
-        "the same fit",
-    ),
-    "tail_rms": ShapeParameter(
-        "Tail residual RMS",
-        "pulse height",
-        "square root of the sum of the squared residuals of that fit over its degrees of "
-        "freedom",
-        "the same fit",
     ),
     "baseline_rms": ShapeParameter(
         "Baseline RMS",
@@ -221,21 +183,13 @@ def _of_block(
     scores: ScoreConfig,
     amplitudes: Values | None,
 ) -> dict[str, Values]:
-    fitted = preparation.decay_fit_samples
-    slopes = tail_slope(block, dt_ns, fitted)
     weights = current_amplitude_kernel()
-    overshoots, late = kernels.corrected_shapes(
-        block, -slopes * dt_ns * 1e-6, fitted, LATE_FRACTION
-    )
     return {
         "current_amplitude": current_amplitude(block) if amplitudes is None else amplitudes,
         "current_width": kernels.current_widths(block, weights) * dt_ns,
         "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
         **_times(block, dt_ns, preparation.samples_before),
-        "late_charge": late * dt_ns,
-        "overshoot": 100 * overshoots,
-        "tail_slope": slopes,
-        **_two_decays(block, slopes, dt_ns, preparation),
+        "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
         "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
     }
 
@@ -259,23 +213,6 @@ def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
     rises = {name: times[end] - times[begin] for name, (begin, end) in RISE_TIMES.items()}
     areas = kernels.missing_areas(block, samples[:, 0], stop.astype(float))
     return {**times, **rises, "effective_drift_time": areas * dt_ns}
-
-
-def _two_decays(
-    block: FloatArray, slopes: Values, dt_ns: float, preparation: PreparationConfig
-) -> dict[str, Values]:
-    fitted = preparation.decay_fit_samples
-    rates, shares, rms = kernels.two_decay_fits(
-        np.ascontiguousarray(block[:, -fitted:]),
-        -slopes * dt_ns * 1e-6,
-        dt_ns / FAST_DECAY_NS,
-        preparation.samples_after - fitted,
-    )
-    return {
-        "slow_tail_slope": -rates / (dt_ns * 1e-6),
-        "fast_share": 100 * shares,
-        "tail_rms": rms,
-    }
 
 
 def _rms_about_line(baseline: FloatArray) -> Values:

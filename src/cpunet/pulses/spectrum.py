@@ -12,7 +12,7 @@ Values = npt.NDArray[np.float64]
 
 WITHIN = 0.03  # relative half-width of the search range of a line
 BIN_KEV = 1.0
-MIN_N = 30  # minimum counts in the highest bins of a line
+MIN_COUNTS = 30  # minimum counts in the highest bins of a line
 ABOVE = 4.0  # minimum ratio of a line's counts to those beside it
 WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
 
@@ -52,7 +52,7 @@ def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
     centre = 0.5 * (edges[1:] + edges[:-1])
     highest = np.flatnonzero(near == near.max())
     top = int(highest[np.abs(centre[highest] - expected_kev).argmin()])
-    if near[top] < MIN_N or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
+    if near[top] < MIN_COUNTS or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
         return None
     part = slice(max(top - WIDTH_BINS, 0), top + WIDTH_BINS + 1)
     return float(np.average(centre[part], weights=counts[part]))
@@ -65,10 +65,6 @@ SOURCES = {
     "Co-60": (1332.492, 1173.228),
     "Co-56": (846.770, 1238.288, 2598.500, 1771.357, 1037.843, 3253.503),
 }
-# The single line of Cs-137 is identified by its Compton edge, the maximum energy of a single
-# scattering, and by the low counts above the edge and above the line.
-CAESIUM, LINE_KEV, EDGE = "Cs-137", 661.657, 0.7214
-STEP, ABOVE_LINE = 2.0, 0.1  # counts below the edge over those above; fraction beyond the line
 MIN_BINS = 10  # minimum number of bins of a spectrum that may contain lines
 LOG_BIN = 0.002  # bin width in the logarithm of the amplitude
 BACKGROUND = 25  # bins to either side whose median is the background under a line
@@ -141,17 +137,10 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     >>> found = suggested_calibration(spectrum / 0.065)
     >>> found.source, round(found.kev_per_adc, 4)
     ('Th-228', 0.065)
-
-    One line is enough if the Compton edge of Cs-137 is below it and few counts are above it.
-
-    >>> scattered = np.append(rng.uniform(100, 477, 6000), rng.uniform(477, 650, 300))
-    >>> found = suggested_calibration(np.append(scattered, rng.normal(661.657, 1, 1500)) / 0.2)
-    >>> found.source, round(found.kev_per_adc, 3)
-    ('Cs-137', 0.2)
     """
     known = np.asarray(amplitudes, float)
     known = np.log(known[np.isfinite(known) & (known > 0)])
-    if len(known) < MIN_N:
+    if len(known) < MIN_COUNTS:
         return None
     edges = np.arange(known.min() - LOG_BIN, known.max() + 2 * LOG_BIN, LOG_BIN)
     if len(edges) < MIN_BINS:  # one energy
@@ -160,7 +149,7 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     found = [_shifted(excess, edges[0], source, SOURCES[source]) for source in SOURCES]
     clear = [one for one in found if one is not None]
     if not clear:
-        return _caesium(known, excess, edges[0])
+        return None
     _, log_factor, source, lines = max(clear, key=lambda one: one[0])
     return Suggestion(_refined(known, log_factor, lines), source, lines)
 
@@ -199,25 +188,6 @@ def _shifted(
         return None
     log_factor = float(places[0] * LOG_BIN - first - (best + 0.5) * LOG_BIN)
     return float(score[best]), log_factor, source, clear
-
-
-def _caesium(log_amplitudes: Values, excess: Values, first: float) -> Suggestion | None:
-    """The calibration with the line of Cs-137, if it is the spectrum's highest one."""
-    lines = np.flatnonzero(excess > HIGHEST)
-    if not len(lines):
-        return None
-    top = lines[excess[lines] > 0.5 * excess[lines].max()][-1]
-    log_factor = float(np.log(LINE_KEV) - first - (top + 0.5) * LOG_BIN)
-    relative = np.exp(log_amplitudes + log_factor) / LINE_KEV
-
-    def counts(low: float, high: float) -> int:
-        return int(((relative >= low) & (relative < high)).sum())
-
-    below, above = counts(EDGE - 0.1, EDGE - 0.02) / 0.08, counts(EDGE + 0.04, 0.93) / 0.17
-    beyond = counts(1.05, np.inf) / max(counts(0.3, np.inf), 1)
-    if below < STEP * max(above, 1.0) or beyond > ABOVE_LINE:
-        return None
-    return Suggestion(_refined(log_amplitudes, log_factor, (LINE_KEV,)), CAESIUM, (LINE_KEV,))
 
 
 def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, ...]) -> float:

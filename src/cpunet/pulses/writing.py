@@ -128,8 +128,7 @@ class PulseWriter:
         others
             Further columns as LH5 objects of n rows.
         """
-        if self._file is None:
-            raise ValueError("append outside of the writer's with block")
+        assert self._file is not None  # within the writer's with block
         extra, others = dict(columns or {}), dict(others or {})
         self._require_same(pulses, extra | others)
         if len(pulses) == 0:
@@ -158,11 +157,8 @@ class PulseWriter:
         columns
             Name → (array of shape ``(rows,)``, units); the same names each time.
         """
-        if self._file is None:
-            raise ValueError("append_rows outside of the writer's with block")
+        assert self._file is not None  # within the writer's with block
         rows = {name: (np.asarray(values), units) for name, (values, units) in columns.items()}
-        if len({values.shape for values, _ in rows.values()}) != 1:
-            raise CpunetError(f"{self.path}: columns of {table} differ in length")
         group, _, name = table.strip("/").rpartition("/")
         content = {
             key: Array(values, attrs={"units": units} if units else {})
@@ -173,14 +169,12 @@ class PulseWriter:
 
     def annotate(self, attrs: Mapping[str, str | float]) -> None:
         """Add attributes to the table of pulses after the first block."""
-        if self._file is None or self._table not in self._file.h5:
-            raise ValueError("annotate before any pulse was appended")
+        assert self._file is not None  # within the writer's with block
         self._file.h5[self._table].attrs.update(attrs)
 
     def stamp(self, name: str, text: str) -> None:
         """Set an attribute of the file, such as its provenance record."""
-        if self._file is None:
-            raise ValueError("stamp outside of the writer's with block")
+        assert self._file is not None  # within the writer's with block
         self._file.h5.attrs[name] = text
 
     def _column(self, name: str, values: npt.ArrayLike, units: str, n: int) -> Array:

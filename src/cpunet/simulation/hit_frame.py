@@ -11,7 +11,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_readers import Transform
 from cpunet.simulation.hits import Hits
 
-MOST = 50_000  # maximum number of hits used
+MAX_HITS = 50_000  # maximum number of hits used
 FITS = 0.999  # share inside above which the frame is right, but for rounding at the surface
 BETTER = 0.02  # share by which another frame must be better than that of the file
 CELL_R_MM, CELL_Z_MM = 4.0, 8.0  # cells in which hits are counted
@@ -52,8 +52,10 @@ def describe_frame(
     (0.0, 100.0)
     """
     position = hits.position_mm
-    if len(position) > MOST:
-        position = position[np.random.default_rng(0).choice(len(position), MOST, replace=False)]
+    if len(position) > MAX_HITS:
+        position = position[
+            np.random.default_rng(0).choice(len(position), MAX_HITS, replace=False)
+        ]
 
     def inside(frame: Transform) -> float:
         x, y, z = frame.apply(position).T

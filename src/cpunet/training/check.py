@@ -38,14 +38,14 @@ from cpunet.recipes.schema import Recipe
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MIN_N, FEW = 200, 1000  # pulses per side needed for a fit, and for a precise one
+MIN_PULSES, FEW = 200, 1000  # pulses per side needed for a fit, and for a precise one
 # Ratios beyond which the detectors differ by more than a calibration can correct
 SPREAD_RATIO, SHARPER = 1.2, 1.08
 # Differences due to rounding, in sampling periods, and to chance, in standard deviations; and
 # number of parts of the pulses from which the latter are estimated.
 ROUNDING, SURE, PARTS = 2.0, 4.0, 8
 LOST = 0.1  # share of the selected pulses left out for one reason that causes a warning
-LOOKED_AT = 2000  # maximum number of pulses per side for shapes
+MAX_PULSES = 2000  # maximum number of pulses per side for shapes
 RISES = (0.1, 0.5)  # of the height: a readout adds the same time between them to all pulses
 OFF_LINE = 1.5  # keV, maximum deviation of a line
 DPI = 150
@@ -268,7 +268,7 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
         return findings
     for one, side in ((sim, "simulated"), (data, "measured")):
         findings += [_count(one, side), *_left_out(one, side), *_lines(one, side, selection)]
-    if min(len(sim.prepared), len(data.prepared)) < MIN_N:
+    if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
         return findings  # too few to compare shapes
     findings.append(_spread(sim, data))
     findings.append(_amplitude(sim, data))
@@ -301,7 +301,7 @@ def _count(one: InputSet, side: str) -> Finding:
     text = f"{one.path.name}: {n} {side} pulses of {one.prepared.n_read} can be used"
     if n >= FEW:
         return Finding("counts", Level.FINE, text)
-    level = Level.ERROR if n < MIN_N else Level.WARNING
+    level = Level.ERROR if n < MIN_PULSES else Level.WARNING
     remedy = f"{FEW} or more are better: more files, or more energies (`peak`)"
     return Finding("counts", level, text, remedy)
 
@@ -312,10 +312,10 @@ REMEDIES = {
         "the traces end too soon before or after the pulse; write longer ones, or allow more "
         "padding (preparation.max_padding_before, max_padding_after in `settings`)"
     ),
-    Rejection.TAIL_SLOPE: "tails differ: pile-up, or remains of earlier pulses",
-    Rejection.BASELINE: "baselines differ: remains of earlier pulses (cpunet info tells them)",
+    Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
+    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info tells them)",
     Rejection.BASELINE_SLOPE: (
-        "baselines are not flat: remains of earlier pulses (cpunet info tells them)"
+        "baselines are not flat: pile-up tails (cpunet info tells them)"
     ),
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",
@@ -396,7 +396,7 @@ def _amplitude(sim: InputSet, data: InputSet) -> Finding:
 
 def _some(one: InputSet) -> Pulses:
     pulses = one.prepared.pulses
-    return pulses[np.linspace(0, len(pulses) - 1, min(len(pulses), LOOKED_AT)).astype(int)]
+    return pulses[np.linspace(0, len(pulses) - 1, min(len(pulses), MAX_PULSES)).astype(int)]
 
 
 def _of_height_one(one: InputSet) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from cpunet.electronics.chain import Decay, Electronics
 from cpunet.electronics.exponentials import Exponentials, moved_apart
-from cpunet.electronics.noise_traces import noise_power
+from cpunet.electronics.readout import noise_power
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse

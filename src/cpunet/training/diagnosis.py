@@ -1,7 +1,7 @@
 """Find the parts of a pulse that a poor fit does not describe, and the likely causes.
 
 A readout is the same for all pulses and does not shape the onset.  The parts that are off
-therefore distinguish physics, slow components, remains of earlier pulses, and energies.
+therefore distinguish physics, slow components, pile-up tails, and energies.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ PARTS = {
     ),
     "tail": Part(
         "the tail",
-        "pile-up, remains of earlier pulses too few to be sure of, or a decay that the recipe "
-        "does not have",
-        "cpunet info tells remains; --set generator.fast_decays_us=[…]",
+        "in-trace pile-up, pile-up tails too few to be sure of, or a decay that the "
+        "recipe does not have",
+        "cpunet info tells of pile-up tails; --set generator.fast_decays_us=[…]",
     ),
     "amplitude": Part(
         "the current amplitude",

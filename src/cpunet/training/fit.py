@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.measured_noise import measured_noise
-from cpunet.electronics.measured_remains import FoundRemains, find_remains
+from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
@@ -28,19 +25,6 @@ from cpunet.training.response_starts import with_drift_terms
 from cpunet.training.run import FitInfo, Run
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class Sides:
-    """Prepared pulses of both sides, the file of the measured ones, and its prepared set.
-
-    Without `data_set`, remains of earlier pulses are not looked for.
-    """
-
-    sim: Pulses
-    data: Pulses
-    data_file: PulseFile
-    data_set: InputSet | None = None
 
 
 def known_response(run: Run, like: Recipe) -> Readout:
@@ -110,7 +94,8 @@ class Matched(NamedTuple):
 
 
 def match(
-    sides: Sides,
+    sim: InputSet,
+    data: InputSet,
     recipe: Recipe,
     seed: int,
     listen: Listener,
@@ -120,8 +105,8 @@ def match(
 
     Parameters
     ----------
-    sides
-        Pulses to fit.
+    sim, data
+        Pulses of both sides.
     recipe
         Recipe with a response to fit.
     seed
@@ -136,8 +121,8 @@ def match(
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    remains, drawn, told_of_remains = remains_of_sides(sides, recipe)
-    noise, remark = measured_noise(sides.data_file, sides.data, recipe.preparation, remains)
+    tails, drawn, told_of_tails = find_tails(data, recipe.preparation)
+    noise, remark = measured_noise(data, recipe.preparation, tails)
     if isinstance(known, ElectronicsResponse):
         allowed = recipe.matching.training.drift_terms
         if known.config.drift_terms > allowed:
@@ -146,28 +131,28 @@ def match(
     given: dict[str, Any] = {
         "seed": seed,
         "known": known,
-        "remains": drawn,
+        "tails": drawn,
         "listener": listen,
     }
     fitted = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
-    response, fit = fitted(sides.sim, sides.data, noise, recipe, **given)
-    told = _described(fit, response, noise, sides)
-    if told_of_remains is not None:
-        told["remains"] = told_of_remains
+    simulated, measured = sim.prepared.pulses, data.prepared.pulses
+    response, fit = fitted(simulated, measured, noise, recipe, **given)
+    told = _described(fit, response, noise, len(sim.prepared), len(data.prepared))
+    told["tails"] = told_of_tails
     recipe = recipe.model_copy(update={"generator": response.config})
-    chain = ResponseGenerator(response.config, sides.sim.dt_ns)
+    chain = ResponseGenerator(response.config, sim.dt_ns)
     chain.response = response
     chain.set_noise(noise)
-    chain.remains = drawn
-    iren = fit_inverse(chain, sides.sim.waveforms, sides.sim.energy_kev, recipe, seed=seed)
+    chain.tails = drawn
+    iren = fit_inverse(chain, simulated.waveforms, simulated.energy_kev, recipe, seed=seed)
     model = nn.ModuleDict({"ren": chain, "iren": iren})
     return Matched(model, FitInfo.model_validate(told), recipe, fit, remark)
 
 
 def _described(
-    fit: Fit, response: Readout, noise: BaselineNoise, sides: Sides
+    fit: Fit, response: Readout, noise: BaselineNoise, n_sim: int, n_data: int
 ) -> dict[str, Any]:
-    """Content of `FitInfo`, without remains."""
+    """Content of `FitInfo`, without tails."""
     parameters = response.describe()
     return {
         "parameters": parameters,
@@ -176,8 +161,8 @@ def _described(
         "verdict": "; ".join([fit.verdict, *stretched(parameters)]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
-            "sim": len(sides.sim) - sum(n for n, _ in fit.bands.values()),
-            "data": len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
+            "sim": n_sim - sum(n for n, _ in fit.bands.values()),
+            "data": n_data - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
         },
         "noise": {
             "baselines": noise.n_baselines,
@@ -185,10 +170,3 @@ def _described(
             "rms_error": noise.rms_error,
         },
     }
-
-
-def remains_of_sides(sides: Sides, recipe: Recipe) -> FoundRemains:
-    """Remains of earlier pulses in the data; not looked for without `data_set`."""
-    if sides.data_set is None:
-        return FoundRemains(None, None, None)
-    return find_remains(sides.data_file, sides.data_set, recipe.preparation)

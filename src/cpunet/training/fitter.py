@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from cpunet.electronics.drawn_remains import KnownDecay
+from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Listener, levenberg_marquardt
 from cpunet.training.moments import Values
@@ -54,7 +54,7 @@ class Fitter:
     training
         Settings of the fits.
     decay
-        Main decay as known from remains of earlier pulses, if it is.
+        Main decay as known from pile-up tails, if it is.
     listener
         Called with the number of steps so far, and chi-square.
     steps

@@ -24,12 +24,12 @@ from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
-from cpunet.training.moments import MIN_N, Values
+from cpunet.training.moments import MIN_PULSES, Values
 
 # RMS, in pulse heights, of white noise added to that of the baselines: rounding to float32,
 # and effects that the response does not describe.
 FLOOR = 1e-5
-MOST = 4096  # maximum number of translated pulses
+MAX_PULSES = 4096  # maximum number of translated pulses
 RECORD_SAMPLES = 8192  # minimum length of the transform that gives the correlation of the noise
 
 
@@ -54,7 +54,7 @@ def fit_inverse(
     recipe
         Recipe that matches a response.
     seed
-        Seed of the choice of pulses, if there are more than `MOST`.
+        Seed of the choice of pulses, if there are more than `MAX_PULSES`.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def fit_inverse(
     _, training = recipe.matching
     _check(sim, energy_kev)
     rng = np.random.default_rng(seed)
-    rows = np.sort(rng.choice(len(sim), min(len(sim), MOST), replace=False))
+    rows = np.sort(rng.choice(len(sim), min(len(sim), MAX_PULSES), replace=False))
     windows, delay, used = _translated(generator, sim[rows], recipe)
     inverse = LinearInverse(Sizes.of(recipe.preparation.length, training))
     inverse.half_height.fill_(0.5 * float(windows.amax(dim=1).median()))
@@ -86,9 +86,9 @@ def fit_inverse(
 
 
 def _check(sim: FloatArray, energy_kev: Values) -> None:
-    if len(sim) < MIN_N:
+    if len(sim) < MIN_PULSES:
         raise CpunetError(
-            f"{len(sim)} simulated pulses for the inverse; {MIN_N} or more are needed: "
+            f"{len(sim)} simulated pulses for the inverse; {MIN_PULSES} or more are needed: "
             "select more energies (`peak`) or simulate more"
         )
     if energy_kev.shape != (len(sim),):
@@ -117,10 +117,10 @@ def _translated(
     config = preparation.model_copy(update={"saturation_run": records.shape[1] + 1})
     dt_ns = float(generator.response.dt_ns)
     prepared = prepare(Pulses.of(records.numpy(), dt_ns=dt_ns), config, "measured")
-    if len(prepared) < MIN_N:
+    if len(prepared) < MIN_PULSES:
         raise CpunetError(
             f"only {len(prepared)} of {len(sim)} translated pulses can be prepared, the "
-            f"inverse needs {MIN_N}: {prepared.rejections}; check the fit of the response"
+            f"inverse needs {MIN_PULSES}: {prepared.rejections}; check the fit of the response"
         )
     delay = prepared.align_sample - preparation.samples_before - PADDING_BEFORE
     return torch.from_numpy(prepared.pulses.waveforms), torch.from_numpy(delay), prepared.index

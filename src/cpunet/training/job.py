@@ -10,10 +10,8 @@ import torch
 from torch import nn
 
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.devices import peak_memory_mb
-from cpunet.training.fit import Sides
 from cpunet.training.run import Run, versions
 
 
@@ -25,8 +23,8 @@ class TrainingJob:
     ----------
     recipe, peak, seed, device
         Settings, energies, seed, and the device to train on.
-    sim, data, data_file
-        Prepared pulses of both sides, and the file of the measured ones.
+    sim, data
+        Prepared pulses of both sides.
     folder
         Folder to write to.
     init
@@ -41,17 +39,9 @@ class TrainingJob:
     device: str
     sim: InputSet
     data: InputSet
-    data_file: PulseFile
     folder: Path
     init: Run | None = None
     resume: bool = False
-
-    @property
-    def sides(self) -> Sides:
-        """Pulses of both sides."""
-        return Sides(
-            self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file, self.data
-        )
 
     def run(
         self, model: nn.Module, recipe: Recipe, started: str, seconds: float, **more: Any

@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse, StepResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import LearnedConfig
@@ -52,7 +52,7 @@ def fit_learned(
     *,
     seed: int,
     known: LearnedResponse | None = None,
-    remains: DrawnRemains | None = None,
+    tails: DrawnTails | None = None,
     listener: Listener | None = None,
 ) -> tuple[LearnedResponse, Fit]:
     """Fit a learned readout; parameters as of `cpunet.training.response_fit.fit_response`.
@@ -62,7 +62,7 @@ def fit_learned(
     config, training = recipe.matching
     assert isinstance(config, LearnedConfig)
     config = config.model_copy(update={"drift": False})  # a U-Net is trained first
-    sets = PulseSets(sim, data, noise, recipe, np.random.default_rng(seed), remains)
+    sets = PulseSets(sim, data, noise, recipe, np.random.default_rng(seed), tails)
     fitter = Fitter(training, listener=listener)
     far = [band.with_wider_bins(FIRST_WIDTH) for band in sets.bands(FIRST_PULSES)]
     near = [band.with_wider_bins(WIDTH) for band in sets.bands(training.search_pulses)]

@@ -29,7 +29,7 @@ Values = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 SIGMA_PER_MAD = 1.4826
-MIN_N = 200  # minimum number of pulses for a covariance of about a hundred moments
+MIN_PULSES = 200  # minimum number of pulses for a covariance of about a hundred moments
 EDGE = 60  # samples on either side of the half maximum that contain the steepest point
 # Charge drift shapes a pulse up to sample EARLY from the half maximum, later the electronics.
 # If the simulated physics are wrong, moments may be off by WRONG and LATE standard deviations.
@@ -126,9 +126,9 @@ class Moments:
         usable = _single(aligned, config)
         if usable.any():
             usable &= log_amplitude > _least(log_amplitude[usable])
-        if usable.sum() < MIN_N:
+        if usable.sum() < MIN_PULSES:
             raise TooFewPulsesError(
-                f"{int(usable.sum())} measured pulses can be used; {MIN_N} or more are "
+                f"{int(usable.sum())} measured pulses can be used; {MIN_PULSES} or more are "
                 "needed: select more energies (`peak`) or give more files"
             )
         least = _least(log_amplitude[usable])

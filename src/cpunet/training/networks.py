@@ -9,14 +9,14 @@ from typing import Any
 
 import torch
 
-from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.measured_noise import measured_noise
+from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
+from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import UnfinishedRun
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.fit import Sides, remains_of_sides
 from cpunet.training.job import TrainingJob
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
@@ -33,7 +33,7 @@ def train_networks(job: TrainingJob) -> Run:
     recipe = job.recipe
     run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job))
     state = run.begin(resume=job.resume)
-    outside, fit = outside_noise(job.sides, recipe)
+    outside, fit = outside_noise(job.sim, job.data, recipe)
     left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
     with stage("Training", left) as bar:
 
@@ -60,8 +60,10 @@ def train_networks(job: TrainingJob) -> Run:
     return job.run(model, recipe, run.started, run.seconds, **more)
 
 
-def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, FitInfo | None]:
-    """Noise for the translations of the simulated pulses, and what was found of remains.
+def outside_noise(
+    sim: InputSet, data: InputSet, recipe: Recipe
+) -> tuple[Outside | None, FitInfo | None]:
+    """Noise for the translations of the simulated pulses, and what was found of tails.
 
     Raises
     ------
@@ -71,22 +73,18 @@ def outside_noise(sides: Sides, recipe: Recipe) -> tuple[Outside | None, FitInfo
     if recipe.cyclegan.training.noise == "none":
         return None, None
     try:
-        found = remains_of_sides(sides, recipe)
-        noise, note = measured_noise(
-            sides.data_file, sides.data, recipe.preparation, found.measured
-        )
+        found = find_tails(data, recipe.preparation)
+        noise, note = measured_noise(data, recipe.preparation, found.measured)
     except CpunetError as error:
         raise CpunetError(
-            f"{sides.data_file.path}: no baselines to draw noise from ({error}); or train "
+            f"{data.path}: no baselines to draw noise from ({error}); or train "
             "without it (training.noise=none in `settings`)"
         ) from error
     if note is not None:
         log.warning(note)
     drawn = TraceNoise(noise, found.drawn)
-    outside = Outside(drawn, sides.sim.energy_kev, recipe.preparation)
-    return outside, None if found.told is None else FitInfo.model_validate(
-        {"remains": found.told}
-    )
+    outside = Outside(drawn, sim.prepared.pulses.energy_kev, recipe.preparation)
+    return outside, FitInfo.model_validate({"tails": found.told})
 
 
 def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:

@@ -15,8 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from cpunet.electronics.drawn_remains import TraceNoise
-from cpunet.electronics.extension import PADDING_AFTER, PADDING_BEFORE
+from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE
 from cpunet.networks.linear_inverse import stretch
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
@@ -67,7 +67,7 @@ class Outside:
 
 
 def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:
-    """Extend windows as `cpunet.electronics.extension.with_room` does, with gradients.
+    """Extend windows as `cpunet.electronics.finishing.with_room` does, with gradients.
 
     Noise makes some windows begin later.  The samples that set the scale of a whole pulse then
     lie in the extension, so level and slope of the decay must have their gradients.

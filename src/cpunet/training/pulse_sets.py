@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import Recipe
@@ -33,8 +33,8 @@ class PulseSets:
         Recipe that matches a response.
     rng
         Random generator that chooses the subsets and draws the noise.
-    remains
-        Remains of earlier pulses in the data.
+    tails
+        Pile-up tails in the data.
 
     Raises
     ------
@@ -49,10 +49,10 @@ class PulseSets:
         noise: BaselineNoise,
         recipe: Recipe,
         rng: np.random.Generator,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
     ) -> None:
         self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
-        self.remains = remains
+        self.tails = tails
         require_energies(sim.energy_kev)
         parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
         # in random order, so that any first part is representative
@@ -84,7 +84,7 @@ class PulseSets:
         rows = band.sim[sim]
         pulses, energy_kev = _taken(self.sim.waveforms, rows), self.sim.energy_kev[rows]
         length, draws = record_length(pulses.shape[1]), training.noise_sets
-        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng, self.remains)
+        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng, self.tails)
         translated = Translated(pulses, drawn, moments, band.weights[sim])
         return Band(band.name, translated, rows)
 

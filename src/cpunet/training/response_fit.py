@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
@@ -65,7 +65,7 @@ class Fit:
     pulls
         Deviation of each moment in its standard deviations, by name.
     data_left_out
-        Number of measured pulses excluded: those with a second pulse, or without a baseline.
+        Number of measured pulses excluded: those with a piled-up pulse, or without a baseline.
     pairs
         Number of pulses that the errors refer to: the harmonic sum of both sides.
     covariance
@@ -135,7 +135,7 @@ def fit_response(
     *,
     seed: int,
     known: ElectronicsResponse | None = None,
-    remains: DrawnRemains | None = None,
+    tails: DrawnTails | None = None,
     listener: Listener | None = None,
 ) -> tuple[ElectronicsResponse, Fit]:
     """Fit a response to unpaired prepared pulses.
@@ -154,8 +154,8 @@ def fit_response(
     known
         Response of a similar readout, with the recipe's configuration, to start from.  The
         recipe's own starts are tried only if that fails.
-    remains
-        Remains of earlier pulses in the data, which are added to the translations.
+    tails
+        Pile-up tails in the data, which are added to the translations.
     listener
         Called with step and chi-square.
 
@@ -166,10 +166,10 @@ def fit_response(
     """
     config, training = recipe.chain, recipe.matching.training
     rng = np.random.default_rng(seed)
-    sets = PulseSets(sim, data, noise, recipe, rng, remains)
+    sets = PulseSets(sim, data, noise, recipe, rng, tails)
     some = sets.bands(training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
-    fitter = Fitter(training, None if remains is None else remains.known_decay, listener)
+    fitter = Fitter(training, None if tails is None else tails.known_decay, listener)
     near = None if known is None else from_known(first, known, fitter)
     found = near or best_start(first, config, fitter)
     everything = sets.bands()

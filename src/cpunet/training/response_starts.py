@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from cpunet.electronics.drawn_remains import KnownDecay
+from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
@@ -36,7 +36,7 @@ FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 MIN_SHARE, MAX_SHARE = 0.005, 0.2
 # A longer overshoot resembles a fast decay, and would be a second valley.
 SLOWEST_NS = 800.0
-# Minimum relative error of a main decay known from remains of earlier pulses: these are fitted
+# Minimum relative error of a main decay known from pile-up tails: these are fitted
 # with one exponential, and a readout may have more.
 MIN_DECAY_ERROR = 0.01
 # Sample from the half maximum up to which drift alone shapes a pulse, and pull above which this
@@ -92,7 +92,7 @@ def onset_is_off(problem: ResponseProblem) -> bool:
     """Whether pulses begin differently than simulated, which physics can cause, but no readout.
 
     If only later parts are off, the data contain effects that no readout chain has, such as
-    remains of earlier pulses in their tails, and the edge can still be trusted.
+    pile-up in their tails, and the edge can still be trusted.
     """
     edges = problem.bands[0].moments.config.segments
     onset = {f"samples {a} to {b}" for a, b in pairwise(edges) if b <= ONSET}
@@ -259,7 +259,7 @@ def start_response(
 def set_decay(
     response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
 ) -> None:
-    """Set the main decay to that of the data: known from remains, or else from the tails."""
+    """Set the main decay to that of the data: known from pile-up, or from the tails."""
     if decay is not None:
         response.log_decay_us.data.fill_(math.log(decay.us))
         response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)

@@ -30,10 +30,10 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 import cpunet
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.pulses.loading import Part, SideInfo
+from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
 from cpunet.training.loop import Record
@@ -62,14 +62,14 @@ Network = TypeVar("Network", bound=nn.Module)
 _NOT_STORED: Any = {"exclude": True, "repr": False}
 
 
-class RemainsInfo(Part):
-    """What was measured of remains of earlier pulses, and what to draw them from."""
+class TailsInfo(InfoPart):
+    """What was measured of pile-up tails, and what to draw them from."""
 
     rate_khz: float = 0.0
     drawn: dict[str, Any] | None = None
 
 
-class FitInfo(Part):
+class FitInfo(InfoPart):
     """Fit of a readout chain: its parameters, their errors and covariance, and its quality."""
 
     chi_square: float | None = None
@@ -82,7 +82,7 @@ class FitInfo(Part):
     pulls: dict[str, float] = {}
     noise: dict[str, float] = {}
     in_no_band: dict[str, int] = {}
-    remains: RemainsInfo | None = None
+    tails: TailsInfo | None = None
 
     @property
     def chi_square_per_moment(self) -> float | None:
@@ -92,7 +92,7 @@ class FitInfo(Part):
         return self.chi_square / self.moments
 
 
-class Run(Part):
+class Run(InfoPart):
     """A training run, returned by `cpunet.train` or opened with `Run.load`.
 
     Parameters
@@ -249,12 +249,12 @@ class Run(Part):
         return hashlib.sha256(save(self.weights)).hexdigest()
 
     @property
-    def remains(self) -> DrawnRemains | None:
-        """Remains of earlier pulses under the data, with rate 0 if they have none for sure."""
-        told = None if self.fit is None else self.fit.remains
+    def tails(self) -> DrawnTails | None:
+        """Pile-up tails under the data, with rate 0 if they have none for sure."""
+        told = None if self.fit is None else self.fit.tails
         if told is None or told.drawn is None:
             return None
-        drawn = DrawnRemains.of(told.drawn)
+        drawn = DrawnTails.of(told.drawn)
         if told.rate_khz > 0:
             return drawn
         return replace(drawn, law=replace(drawn.law, rate_khz=0.0))

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 
-from cpunet.electronics.remains import remains_in_words
+from cpunet.electronics.pile_up_tails import tails_in_words
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import SideInfo
 from cpunet.tables import counted, percent, with_std
@@ -24,7 +24,7 @@ def summary(run: Run) -> list[tuple[str, str]]:
     where = run.name
     response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
     when = run.started[:16].replace("T", " ")
-    known, drift = fit.remains, (fit.model_extra or {}).get("drift") or {}
+    known, drift = fit.tails, (fit.model_extra or {}).get("drift") or {}
     lines = [
         ("run", where),
         (
@@ -44,7 +44,7 @@ def summary(run: Run) -> list[tuple[str, str]]:
     if "baselines" in fit.noise:
         lines.append(("noise", f"{_noise(run)}of {fit.noise['baselines']:.0f} baselines"))
     if known is not None and "rate_khz" in known.model_fields_set:
-        lines += remains_in_words(known.model_dump())
+        lines += tails_in_words(known.model_dump())
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]

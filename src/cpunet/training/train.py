@@ -6,6 +6,7 @@ import logging
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +17,7 @@ from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
 from cpunet.outputs import folder_written_aside, refuse_inputs
-from cpunet.pulses.channels import ALL, Outcome, Pair, one_by_one, own_folder, paired
+from cpunet.pulses.channels import ALL, Outcome, Pair, each_channel, own_folder, paired
 from cpunet.pulses.loading import (
     load_pulses,
     require_both_sides,
@@ -63,7 +64,7 @@ def train(
     Parameters
     ----------
     sim
-        Simulated pulses.
+        Simulated pulses; of all channels, as ``sim/{channel}.lh5``.
     data
         Measured pulses.
     out
@@ -84,8 +85,8 @@ def train(
     resume
         Resume OUT.unfinished; give all other options as before.
     read
-        How the files are read, if they do not tell themselves. All channels of the data,
-        one after another, become runs in the folders ``OUT/CHANNEL``.
+        How the files are read, if they do not tell themselves. All channels of the data
+        become runs in the folders ``OUT/CHANNEL``, in a process for each core.
     force
         Replace existing output.
 
@@ -115,30 +116,52 @@ def train(
     chosen, device = load_recipe(recipe, settings), resolve_device(device)
     sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
 
-    def one(pair: Pair, place: Path | None, start: RunLike | None, go_on: bool) -> Run:
-        known = None if start is None else as_run(start)
-        files = (*pair[0].files, *pair[1].files, None if known is None else known.folder)
-        with _workplace(place, files, chosen, go_on, force) as folder:
-            job = _job(pair, folder, chosen, peak, known, seed, device, go_on)
-            return _trained(job, place)
-
+    training = _Training(chosen, peak, init, seed, device, resume, force)
     if sides[1].table != ALL:
-        run = one(sides, target, init, resume)
+        start = None if init is None else as_run(init)
+        run = training.run(sides, target, start, go_on=resume)
         _tell_next(*sides, target)
         return run
     if target is None:
         raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
-
-    def channel(name: str, pair: Pair, folder: Path) -> Run:
-        if resume and (folder / INFO).is_file():
-            log.info(f"{name}: trained already")
-            return Run.load(folder)
-        start = own_folder(Path(init), name, INFO) if isinstance(init, str | Path) else init
-        return one(pair, folder, start, resume and unfinished_name(folder).exists())
-
-    runs = one_by_one(paired(*sides), target, channel)
+    trained = each_channel(paired(*sides), target, training.of_channel)
     _tell_next(*sides, target)
-    return runs
+    return Outcome({name: Run.load(run) for name, run in trained.done.items()}, trained.failed)
+
+
+@dataclass(frozen=True)
+class _Training:
+    """How to train, see `train`."""
+
+    recipe: Recipe
+    peak: str
+    init: RunLike | None
+    seed: int
+    device: str
+    resume: bool
+    force: bool
+
+    def of_channel(self, name: str, pair: Pair, folder: Path) -> Path:
+        """The folder of the run of a channel, trained in a process of its own."""
+        if self.resume and (folder / INFO).is_file():
+            log.info(f"{name}: trained already")
+            return folder
+        init = self.init
+        if isinstance(init, str | Path):
+            init = own_folder(Path(init), name, INFO)
+        start = None if init is None else as_run(init)
+        go_on = self.resume and unfinished_name(folder).exists()
+        self.run(pair, folder, start, go_on=go_on)
+        return folder
+
+    def run(self, pair: Pair, out: Path | None, start: Run | None, *, go_on: bool) -> Run:
+        """Read, train and write a run."""
+        files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
+        with _workplace(out, files, self.recipe, go_on, self.force) as folder:
+            job = _job(
+                pair, folder, self.recipe, self.peak, start, self.seed, self.device, go_on
+            )
+            return _trained(job, out)
 
 
 def _tell_next(sim: PulseFile, data: PulseFile, out: Path | None) -> None:
@@ -195,9 +218,7 @@ def _job(
     if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
         kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
         raise CpunetError(f"{init.name}: {kinds}; resample them")
-    return TrainingJob(
-        recipe, peak, seed, device, sim, data, pair[1], Path(folder), init, resume
-    )
+    return TrainingJob(recipe, peak, seed, device, sim, data, Path(folder), init, resume)
 
 
 def _trained(job: TrainingJob, out: Path | None) -> Run:

@@ -17,7 +17,7 @@ import scipy.fft
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.electronics.drawn_remains import DrawnRemains
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.drift_clock import DriftClock
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
@@ -57,7 +57,7 @@ class Noise:
         Trace, start sample, and sign divided by energy, for each draw and pulse; each of shape
         (draws, pulses).
     left, decay
-        Remains of earlier pulses for each record, shape (draws, pulses), and their decay over
+        Pile-up tails for each record, shape (draws, pulses), and their decay over
         a record, shape (samples,); None for none.
     """
 
@@ -76,7 +76,7 @@ class Noise:
         length: int,
         draws: int,
         rng: np.random.Generator,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
     ) -> Noise:
         """Draw noise for records of `length` samples.
 
@@ -104,10 +104,10 @@ class Noise:
                 np.float32,
             ),
         )
-        if remains is None:
+        if tails is None:
             return drawn
-        left = np.stack([remains.factors(energy_kev, rng) for _ in range(draws)])
-        return replace(drawn, left=left, decay=np.asarray(remains.decay(length), np.float32))
+        left = np.stack([tails.factors(energy_kev, rng) for _ in range(draws)])
+        return replace(drawn, left=left, decay=np.asarray(tails.decay(length), np.float32))
 
     def of(self, rows: Rows | slice) -> Noise:
         """Noise of some of the pulses."""

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.extension import PADDING_BEFORE, extended, with_room
-from cpunet.electronics.finishing import finish_with_codes
-from cpunet.electronics.second_pulses import SecondPulses
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.finishing import PADDING_BEFORE, extended, finish, with_room
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
 from cpunet.networks.kept_noise import KeptNoise
 from cpunet.networks.linear_inverse import LinearInverse, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
@@ -43,30 +42,30 @@ class Drawn:
         Whether to add noise.
     generator
         Random generator of the noise.
-    remains_kev
-        Remains of earlier pulses under each pulse, in keV.
-    second
-        Second pulses within the records.
+    tails_kev
+        Pile-up tails under each pulse, in keV.
+    piled
+        Piled-up pulses within the records.
     """
 
     energy_kev: Energies | None = None
     noise: bool = True
     generator: torch.Generator | None = None
-    remains_kev: Energies | None = None
-    second: SecondPulses | None = None
+    tails_kev: Energies | None = None
+    piled: InTracePileUp | None = None
 
     @property
     def others(self) -> bool:
         """Whether there are other pulses under these."""
-        return self.remains_kev is not None or self.second is not None
+        return self.tails_kev is not None or self.piled is not None
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Drawn:
         """The same for some of the pulses."""
         return replace(
             self,
             energy_kev=None if self.energy_kev is None else self.energy_kev[rows],
-            remains_kev=None if self.remains_kev is None else self.remains_kev[rows],
-            second=None if self.second is None else self.second.of_rows(rows),
+            tails_kev=None if self.tails_kev is None else self.tails_kev[rows],
+            piled=None if self.piled is None else self.piled.of_rows(rows),
         )
 
     def seed(self, default: torch.device) -> int:
@@ -88,14 +87,14 @@ class Backend(ABC):
         Readout chain, which gives traces of any length (`levels`).
     noise : BaselineNoise or None
         Noise that is added to the output of the network.
-    remains : DrawnRemains or None
-        Distribution of the remains of earlier pulses under the data, if known.
+    tails : DrawnTails or None
+        Distribution of the pile-up tails under the data, if known.
     """
 
     network: nn.Module
     needs_energies: ClassVar[bool] = False
     chain: ResponseGenerator | None = None
-    remains: DrawnRemains | None = None
+    tails: DrawnTails | None = None
 
     @property
     def noise(self) -> BaselineNoise | None:
@@ -173,8 +172,8 @@ class NoisyNetworkBackend(NetworkBackend):
         Noise of the data's baselines.
     config
         The preparation of the data, which noisy pulses go through again.
-    remains
-        Distribution of the remains of earlier pulses under the data, if known.
+    tails
+        Distribution of the pile-up tails under the data, if known.
     """
 
     needs_energies = True
@@ -184,10 +183,10 @@ class NoisyNetworkBackend(NetworkBackend):
         network: PositionalUNet,
         kept: KeptNoise,
         config: PreparationConfig,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
     ) -> None:
         super().__init__(network)
-        self.kept, self.config, self.remains = kept, config, remains
+        self.kept, self.config, self.tails = kept, config, tails
 
     @property
     def noise(self) -> BaselineNoise:
@@ -196,7 +195,7 @@ class NoisyNetworkBackend(NetworkBackend):
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network, add noise in proportion to 1/energy, and prepare like data."""
-        energy_kev, second = drawn.energy_kev, drawn.second
+        energy_kev, piled = drawn.energy_kev, drawn.piled
         clean, codes = super().__call__(
             windows, Drawn(noise=drawn.noise, generator=drawn.generator)
         )
@@ -207,13 +206,13 @@ class NoisyNetworkBackend(NetworkBackend):
         records = with_room(clean, self.config, dt_ns)
         added = None
         if drawn.others:
-            added = _left(self.remains, records, energy_kev, drawn.remains_kev)
-        if second is not None and added is not None:
-            length = records.shape[1] + second.reach(dt_ns)
+            added = _left(self.tails, records, energy_kev, drawn.tails_kev)
+        if piled is not None and added is not None:
+            length = records.shape[1] + piled.reach(dt_ns)
             before = PADDING_BEFORE + self.config.samples_before
-            shapes = extended(clean[second.partner], self.config, dt_ns, length, before)
-            added += second.added(shapes, energy_kev, dt_ns, records.shape[1])
-        return finish_with_codes(
+            shapes = extended(clean[piled.partner], self.config, dt_ns, length, before)
+            added += piled.added(shapes, energy_kev, dt_ns, records.shape[1])
+        return finish(
             records,
             self.config,
             dt_ns=dt_ns,
@@ -221,7 +220,7 @@ class NoisyNetworkBackend(NetworkBackend):
             energy_kev=energy_kev,
             seed=seed,
             added=added,
-        )
+        )[:2]
 
 
 class ResponseBackend(Backend):
@@ -232,7 +231,7 @@ class ResponseBackend(Backend):
 
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
         self.network = self.chain = generator.eval()
-        self.remains = generator.remains
+        self.tails = generator.tails
         self.config = config
 
     @property
@@ -243,14 +242,14 @@ class ResponseBackend(Backend):
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
-        energy_kev, second = drawn.energy_kev, drawn.second
+        energy_kev, piled = drawn.energy_kev, drawn.piled
         seed = drawn.seed(self.device)
         added = None
         if drawn.others and energy_kev is not None:
-            added = _left(self.remains, records, energy_kev, drawn.remains_kev)
-            if second is not None and len(second.row):
-                added += self._second(windows, energy_kev, second, records.shape[1])
-        return finish_with_codes(
+            added = _left(self.tails, records, energy_kev, drawn.tails_kev)
+            if piled is not None and len(piled.row):
+                added += self._piled(windows, energy_kev, piled, records.shape[1])
+        return finish(
             records,
             self.config,
             dt_ns=float(self.chain.response.dt_ns),
@@ -258,7 +257,7 @@ class ResponseBackend(Backend):
             energy_kev=energy_kev if drawn.noise else None,
             seed=seed,
             added=added,
-        )
+        )[:2]
 
     def graph(self, length: int) -> Graph:
         """The chain as a matrix."""
@@ -295,17 +294,17 @@ class ResponseBackend(Backend):
         pulses = Pulses.of(records, dt_ns=float(self.chain.response.dt_ns))
         return records, prepare(pulses, config, "measured")
 
-    def _second(
-        self, windows: FloatArray, energy_kev: Energies, second: SecondPulses, length: int
+    def _piled(
+        self, windows: FloatArray, energy_kev: Energies, piled: InTracePileUp, length: int
     ) -> npt.NDArray[np.float64]:
-        """Second pulses with shapes of the same batch, at each sample in prepared units."""
+        """Piled-up pulses with shapes of the same batch, at each sample in prepared units."""
         dt_ns = float(self.chain.response.dt_ns)
-        # early second pulses need longer records
-        reach = ((0, 0), (0, second.reach(dt_ns)))
-        shapes, clean = self._clean(np.pad(windows[second.partner], reach, mode="edge"))
+        # early piled-up pulses need longer records
+        reach = ((0, 0), (0, piled.reach(dt_ns)))
+        shapes, clean = self._clean(np.pad(windows[piled.partner], reach, mode="edge"))
         scale = np.full(len(shapes), np.median(clean.scale))
         scale[clean.index] = clean.scale
-        return second.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
+        return piled.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
 
 
 class InverseBackend(Backend):
@@ -350,23 +349,23 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
         if not forward or recipe.cyclegan.training.noise == "none":
             return NetworkBackend(network)
         kept = run.fill(NOISE, KeptNoise(run.dt_ns), device)
-        return NoisyNetworkBackend(network, kept, preparation, run.remains)
+        return NoisyNetworkBackend(network, kept, preparation, run.tails)
     if forward:
         response = run.fill(part, ResponseGenerator(generator, run.dt_ns), device)
-        response.remains = run.remains
+        response.tails = run.tails
         return ResponseBackend(response, preparation)
     inverse = LinearInverse(Sizes.of(preparation.length, recipe.matching.training))
     return InverseBackend(run.fill(part, inverse, device), preparation, run.dt_ns)
 
 
 def _left(
-    remains: DrawnRemains | None,
+    tails: DrawnTails | None,
     records: FloatArray,
     energy_kev: Energies,
-    remains_kev: Energies | None,
+    tails_kev: Energies | None,
 ) -> npt.NDArray[np.float64]:
     """Pile-up tails at each sample of the records, in prepared units."""
-    if remains_kev is None or remains is None:
+    if tails_kev is None or tails is None:
         return np.zeros(records.shape)
-    left = remains_kev * remains.height / energy_kev
-    return np.asarray(left[:, np.newaxis] * remains.decay(records.shape[1]))
+    left = tails_kev * tails.height / energy_kev
+    return np.asarray(left[:, np.newaxis] * tails.decay(records.shape[1]))

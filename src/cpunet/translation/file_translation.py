@@ -19,10 +19,10 @@ from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
-from cpunet.pulses.side import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 OWN_COLUMNS = frozenset(
-    {"waveform", "energy", "event_number", "rejection", "realisation", "remains_kev"}
+    {"waveform", "energy", "event_number", "rejection", "realisation", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
 )
 
@@ -81,6 +81,9 @@ class FileTranslation:
         self.form = self._form()
         identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
         self._print = hashlib.sha256(identity.encode()).hexdigest()
+
+    def warn(self) -> None:
+        """Say what the user should know of the output."""
         if isinstance(self.form, AdcTraces) and self.form.fills_in:
             log.warning(
                 f"a network knows windows of {self.form.config.length} samples alone; beyond "
@@ -193,7 +196,7 @@ class FileTranslation:
 
     def _form(self) -> OutputForm:
         adc = self.options.adc
-        tails = wanted_tails(self.translator, self.options.remains, raw=adc is not None)
+        tails = wanted_tails(self.translator, self.options.tails, raw=adc is not None)
         pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
         if adc is None or not isinstance(self.translator, REN):
             return Windows(self.translator, tails, pile_up)

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.extension import extended
-from cpunet.electronics.second_pulses import Columns, DrawnPileUp, SecondPulses
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.finishing import extended
+from cpunet.electronics.in_trace_pile_up import Columns, DrawnPileUp, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import PADDING_BEFORE, record_length
 from cpunet.pulses.container import FloatArray, Pulses
@@ -47,9 +47,9 @@ class Formed:
     saturated
         Mask of the rows that reach an end of the digitiser's range, shape (n,).
     truth
-        What is known of each trace, arrays of shape (n,) with their units: ``remains_kev``
-        with remains of earlier pulses; ``n_piled``, ``piled_kev`` and ``piled_ns`` with second
-        pulses, see `SecondPulses.largest`; ``realisation`` with several.
+        What is known of each trace, arrays of shape (n,) with their units: ``tails_kev``
+        with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
+        pulses, see `InTracePileUp.largest`; ``realisation`` with several.
     """
 
     pulses: Pulses
@@ -95,10 +95,10 @@ class Windows:
     ----------
     translator
         Trained run.
-    remains
-        Distribution of the remains of earlier pulses; None for none.
+    tails
+        Distribution of the pile-up tails; None for none.
     pile_up
-        Rate and energies of second pulses; None for none.
+        Rate and energies of piled-up pulses; None for none.
     """
 
     samples: npt.DTypeLike = np.float32
@@ -107,30 +107,30 @@ class Windows:
     def __init__(
         self,
         translator: Translator,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
         pile_up: DrawnPileUp | None = None,
     ) -> None:
-        self.translator, self.remains, self.pile_up = translator, remains, pile_up
+        self.translator, self.tails, self.pile_up = translator, tails, pile_up
         self.t0_ns = -translator.recipe.preparation.samples_before * translator.dt_ns
 
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
     ) -> Formed:
         """Translate pulses, keeping their rows."""
-        left = drawn_kev(self.remains, len(pulses), generator)
-        second = None
+        left = drawn_kev(self.tails, len(pulses), generator)
+        piled = None
         if self.pile_up is not None:  # within the records that are prepared to windows
             config = self.translator.recipe.preparation
             before, length = (
                 PADDING_BEFORE + config.samples_before,
                 record_length(config.length),
             )
-            second = self.pile_up.draw(len(pulses), before, length, rng_of(generator))
+            piled = self.pile_up.draw(len(pulses), before, length, rng_of(generator))
         done = self.translator.translate_pulses(
-            pulses, noise=noise, generator=generator, remains_kev=left, second=second
+            pulses, noise=noise, generator=generator, tails_kev=left, piled=piled
         )
         saturated = np.zeros(len(pulses), bool)
-        return Formed(done.pulses, done.codes, saturated, truth_of(left, second))
+        return Formed(done.pulses, done.codes, saturated, truth_of(left, piled))
 
 
 class AdcTraces:
@@ -145,11 +145,11 @@ class AdcTraces:
     adc
         Number of samples of a trace, and of those before the pulse without noise reaches
         99.9 % of its maximum; the values of the prepared window if None.
-    remains
-        Distribution of the remains of earlier pulses, which raise the baseline at the start
+    tails
+        Distribution of the pile-up tails, which raise the baseline at the start
         of a trace; None for none.
     pile_up
-        Rate and energies of second pulses within a trace; None for none.
+        Rate and energies of piled-up pulses within a trace; None for none.
 
     Raises
     ------
@@ -166,16 +166,16 @@ class AdcTraces:
         per_kev: float,
         baseline: float,
         adc: Adc,
-        remains: DrawnRemains | None = None,
+        tails: DrawnTails | None = None,
         pile_up: DrawnPileUp | None = None,
     ) -> None:
-        self.ren, self.remains, self.pile_up = ren, remains, pile_up
+        self.ren, self.tails, self.pile_up = ren, tails, pile_up
         self.per_kev, self.baseline = per_kev, baseline
         self.config = ren.recipe.preparation
         if pile_up is not None and ren.backend.chain is None:
             raise CpunetError(
                 "a network knows no shapes beyond its windows, so it gives no raw traces with "
-                "second pulses; leave out `pile_up_khz` or `adc`"
+                "piled-up pulses; leave out `pile_up_khz` or `adc`"
             )
         self.length = self.config.length if adc.length is None else adc.length
         self.n_pre = self.config.samples_before if adc.n_pre is None else adc.n_pre
@@ -197,12 +197,12 @@ class AdcTraces:
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
     ) -> Formed:
         """Translate pulses, keeping their rows; pulses without energy are rejected."""
-        left = drawn_kev(self.remains, len(pulses), generator)
-        second = None
+        left = drawn_kev(self.tails, len(pulses), generator)
+        piled = None
         if self.pile_up is not None:
-            second = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
+            piled = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
         if self.ren.backend.chain is not None:
-            windows, codes = self._of_chain(pulses, noise, generator, second)
+            windows, codes = self._of_chain(pulses, noise, generator, piled)
         else:
             done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
             codes = done.codes.copy()
@@ -211,24 +211,24 @@ class AdcTraces:
             )
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
-        if left is not None and self.remains is not None:
+        if left is not None and self.tails is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
-                heights = left * self.remains.height / pulses.energy_kev
-            decay = self.remains.decay(self.length, lead_us=0.0)
+                heights = left * self.tails.height / pulses.energy_kev
+            decay = self.tails.decay(self.length, lead_us=0.0)
             windows += heights[:, np.newaxis] * decay
         windows[codes != Rejection.ACCEPTED] = np.nan
         scale = np.where(unknown, 0.0, self.per_kev * pulses.energy_kev)
         traces, saturated = to_adc(windows, scale, self.baseline)
         # single precision represents 16-bit integers exactly
         whole = pulses.with_waveforms(traces.astype(np.float32))
-        return Formed(whole, codes, saturated, truth_of(left, second))
+        return Formed(whole, codes, saturated, truth_of(left, piled))
 
     def _of_chain(
         self,
         pulses: Pulses,
         noise: bool,
         generator: torch.Generator | None,
-        second: SecondPulses | None,
+        piled: InTracePileUp | None,
     ) -> tuple[FloatArray, Codes]:
         """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
         prepared = prepare(pulses, self.config, "simulated")
@@ -246,8 +246,8 @@ class AdcTraces:
             energies = pulses.energy_kev[rows]
             if noise and backend.noise is not None:
                 levels += backend.noise.draw(energies, self.length, rng)
-            if second is not None and len((other := second.of_rows(rows)).row):
-                # early second pulses need longer traces
+            if piled is not None and len((other := piled.of_rows(rows)).row):
+                # early piled-up pulses need longer traces
                 reached = self.length + other.reach(self.ren.dt_ns)
                 shapes, _ = backend.levels(batch[other.partner], self.n_pre, reached)
                 shapes = np.nan_to_num(shapes)
@@ -338,16 +338,16 @@ def _height(ren: REN) -> float:
 
 
 def drawn_kev(
-    remains: DrawnRemains | None, n: int, generator: torch.Generator | None
+    tails: DrawnTails | None, n: int, generator: torch.Generator | None
 ) -> npt.NDArray[np.float64] | None:
     """Remains of `n` pulses in keV, drawn from the random generator of the noise."""
-    return None if remains is None else remains.draw_kev(n, rng_of(generator))
+    return None if tails is None else tails.draw_kev(n, rng_of(generator))
 
 
-def truth_of(left: npt.NDArray[np.float64] | None, second: SecondPulses | None) -> Columns:
-    """Columns on remains and on second pulses, as far as there are any."""
-    truth: Columns = {} if left is None else {"remains_kev": (left, "keV")}
-    return truth if second is None else truth | second.columns()
+def truth_of(left: npt.NDArray[np.float64] | None, piled: InTracePileUp | None) -> Columns:
+    """Columns on tails and on piled-up pulses, as far as there are any."""
+    truth: Columns = {} if left is None else {"tails_kev": (left, "keV")}
+    return truth if piled is None else truth | piled.columns()
 
 
 def rng_of(generator: torch.Generator | None) -> np.random.Generator:
@@ -359,17 +359,17 @@ def rng_of(generator: torch.Generator | None) -> np.random.Generator:
 
 def wanted_tails(
     translator: Translator, wanted: str | float, *, raw: bool = False
-) -> DrawnRemains | None:
-    """Pile-up tails, remains of earlier pulses, to add to translations.
+) -> DrawnTails | None:
+    """Pile-up tails, pile-up tails, to add to translations.
 
     Parameters
     ----------
     translator
         Trained run.
     wanted
-        ``"learned"`` for the remains of the data, ``"none"``, or a rate in kHz.
+        ``"learned"`` for the tails of the data, ``"none"``, or a rate in kHz.
     raw
-        Whether the remains are for raw traces, which have not passed any cuts.
+        Whether the tails are for raw traces, which have not passed any cuts.
 
     Raises
     ------
@@ -385,11 +385,11 @@ def wanted_tails(
         except ValueError:
             rate = np.nan
         if not (np.isfinite(rate) and rate >= 0):
-            raise CpunetError(f"`remains` {wanted}: expected learned, none, or a rate in kHz")
-    known = translator.remains
+            raise CpunetError(f"`tails` {wanted}: expected learned, none, or a rate in kHz")
+    known = translator.tails
     if known is None:
         raise CpunetError(
-            f"`remains` {wanted}: the run tells nothing of remains of earlier pulses (a "
+            f"`tails` {wanted}: the run tells nothing of pile-up tails (a "
             "network, trained before they were told, or without raw traces); train a readout "
             "chain on raw traces, or leave it out"
         )
@@ -401,7 +401,7 @@ def wanted_tails(
 
 
 def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | None:
-    """Second pulses to add to translations, with the energies learned by a run.
+    """Piled-up pulses to add to translations, with the energies learned by a run.
 
     Parameters
     ----------
@@ -419,7 +419,7 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
         raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
     if rate_khz == 0:
         return None
-    known = translator.remains
+    known = translator.tails
     if known is None:
         raise CpunetError(
             f"`pile_up_khz` {rate_khz:g}: the run does not tell the energies of other pulses "

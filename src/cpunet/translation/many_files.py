@@ -4,28 +4,16 @@ from __future__ import annotations
 
 import glob
 import logging
-import multiprocessing
-import os
-import signal
-import sys
-import threading
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
-from logging.handlers import QueueHandler
 from pathlib import Path
-from queue import SimpleQueue
-from types import FrameType
 from typing import Any
 
-import torch
-
 from cpunet.errors import CpunetError
-from cpunet.kernels import use_threads
 from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.processes import outcomes
 from cpunet.progress import stage
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run
@@ -39,7 +27,6 @@ OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 Summary = dict[str, Any]  # counts of a file, or of all
 Task = tuple[PulseFile, Path]  # a file and its output
 Work = Callable[[Task], Summary]
-Outcomes = Generator[tuple[Task, Summary | str]]
 
 
 def translate_files(
@@ -75,17 +62,19 @@ def translate_files(
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
     _check(tasks, run.folder, **how)
     make = partial(_work_of, run, options, device, how)
-    if (jobs := min(jobs, len(tasks))) > 1:
-        FileTranslation(run, options, device)  # what cannot be used is refused once
+    FileTranslation(run, options, device).warn()  # what cannot be used is refused once
     done: list[Summary] = []
     failed: list[str] = []
-    outcomes = _in_processes(make, tasks, jobs) if jobs > 1 else _one_by_one(make, tasks)
-    with stage("Translating", len(tasks)) as bar, closing(outcomes):
-        for (source, target), outcome in outcomes:
+    with (
+        stage("Translating", len(tasks)) as bar,
+        closing(outcomes(make, tasks, jobs, once=True)) as found,
+    ):
+        for (source, target), outcome in found:
             bar.update()
-            if isinstance(outcome, str):
-                named = str(source.path) in outcome or str(target) in outcome
-                failed.append(outcome if named else f"{source.path}: {outcome}")
+            if isinstance(outcome, CpunetError):
+                text = str(outcome)
+                named = str(source.path) in text or str(target) in text
+                failed.append(text if named else f"{source.path}: {text}")
                 log.error(failed[-1])
             else:
                 done.append(outcome)
@@ -123,98 +112,8 @@ def expanded(name: Path) -> list[Path]:
 
 def _work_of(run: Run, options: TranslateOptions, device: str, how: Mapping[str, bool]) -> Work:
     """Return a function that translates a file after the other."""
-    # the last bits of a network depend on the number of threads, and processes share cores
-    torch.set_num_threads(1)
     translation = FileTranslation(run, options, device)
     return lambda task: translation(task[0], task[1], noise_key=task[1].name, **how)
-
-
-def _outcome(work: Work, task: Task) -> Summary | str:
-    try:
-        return work(task)
-    except (CpunetError, OSError) as error:
-        return str(error)
-
-
-def _one_by_one(make: Callable[[], Work], tasks: Sequence[Task]) -> Outcomes:
-    threads = torch.get_num_threads()
-    try:
-        work = make()
-        for task in tasks:
-            yield task, _outcome(work, task)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _in_processes(make: Callable[[], Work], tasks: Sequence[Task], jobs: int) -> Outcomes:
-    """Yield outcomes as they arrive; the processes end when the iterator is closed."""
-    context = multiprocessing.get_context("spawn")  # torch does not survive a fork
-    others = {*multiprocessing.active_children()}
-    noted: set[str] = set()
-    with ProcessPoolExecutor(jobs, context, _begin, (make,)) as pool:
-        left = {pool.submit(_work, task): task for task in tasks}
-        try:
-            while left:
-                for future in wait(left, return_when=FIRST_COMPLETED).done:
-                    outcome, records = future.result()
-                    for record in records:
-                        logger = logging.getLogger(record.name)
-                        if record.msg not in noted and logger.isEnabledFor(record.levelno):
-                            logger.handle(record)
-                        noted.add(record.msg)
-                    yield left.pop(future), outcome
-        except BrokenProcessPool as error:
-            raise CpunetError(
-                "a process was ended, perhaps for lack of memory; try fewer `jobs`, and "
-                "continue with `resume`"
-            ) from error
-        finally:
-            if left:
-                for process in {*multiprocessing.active_children()} - others:
-                    process.terminate()
-                pool.shutdown(cancel_futures=True)
-
-
-# in a process of the pool: its work, and what it has to say
-_translate: Work
-_said: SimpleQueue[logging.LogRecord] = SimpleQueue()
-
-
-def _begin(make: Callable[[], Work]) -> None:
-    """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    use_threads(1)
-    logger = logging.getLogger("cpunet")
-    logger.addHandler(QueueHandler(_said))
-    logger.setLevel(logging.INFO)
-    logging.getLogger("cpunet.progress").setLevel(logging.ERROR)  # the parent counts files
-    global _translate
-    _translate = make()
-    while not _said.empty():  # what the parent has said already
-        _said.get()
-
-
-def _leave(number: int, _frame: FrameType | None) -> None:
-    """End in a way that removes the file being written."""
-    signal.signal(number, signal.SIG_IGN)  # the pool repeats it
-    sys.exit(128 + number)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _work(task: Task) -> tuple[Summary | str, list[logging.LogRecord]]:
-    try:
-        outcome = _outcome(_translate, task)
-    except SystemExit:  # which the pool would take for an outcome
-        os._exit(1)
-    return outcome, [_said.get() for _ in range(_said.qsize())]
 
 
 def _name(path: Path) -> str:

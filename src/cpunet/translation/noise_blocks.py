@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.electronics.second_pulses import Columns
+from cpunet.electronics.in_trace_pile_up import Columns
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection
 from cpunet.translation.forms import Formed

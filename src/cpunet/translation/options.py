@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from cpunet.errors import CpunetError
 
-NONE, LEARNED = "none", "learned"  # remains of earlier pulses
+NONE, LEARNED = "none", "learned"  # pile-up tails
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class TranslateOptions:
     table: str | None = None
     realisations: int = 1
     adc: Adc | None = None
-    remains: str | float = NONE
+    tails: str | float = NONE
     pile_up_khz: float = 0.0
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class TranslateOptions:
         if self.table is not None and not self.table.strip("/ "):
             raise CpunetError("`out_table` is empty; leave it out, or give a name as geds/ren")
         asked = {
-            "remains": self.remains != NONE,
+            "tails": self.tails != NONE,
             "pile_up_khz": self.pile_up_khz != 0,
             "adc": self.adc is not None,
         }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.channels import ALL, Outcome, Pair, channels_of, one_by_one, own_folder
+from cpunet.pulses.channels import ALL, Outcome, Pair, channels_of, each_channel, own_folder
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run
@@ -27,7 +28,7 @@ def translate(
     *,
     inverse: bool = False,
     noise: bool = True,
-    remains: str | float = NONE,
+    tails: str | float = NONE,
     pile_up_khz: float = 0.0,
     realisations: int = 1,
     adc: bool = False,
@@ -56,10 +57,10 @@ def translate(
         Translate measured pulses to simulation-like ones.
     noise
         Add noise as the data have it.  It is the same in memory and in a file.
-    remains
-        Remains of earlier pulses: ``learned``, ``none``, or a rate in kHz.
+    tails
+        Pile-up tails: ``learned``, ``none``, or a rate in kHz.
     pile_up_khz
-        Rate in kHz of second pulses within a trace.
+        Rate in kHz of piled-up pulses within a trace.
     realisations
         Number of noise draws for each pulse: rows are repeated and numbered.
     adc
@@ -112,7 +113,7 @@ def translate(
         out_table,
         realisations,
         scale if adc else None,
-        remains,
+        tails,
         pile_up_khz,
     )
     files = list(_files(pulses, read, run))
@@ -124,6 +125,7 @@ def translate(
             raise CpunetError("several files or tables do not stay in memory; give `out`")
         run = as_run(run)
         job = FileTranslation(run, options, device)
+        job.warn()
         kept, counts = job.in_memory(files[0])
         return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
     if channels:
@@ -155,8 +157,11 @@ def _files(
 def _to_file(
     run: Run, source: PulseFile, out: Path, options: TranslateOptions, device: str, **how: Any
 ) -> Translation:
-    counts = FileTranslation(run, options, device)(source, out, **how)
-    return Translation(run.name, run.recipe, counts, options.adc is not None, out)
+    job = FileTranslation(run, options, device)
+    job.warn()
+    return Translation(
+        run.name, run.recipe, job(source, out, **how), options.adc is not None, out
+    )
 
 
 def _of_channels(
@@ -168,12 +173,6 @@ def _of_channels(
     run.  The noise depends on the seed and the name of the channel, so that of channels
     differs.
     """
-
-    def act(name: str, pair: Pair, place: Path) -> Translation:
-        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-        target = place.with_name(f"{name}.lh5")
-        return _to_file(as_run(run), pair[0], target, options, noise_key=name, **how)
-
     channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
     if len(channels) == 1 and not isinstance(runs, Run):
         own = (own_folder(Path(runs), name, INFO).is_dir() for name in channels)
@@ -181,4 +180,17 @@ def _of_channels(
             (single,) = channels.values()
             trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
             channels = dict.fromkeys(trained, single) or channels
-    return one_by_one(channels, out, act)
+    return each_channel(channels, out, partial(_of_channel, runs, options, how))
+
+
+def _of_channel(
+    runs: RunLike,
+    options: TranslateOptions,
+    how: Mapping[str, Any],
+    name: str,
+    pair: Pair,
+    place: Path,
+) -> Translation:
+    run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
+    target = place.with_name(f"{name}.lh5")
+    return _to_file(as_run(run), pair[0], target, options, noise_key=name, **how)

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_remains import DrawnRemains
-from cpunet.electronics.second_pulses import SecondPulses
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
@@ -106,7 +106,7 @@ class Translator:
         energy_kev: npt.ArrayLike | None = None,
         noise: bool = True,
         seed: int | None = None,
-        remains_kev: npt.ArrayLike | None = None,
+        tails_kev: npt.ArrayLike | None = None,
     ) -> Waveforms:
         """Translate waveforms, given as a NumPy array or a torch tensor.
 
@@ -122,8 +122,8 @@ class Translator:
             Whether to add noise; without it the result is deterministic.
         seed
             Seed of the noise; None for a random one.
-        remains_kev
-            Remains of earlier pulses under each pulse in keV; `remains` can draw them.
+        tails_kev
+            Pile-up tails under each pulse in keV; `tails` can draw them.
 
         Returns
         -------
@@ -156,10 +156,10 @@ class Translator:
             energies = _one_each("energy_kev", energy_kev, len(pulses))
             pulses = replace(pulses, energy_kev=energies)
         left = None
-        if remains_kev is not None:
-            left = _one_each("remains_kev", remains_kev, len(pulses))
+        if tails_kev is not None:
+            left = _one_each("tails_kev", tails_kev, len(pulses))
         done = self.translate_pulses(
-            pulses, noise=noise, generator=self.seeded(seed), remains_kev=left
+            pulses, noise=noise, generator=self.seeded(seed), tails_kev=left
         )
         if array.ndim == 1 and not done.valid[0]:
             raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")
@@ -181,8 +181,8 @@ class Translator:
         *,
         noise: bool = True,
         generator: torch.Generator | None = None,
-        remains_kev: Energies | None = None,
-        second: SecondPulses | None = None,
+        tails_kev: Energies | None = None,
+        piled: InTracePileUp | None = None,
     ) -> TranslatedPulses:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
@@ -195,10 +195,10 @@ class Translator:
             and pulses without energy are rejected.
         generator
             Random generator of the noise.
-        remains_kev
-            Remains of earlier pulses under each pulse in keV, shape ``(n,)``.
-        second
-            Second pulses within the records.
+        tails_kev
+            Pile-up tails under each pulse in keV, shape ``(n,)``.
+        piled
+            Piled-up pulses within the records.
 
         Raises
         ------
@@ -221,14 +221,14 @@ class Translator:
         index = prepared.index[rows]
         waveforms[index], codes[index] = self.apply_with_codes(
             prepared.pulses.waveforms[rows],
-            Drawn(pulses.energy_kev, noise, generator, remains_kev, second).of_rows(index),
+            Drawn(pulses.energy_kev, noise, generator, tails_kev, piled).of_rows(index),
         )
         return TranslatedPulses(pulses.with_waveforms(waveforms), codes)
 
     @property
-    def remains(self) -> DrawnRemains | None:
-        """Remains of earlier pulses as learned by the run; None if it has no information."""
-        return self.backend.remains
+    def tails(self) -> DrawnTails | None:
+        """Pile-up tails as learned by the run; None if it has no information."""
+        return self.backend.tails
 
     @property
     def needs_energies(self) -> bool:
@@ -242,10 +242,10 @@ class Translator:
         energy_kev: Energies | None = None,
         noise: bool = True,
         generator: torch.Generator | None = None,
-        remains_kev: Energies | None = None,
+        tails_kev: Energies | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        drawn = Drawn(energy_kev, noise, generator, remains_kev)
+        drawn = Drawn(energy_kev, noise, generator, tails_kev)
         return self.apply_with_codes(windows, drawn)[0]
 
     def apply_with_codes(
@@ -264,12 +264,10 @@ class Translator:
             raise CpunetError(NO_ENERGY)
         if drawn.others and not (drawn.noise and self.needs_energies):
             raise CpunetError(
-                "other pulses are drawn with electronic noise; leave out remains_kev and second"
+                "other pulses are drawn with electronic noise; leave out tails_kev and piled"
             )
-        if drawn.remains_kev is not None and self.remains is None:
-            raise CpunetError(
-                "the run does not tell of remains of earlier pulses; leave out remains_kev"
-            )
+        if drawn.tails_kev is not None and self.tails is None:
+            raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
         result = np.empty_like(windows)
         codes = np.zeros(len(windows), np.uint8)
         with torch.inference_mode():

@@ -42,7 +42,7 @@ from cpunet.validation.slices import slice_figure
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
-TAILS = "remains of earlier pulses"
+TAILS = "pile-up tails"
 DRIFT, IN_DRIFT = "clock and blur of the U-Net", 2048  # pulses in it
 SPECTRUM, LOSSES, ROC = "spectrum", "losses", "A over E survival"
 FORWARD = ("Simulation", "REN (simulation)", "IREN (REN (simulation))")
@@ -58,7 +58,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     peaks = {name: peak.energy_kev for name, peak in ren.recipe.peaks.items()}
     energies = {"data": found.data.energies_kev, "raw": found.sim.energies_kev}
     drawn: dict[str, Drawing] = {SPECTRUM: partial(spectrum_figure, energies, peaks)}
-    tails = metrics["remains"] or {}
+    tails = metrics["tails"] or {}
     if tails.get("rate_khz") and "sizes" in tails:  # if any are known and were kept
         energies_kev = tails["drawn"]["energies_kev"]
         drawn[TAILS] = partial(tails_figure, tails, tails["sizes"], energies_kev)

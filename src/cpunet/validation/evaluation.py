@@ -133,10 +133,9 @@ def evaluate(
     baseline_methods = fit_baseline_methods(
         sim_set,
         data_set,
-        data,
         parse_selection(trained_on, recipe.peaks),
         recipe,
-        remains=ren.remains,
+        tails=ren.tails,
         fitted=baselines,
     )
     translations = translate_all(ren, baseline_methods, sim_set, responses, seed)
@@ -170,7 +169,7 @@ def evaluate(
     )
     data_kev, sim_kev = (side.prepared.pulses.energy_kev for side in (data_set, sim_set))
     energies = {method: data_kev if method == "data" else sim_kev for method in amplitudes}
-    known = None if run.fit is None else run.fit.remains
+    known = None if run.fit is None else run.fit.tails
     metrics = {
         "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
@@ -213,7 +212,7 @@ def evaluate(
             "seed": run.seed,
             "peak": run.peak,
         },
-        "remains": None if known is None else known.model_dump(exclude_unset=True),
+        "tails": None if known is None else known.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,
@@ -234,8 +233,8 @@ def _load_both(
     max_pulses: int,
 ) -> tuple[InputSet, InputSet]:
     selection = validation_selection(names, ren.recipe)
-    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, most=max_pulses)
-    data_set = load_pulses(data, "measured", ren.recipe, selection, most=max_pulses)
+    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, max_pulses=max_pulses)
+    data_set = load_pulses(data, "measured", ren.recipe, selection, max_pulses=max_pulses)
     require_same_sampling(sim_set, data_set)
     if not np.isclose(sim_set.dt_ns, ren.dt_ns):
         raise CpunetError(

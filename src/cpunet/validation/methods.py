@@ -16,21 +16,21 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_methods.base import BaselineMethod
-from cpunet.electronics.baseline_methods.registry import BASELINE_METHODS
-from cpunet.electronics.baseline_methods.translating import translate_like_data
+from cpunet.electronics.baseline_methods import (
+    BASELINE_METHODS,
+    BaselineMethod,
+    translate_like_data,
+)
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_remains import DrawnRemains, SameNoise, TraceNoise
-from cpunet.electronics.finishing import blocks, finish, finish_both
-from cpunet.electronics.measured_noise import noise_of_traces
-from cpunet.electronics.measured_remains import measured_remains
+from cpunet.electronics.drawn_tails import DrawnTails, SameNoise, TraceNoise
+from cpunet.electronics.finishing import blocks, finish
+from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import EnergySelection
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.forms import drawn_kev, wanted_tails
 from cpunet.translation.options import LEARNED
@@ -52,7 +52,7 @@ class FittedBaselineMethods:
     methods
         Fitted baseline methods by name.
     noise
-        Noise drawn from the baselines of the data, with remains of earlier pulses if the data
+        Noise drawn from the baselines of the data, with pile-up tails if the data
         have any; None if there are no baselines.
     missing
         Reasons why methods or the noise are missing, by name.
@@ -66,11 +66,10 @@ class FittedBaselineMethods:
 def fit_baseline_methods(
     sim: InputSet,
     data: InputSet,
-    data_file: PulseFile,
     fit_on: EnergySelection,
     recipe: Recipe,
     *,
-    remains: DrawnRemains | None = None,
+    tails: DrawnTails | None = None,
     fitted: bool,
 ) -> FittedBaselineMethods:
     """Fit every baseline method to unpaired pulses.
@@ -79,14 +78,12 @@ def fit_baseline_methods(
     ----------
     sim, data
         All prepared pulses of both sides.
-    data_file
-        Measured file, for its baselines.
     fit_on
         Energies on which the methods are fitted: those of the training.
     recipe
         Recipe of the run.
-    remains
-        Remains of earlier pulses as learned by the run.
+    tails
+        Pile-up tails as learned by the run.
     fitted
         Whether to fit the methods; the noise is measured in any case, for the truth.
 
@@ -98,13 +95,11 @@ def fit_baseline_methods(
     config, result = recipe.preparation, FittedBaselineMethods()
     # all but the untranslated simulation, which is scored anyway
     kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
-    there = remains is not None and remains.law.rate_khz > 0
-    found = measured_remains(data_file, config)[0] if there else None
-    noise = _or_reason(
-        result.missing, "noise", lambda: noise_of_traces(data_file, config, found)
-    )
+    there = tails is not None and tails.law.rate_khz > 0
+    found = tails_of(data)[0] if there else None
+    noise = _or_reason(result.missing, "noise", lambda: noise_of(data, found))
     if noise is not None:
-        result.noise = TraceNoise(noise, remains) if there else noise
+        result.noise = TraceNoise(noise, tails) if there else noise
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
@@ -216,7 +211,7 @@ def translate_all(
     true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
     # like the data with which they are compared
-    remains = wanted_tails(ren, LEARNED) if ren.remains is not None else None
+    tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
     # the random generators of all methods are in the same state
     noise = None if baselines.noise is None else SameNoise(baselines.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
@@ -231,15 +226,23 @@ def translate_all(
                     if name == "truth"
                     else baselines.methods[name].translate(block.waveforms)
                 )
-                clean[name], drawn = _finished(records, block, noise, recipe, rngs[name])
-                if drawn is not None:
-                    noisy[name][rows] = drawn
+                finished = finish(
+                    records,
+                    recipe.preparation,
+                    dt_ns=block.dt_ns,
+                    noise=noise,
+                    energy_kev=block.energy_kev,
+                    seed=rngs[name],
+                )
+                clean[name] = finished.clean
+                if noise is not None:
+                    noisy[name][rows] = finished.windows
             clean["ren"] = ren.apply(block.waveforms, noise=False)
             noisy["ren"][rows] = ren.apply(
                 block.waveforms,
                 energy_kev=block.energy_kev,
                 generator=generator,
-                remains_kev=drawn_kev(remains, len(block), generator),
+                tails_kev=drawn_kev(tails, len(block), generator),
             )
             if truth is not None:
                 truth[rows] = clean["truth"]
@@ -249,26 +252,6 @@ def translate_all(
     whole = {name: _whole(windows) for name, windows in noisy.items()}
     joined = {name: _joined(found) for name, found in parts.items()}
     return Translations(ren, baselines, pulses, noisy, whole, joined, truth)
-
-
-def _finished(
-    records: FloatArray,
-    pulses: Pulses,
-    noise: SameNoise | None,
-    recipe: Recipe,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Windows without noise, and with noise if it is known."""
-    if noise is None:
-        return finish(records, recipe.preparation, dt_ns=pulses.dt_ns), None
-    return finish_both(
-        records,
-        recipe.preparation,
-        dt_ns=pulses.dt_ns,
-        noise=noise,
-        energy_kev=pulses.energy_kev,
-        seed=rng,
-    )
 
 
 def _numbers(

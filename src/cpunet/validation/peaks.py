@@ -25,7 +25,7 @@ from cpunet.validation.truth import PairedScores, scores_of_squares
 from cpunet.validation.two_sample import classifier_auc
 from cpunet.validation.when_asked import WhenAsked
 
-MIN_N = 10  # minimum number of pulses of a distribution
+MIN_PULSES = 10  # minimum number of pulses of a distribution
 
 Rows = npt.NDArray[np.int64]
 ByMethod = dict[str, dict[str, Values]]
@@ -92,7 +92,7 @@ class PeakSets:
             "raw": lambda: self.raw,
         }
         for name in self.translations.whole:
-            if len(self.rows(name)) >= MIN_N or name == "ren":
+            if len(self.rows(name)) >= MIN_PULSES or name == "ren":
                 makers[name] = partial(self._noisy, name)
         return WhenAsked(makers)
 
@@ -101,7 +101,7 @@ class PeakSets:
         found = {}
         for name, kept in self.translations.clean.items():
             rows = self._prepared(kept.whole)
-            if name not in ("raw", "ren") and len(rows) >= MIN_N:
+            if name not in ("raw", "ren") and len(rows) >= MIN_PULSES:
                 found[f"{name}{NO_NOISE}"] = {k: v[rows] for k, v in kept.parameters.items()}
         return found
 
@@ -136,8 +136,8 @@ class PeakSets:
     def missing(self) -> str | None:
         """Reason why the peak cannot be scored; None if it can."""
         sides = (("simulated", self.sim_rows), ("measured", self.data_rows))
-        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_N]
-        return f"{' and '.join(few)} pulses (at least {MIN_N} are needed)" if few else None
+        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
+        return f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)" if few else None
 
     def _prepared(self, flags: npt.NDArray[np.bool_]) -> Rows:
         return self.sim_rows[flags[self.sim_rows]]

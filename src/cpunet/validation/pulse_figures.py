@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import blended_transform_factory
 
-from cpunet.electronics.baseline_methods.superpulses import fitted_tail_slope, without_decay
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.tails_law import TailsLaw
+from cpunet.electronics.window_response import fitted_tail_slope, without_decay
 from cpunet.plotting import COLOURS, DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.half_maximum import BLOCK, align_half_maximum
@@ -260,9 +260,7 @@ def tails_figure(
         kev, 100 * (share - error), 100 * (share + error), color=COLOURS["data"], alpha=0.3
     )
     axes.loglog(kev, 100 * share, color=COLOURS["data"], label=f"measured, {n:,} traces")
-    law = RemainsLaw(
-        float(summary["rate_khz"]), float(summary["decay_us"]), tuple(energies_kev)
-    )
+    law = TailsLaw(float(summary["rate_khz"]), float(summary["decay_us"]), tuple(energies_kev))
     axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
     twice = 2 * summary["error_kev"]
     axes.axvline(twice, color="0.6", lw=0.8, ls=":", label="twice the error of a size")

@@ -31,7 +31,7 @@ Values = npt.NDArray[np.float64]
 
 BEFORE, AFTER = 100, 150  # samples of a mean pulse before and after half maximum
 SLICES = 4
-MIN_N = 10  # minimum pulses of a slice for an error of its mean
+MIN_PULSES = 10  # minimum pulses of a slice for an error of its mean
 EDGE_SAMPLES = 100  # about half maximum, in which differences are evaluated
 LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
 
@@ -173,7 +173,7 @@ def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]
     """
     return tuple(
         None
-        if min(measured.n, other.n) < MIN_N
+        if min(measured.n, other.n) < MIN_PULSES
         else Residual(other.mean - measured.mean, np.hypot(other.error, measured.error))
         for measured, other in zip(data.pulses, method.pulses, strict=True)
     )
@@ -280,7 +280,7 @@ def _rows(data: Slices, method: Slices, dt_ns: float) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"n": own.n, "n_data": measured.n}
         if residual is None:
             few = f"{own.n} pulses beside {measured.n} measured ones"
-            rows.append(row | {"missing": f"{few} (at least {MIN_N} are needed)"})
+            rows.append(row | {"missing": f"{few} (at least {MIN_PULSES} are needed)"})
             continue
         near = slice(BEFORE - EDGE_SAMPLES, BEFORE + EDGE_SAMPLES + 1)
         difference, error, z = (v[near] for v in (*residual, residual.z))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -29,13 +29,13 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, checked
 from cpunet.training.checkpoints import differences
 from cpunet.training.devices import resolve_device
-from cpunet.training.fit import Sides, match
+from cpunet.training.fit import match
 from cpunet.training.loop import train
 from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 JOURNAL, BEST, TABLE = "journal.log", "best.yaml", "trials.csv"
 STARTS = 8  # random trials before the first Gaussian process
 SHARE = 0.3  # share of the pulses of each side that is held out
-MIN_N = 20  # minimum per side for a distribution
+MIN_PULSES = 20  # minimum per side for a distribution
 MAX_LOST = 0.01  # share of lost translations: losing bad ones would improve the score
 # pulses and their comparison must be the same for all trials, so only these may be tuned
 TUNED = ("generator", "discriminator", "training")
@@ -119,7 +119,7 @@ def tune(
     measured = load_pulses(sides[1], "measured", recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
-    held_out = HeldOut.of(simulated, measured, sides[1], recipe, seed)
+    held_out = HeldOut.of(simulated, measured, recipe, seed)
     out.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         study_name="cpunet",
@@ -277,7 +277,7 @@ class HeldOut:
 
     Parameters
     ----------
-    fit
+    fit_sim, fit_data
         Pulses for the training.
     sim, data
         Held-out pulses.
@@ -285,7 +285,8 @@ class HeldOut:
         Parameters of the held-out data, and the null distance of each.
     """
 
-    fit: Sides
+    fit_sim: InputSet
+    fit_data: InputSet
     sim: Pulses
     data: Pulses
     values: dict[str, Values]
@@ -293,9 +294,7 @@ class HeldOut:
     seed: int
 
     @classmethod
-    def of(
-        cls, sim: InputSet, data: InputSet, data_file: PulseFile, recipe: Recipe, seed: int
-    ) -> Self:
+    def of(cls, sim: InputSet, data: InputSet, recipe: Recipe, seed: int) -> Self:
         """Split both sides at random.
 
         Raises
@@ -310,8 +309,7 @@ class HeldOut:
         n_sim, n_data = len(held_sim), len(held_data)
         draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
         nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
-        fit = Sides(fit_sim, fit_data, data_file, data)
-        return cls(fit, held_sim, held_data, values, nulls, seed)
+        return cls(fit_sim, fit_data, held_sim, held_data, values, nulls, seed)
 
     def score(self, ren: REN) -> float:
         r"""Distance of translated held-out pulses from data; 1 for two samples of the data.
@@ -327,12 +325,12 @@ class HeldOut:
             If pulses cannot be translated.
         """
         generator = ren.seeded(self.seed)
-        remains = wanted_tails(ren, LEARNED) if ren.remains is not None else None
+        tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
         windows = ren.apply(
             self.sim.waveforms,
             energy_kev=self.sim.energy_kev,
             generator=generator,
-            remains_kev=drawn_kev(remains, len(self.sim), generator),
+            tails_kev=drawn_kev(tails, len(self.sim), generator),
         )
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MAX_LOST:
@@ -355,23 +353,25 @@ class HeldOut:
         """
         model: nn.Module
         if recipe.training.method == "matching":
-            found = match(self.fit, recipe, seed, lambda *_step: None)
+            found = match(self.fit_sim, self.fit_data, recipe, seed, lambda *_step: None)
             model, recipe = found.model, found.recipe
         else:
-            outside, _ = outside_noise(self.fit, recipe)
-            sides = (self.fit.sim.waveforms, self.fit.data.waveforms)
-            model = train(*sides, recipe, seed=seed, device=device, outside=outside)
+            sides = (self.fit_sim, self.fit_data)
+            outside, _ = outside_noise(*sides, recipe)
+            sim, data = (side.prepared.pulses.waveforms for side in sides)
+            model = train(sim, data, recipe, seed=seed, device=device, outside=outside)
         facts = {"dt_ns": self.sim.dt_ns, "peak": "", "seconds": 0.0}
         return REN.of(Run.of(model, recipe, seed=seed, device=device, **facts), device)
 
 
-def _split(side: InputSet, rng: np.random.Generator) -> tuple[Pulses, Pulses]:
+def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
     """The pulses of a side to fit, and those held out."""
-    pulses = side.prepared.pulses
-    rows, n = rng.permutation(len(pulses)), int(SHARE * len(pulses))
-    if n < MIN_N:
+    prepared = side.prepared
+    rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
+    if n < MIN_PULSES:
         raise CpunetError(
-            f"{side.path}: {len(pulses)} pulses, of which {n} would be held out, "
-            f"and {MIN_N} are needed; select more energies (`peak`) or give more"
+            f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, "
+            f"and {MIN_PULSES} are needed; select more energies (`peak`) or give more"
         )
-    return pulses[np.sort(rows[n:])], pulses[np.sort(rows[:n])]
+    rest = replace(side, prepared=prepared[np.sort(rows[n:])])
+    return rest, prepared.pulses[np.sort(rows[:n])]

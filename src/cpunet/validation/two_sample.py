@@ -28,7 +28,7 @@ Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 Parameters = Mapping[str, Values]
 
-MIN_N = 40  # pulses per side: 8 in each test fold
+MIN_PULSES = 40  # pulses per side: 8 in each test fold
 LARGEST = 1000  # pulses per side: resolves an AUC to 0.013
 BLOCK = 256  # pulses per block: bounds memory
 FOLDS = 5
@@ -121,10 +121,11 @@ def classifier_auc(
         for windows, extra in zip(sides, extras, strict=True)
     ]
     size = min(largest, *map(len, usable))
-    if size < MIN_N:
+    if size < MIN_PULSES:
         raise CpunetError(
             f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable, "
-            f"and {size} of each would be compared; a two-sample test needs {MIN_N} of each"
+            f"and {size} of each would be compared; a two-sample test needs {MIN_PULSES} "
+            "of each"
         )
     rows = [np.sort(rng.choice(found, size, replace=False)) for found in usable]
     windows = np.concatenate([s[r] for s, r in zip(sides, rows, strict=True)]).astype(float)

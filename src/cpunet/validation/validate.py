@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside
-from cpunet.pulses.channels import ALL, Outcome, Pair, one_by_one, own_folder, paired
+from cpunet.pulses.channels import ALL, Outcome, Pair, each_channel, own_folder, paired
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, as_run
@@ -146,19 +147,24 @@ def _of_channels(
     if out is None:
         raise CpunetError(f"`data_table` {ALL}: give `out`, the folder of the reports")
 
-    def report(name: str, pair: Pair, folder: Path) -> Report:
-        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-        return _validated(as_run(run), *pair, folder, how, force=force)
-
     channels = paired(sim, data)
-    outcome = one_by_one(channels, out, report)
+    outcome = each_channel(channels, out, partial(_of_channel, runs, how, force))
     if outcome.done:
         folders = [out / name for name in channels]
         # without force, a channel with a report fails and keeps it
         failed = [out / name for name in outcome.failed if force]
         compared(folders, failed=failed, missing_ok=True).save(out / INDEX, force=True)
         log.info(f"all channels: {out / INDEX}")
-    return outcome
+    return Outcome({n: Report.load(place) for n, place in outcome.done.items()}, outcome.failed)
+
+
+def _of_channel(
+    runs: RunLike, how: Mapping[str, Any], force: bool, name: str, pair: Pair, folder: Path
+) -> Path:
+    """The folder of the report of a channel, made in a process of its own."""
+    run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
+    _validated(as_run(run), *pair, folder, how, force=force)
+    return folder
 
 
 def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str]:
@@ -176,7 +182,7 @@ def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str
 
 def _of_tails(metrics: Mapping[str, Any]) -> list[str]:
     """Remarks on pile-up tails in the data, if they are certain."""
-    tails = metrics["remains"] or {}
+    tails = metrics["tails"] or {}
     if not tails.get("rate_khz"):
         return []
     shares = ", ".join(
@@ -184,8 +190,8 @@ def _of_tails(metrics: Mapping[str, Any]) -> list[str]:
         for size, share in tails["percent_above"].items()
     )
     return [
-        f"Traces of the training lie on remains of earlier pulses, {tails['rate_khz']:.2f} ± "
+        f"Traces of the training lie on pile-up tails, {tails['rate_khz']:.2f} ± "
         f"{tails['rate_error_khz']:.2f} kHz decaying with {tails['decay_us']:.1f} µs: percent "
         f"of the traces, measured (by the law), {shares}. All translations and the truth have "
-        "remains drawn by this law, as likely as they pass the quality cuts."
+        "tails drawn by this law, as likely as they pass the quality cuts."
     ]

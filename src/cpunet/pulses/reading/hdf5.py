@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, lh5_rows, opened, text_attribute
-from cpunet.pulses.reading.columns import shortened
+from cpunet.pulses.reading.energies import shortened
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces

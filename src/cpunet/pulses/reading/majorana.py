@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
-from cpunet.pulses.reading.columns import MemoryColumn, shortened
+from cpunet.pulses.reading.energies import MemoryColumn, shortened
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 

@@ -1,18 +1,17 @@
-"""Pulses in the formats of siggen and its users: ``.spe`` spectra and columns of text."""
+"""Pulses in the formats of siggen and its users: ``.spe`` spectra and text."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.columns import MemoryColumn
+from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
@@ -20,8 +19,7 @@ from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 # (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
 _SPE = struct.Struct("<i8siiiiii")
 
-_MIN_N = 16  # samples: shorter lines are not pulses but some other table
-_PRINTED = "signal:"  # the line that siggen's `psig` prints before the numbers
+_MIN_SAMPLES = 16  # samples: shorter lines are not pulses but some other table
 _UNEVEN = 0.1  # of a step: times are printed with few digits
 
 
@@ -52,40 +50,29 @@ class SpectrumSource(PulseSource):
                 yield Traces(rows.reshape(n_rows, self.length))
 
 
-class _Line(NamedTuple):
-    number: int
-    values: list[float]
-
-
 class TextSource(PulseSource):
-    """Text in one of four formats; ``#`` starts a comment, commas may separate numbers.
+    """Text: one pulse a line, or lines of a pulse's times (ns, evenly spaced) and values.
 
-    Lines of one number are the samples of one pulse.  Lines of two numbers are its times
-    (ns, evenly spaced) and values.  Longer lines are one pulse each.  After a line
-    ``signal:``, as printed by siggen, all numbers are one pulse.
+    ``#`` starts a comment, commas may separate numbers.
     """
 
     def __init__(self, options: PulseFile) -> None:
         path = options.path
-        first, second = [*islice(_lines(path), 2), None, None][:2]
+        first = next(_lines(path), None)
         if first is None:
             raise CpunetError(f"{path}: holds no numbers; give a file of pulses")
-        period = None
+        length, period = len(first), None
         self._pulse: npt.NDArray[np.float64] | None = None
-        if _is_printed(path):
-            numbers = chain.from_iterable(line.values for line in _lines(path))
-            self._pulse = np.fromiter(numbers, np.float64)
-        elif len(first.values) <= 2 and second is not None:
-            columns = np.array(list(_even_lines(path, len(first.values))))
-            self._pulse = columns[:, -1]
-            if len(first.values) == 2:
-                period = MemoryColumn(_spacing(path, columns[:, 0]), "ns")
-        length = len(first.values) if self._pulse is None else len(self._pulse)
-        if length < _MIN_N:
+        if length == 2:
+            time_ns, self._pulse = np.array(list(_lines(path))).T
+            length = len(time_ns)
+        if length < _MIN_SAMPLES:
             raise CpunetError(
                 f"{path}: {length} numbers are no pulse; give time (ns) and value, "
                 "or one pulse a line"
             )
+        if self._pulse is not None:
+            period = MemoryColumn(_spacing(path, time_ns), "ns")
         n_pulses = None if self._pulse is None else 1
         super().__init__(options, Layout("text", "", n_pulses, length, {}, "time", period))
 
@@ -93,33 +80,17 @@ class TextSource(PulseSource):
         if self._pulse is not None:
             yield Traces(self._pulse[np.newaxis])
             return
-        lines = _even_lines(self.path, self.length)
+        lines = _lines(self.path)
         while rows := list(islice(lines, size)):
             yield Traces(np.array(rows))
 
 
-def _even_lines(path: Path, expected: int) -> Iterator[list[float]]:
-    for line in _lines(path):
-        if len(line.values) != expected:
-            raise CpunetError(
-                f"{path}: line {line.number}: {len(line.values)} numbers, before it "
-                f"{expected}; give every line the same length"
-            )
-        yield line.values
-
-
-def _lines(path: Path) -> Iterator[_Line]:
-    """Yield the numbers of each line that has any."""
-    any_line = False
+def _lines(path: Path) -> Iterator[list[float]]:
+    """Yield the numbers of each line that has any, as many in every line."""
+    expected = None
     with path.open(encoding="ascii", errors="replace") as file:
         for number, line in enumerate(file, 1):
             words = line.partition("#")[0].replace(",", " ").split()
-            if words == [_PRINTED]:
-                if any_line:
-                    raise CpunetError(
-                        f"{path}: line {number}: another pulse; give each a file of its own"
-                    )
-                continue
             try:
                 values = [float(word) for word in words]
             except ValueError:
@@ -127,14 +98,14 @@ def _lines(path: Path) -> Iterator[_Line]:
                     f"{path}: line {number}: {line.strip()[:40]!r} is no line of numbers; "
                     "give a file of pulses, or start comments with #"
                 ) from None
-            if values:
-                any_line = True
-                yield _Line(number, values)
-
-
-def _is_printed(path: Path) -> bool:
-    with path.open(encoding="ascii", errors="replace") as file:
-        return next((line.strip() for line in file if line.strip()), "") == _PRINTED
+            if not values:
+                continue
+            if len(values) != (expected := expected or len(values)):
+                raise CpunetError(
+                    f"{path}: line {number}: {len(values)} numbers, before it "
+                    f"{expected}; give every line the same length"
+                )
+            yield values
 
 
 def _spacing(path: Path, time_ns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

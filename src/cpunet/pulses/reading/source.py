@@ -12,8 +12,13 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.columns import Column, require_length
-from cpunet.pulses.reading.energies import EVENT_KEYS, resolve_energies, resolve_sampling
+from cpunet.pulses.reading.energies import (
+    EVENT_KEYS,
+    Column,
+    require_length,
+    resolve_energies,
+    resolve_sampling,
+)
 from cpunet.pulses.reading.files import PulseFile
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces

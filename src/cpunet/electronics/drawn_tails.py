@@ -1,14 +1,14 @@
-"""Random tails of earlier pulses for translated pulses, distributed as in the data.
+"""Random pile-up tails for translated pulses, distributed as in the data.
 
-They are drawn from the law of the data. Quality cuts remove traces with large remainders. The
-probability of passing the cuts is measured by adding remainders to measured traces without any.
-Translations into prepared windows are compared with data after cuts, so their remainders are
+They are drawn from the law of the data. Quality cuts remove traces with large tails. The
+probability of passing the cuts is measured by adding tails to measured traces without any.
+Translations into prepared windows are compared with data after cuts, so their tails are
 drawn with this probability. Raw traces have not passed any cuts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
@@ -16,18 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.electronics.baseline_tails import tail_shape
 from cpunet.electronics.exponentials import FloatArray as Values
-from cpunet.electronics.remains import Remains
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.pile_up_tails import PileUpTails, tail_shape
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.cuts import CutWindows, apply_cuts
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Remainders in keV at which the probability of passing the cuts is measured.
+# Tails in keV at which the probability of passing the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
-TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which remainders are added
+TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which tails are added
 
 
 class KnownDecay(NamedTuple):
@@ -38,8 +37,8 @@ class KnownDecay(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnRemains:
-    """Remainders to be drawn and added to records.
+class DrawnTails:
+    """Tails to be drawn and added to records.
 
     Parameters
     ----------
@@ -54,10 +53,10 @@ class DrawnRemains:
     passed
         Probability of passing the cuts of the data at `SIZES_KEV`. None if there are no cuts.
     decay_error_us
-        Error in us of the decay time of the law, if it was measured from remainders.
+        Error in us of the decay time of the law, if it was measured from tails.
     """
 
-    law: RemainsLaw
+    law: TailsLaw
     height: float
     lead_us: float
     dt_ns: float
@@ -66,7 +65,7 @@ class DrawnRemains:
 
     @property
     def known_decay(self) -> KnownDecay | None:
-        """The decay time, if it was measured from remainders."""
+        """The decay time, if it was measured from tails."""
         if self.decay_error_us is None:
             return None
         return KnownDecay(self.law.decay_us, self.decay_error_us / self.law.decay_us)
@@ -77,12 +76,12 @@ class DrawnRemains:
         return replace(self, law=law, passed=None)
 
     def draw_kev(self, n: int, rng: np.random.Generator) -> Values:
-        """Draw the remainders at the start of `n` traces, in keV."""
+        """Draw the tails at the start of `n` traces, in keV."""
         kev = self.law.draw(n, rng)
         if self.passed is None or not n:
             return kev
         again = np.arange(n)
-        for _ in range(100):  # most traces have no remainder and pass
+        for _ in range(100):  # most traces have no tail and pass
             sizes = np.log1p(kev[again])
             passes = np.interp(sizes, np.log1p(SIZES_KEV), self.passed)
             again = again[rng.random(len(again)) >= passes]
@@ -92,7 +91,7 @@ class DrawnRemains:
         return kev
 
     def decay(self, length: int, lead_us: float | None = None) -> Values:
-        """Remainder of 1 keV at each sample of a record, shape ``(length,)``."""
+        """Tail of 1 keV at each sample of a record, shape ``(length,)``."""
         lead = self.lead_us if lead_us is None else lead_us
         time_us = np.arange(length) * self.dt_ns * 1e-3 + lead
         return np.asarray(np.exp(-time_us / self.law.decay_us), float)
@@ -100,7 +99,7 @@ class DrawnRemains:
     def factors(
         self, energy_kev: npt.NDArray[np.float64], rng: np.random.Generator
     ) -> FloatArray:
-        """Draw remainders for pulses of given energies, in prepared units."""
+        """Draw tails for pulses of given energies, in prepared units."""
         require_energies(energy_kev)
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32)
@@ -120,7 +119,7 @@ class DrawnRemains:
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Self:
         """Read a mapping written by `describe`."""
-        law = RemainsLaw(
+        law = TailsLaw(
             float(told["rate_khz"]), float(told["decay_us"]), tuple(told["energies_kev"])
         )
         passed = None if told["passed"] is None else tuple(told["passed"])
@@ -131,18 +130,18 @@ class DrawnRemains:
 
 @dataclass(frozen=True, eq=False)
 class TraceNoise:
-    """Noise and tails of earlier pulses: everything that is added to a record.
+    """Noise and pile-up tails: everything that is added to a record.
 
     Parameters
     ----------
     noise
         Noise of the baselines.
-    remains
-        Tails of earlier pulses, or None for noise alone.
+    tails
+        Pile-up tails, or None for noise alone.
     """
 
     noise: BaselineNoise
-    remains: DrawnRemains | None = None
+    tails: DrawnTails | None = None
 
     @property
     def dt_ns(self) -> float:
@@ -152,11 +151,11 @@ class TraceNoise:
     def draw(
         self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw noise as `BaselineNoise.draw`, with tails of earlier pulses added."""
+        """Draw noise as `BaselineNoise.draw`, with pile-up tails added."""
         drawn = self.noise.draw(energy_kev, length, rng)
-        if self.remains is not None:
-            factors = self.remains.factors(energy_kev, rng)
-            drawn += factors[:, np.newaxis] * self.remains.decay(length).astype(np.float32)
+        if self.tails is not None:
+            factors = self.tails.factors(energy_kev, rng)
+            drawn += factors[:, np.newaxis] * self.tails.decay(length).astype(np.float32)
         return drawn
 
 
@@ -192,37 +191,31 @@ class SameNoise:
 
 
 def passing(
-    remains: Remains, traces: Iterable[Pulses], config: PreparationConfig, cuts: CutWindows
+    tails: PileUpTails, traces: Pulses, config: PreparationConfig, cuts: CutWindows
 ) -> tuple[float, ...] | None:
-    """Probability that traces with remainders of `SIZES_KEV` pass the quality cuts.
+    """Probability that traces with tails of `SIZES_KEV` pass the quality cuts.
 
     Parameters
     ----------
-    remains
-        Remainders of the channel.
+    tails
+        Tails of the channel.
     traces
-        Blocks of raw traces that have passed the cuts.
+        Raw traces that have passed the cuts.
     config, cuts
         Preparation settings and quality cuts.
 
     Returns
     -------
     tuple of float
-        One probability per size, or None if too few traces have no remainder.
+        One probability per size, or None if too few traces have no tail.
     """
-    templates: list[npt.NDArray[np.float32]] = []
-    for block in traces:
-        empty = remains.measure(block) < remains.error_kev
-        templates += list(block.waveforms[empty])
-        if len(templates) >= TEMPLATES:
-            break
-    if len(templates) < MIN_TEMPLATES:
+    raw = traces.waveforms[tails.measure(traces) < tails.error_kev][:TEMPLATES]
+    if len(raw) < MIN_TEMPLATES:
         return None
-    raw = np.stack(templates[:TEMPLATES])
-    shape = tail_shape(raw.shape[1], remains.dt_ns, remains.decay_us)
-    unit = (remains.adc_per_kev * shape).astype(np.float32)
+    shape = tail_shape(raw.shape[1], tails.dt_ns, tails.decay_us)
+    unit = (tails.adc_per_kev * shape).astype(np.float32)
     shares = []
     for kev in SIZES_KEV:
-        lifted = Pulses.of(raw + np.float32(kev) * unit, dt_ns=remains.dt_ns)
+        lifted = Pulses.of(raw + np.float32(kev) * unit, dt_ns=tails.dt_ns)
         shares.append(len(apply_cuts(prepare(lifted, config, "measured"), cuts)) / len(raw))
     return tuple(share / max(shares[0], 1e-9) for share in np.minimum.accumulate(shares))

@@ -1,6 +1,6 @@
-"""Remains of earlier pulses in a file of raw traces: rate, spreads of slopes, and a picture.
+"""Pile-up tails in a file of raw traces: rate, spreads of slopes, and a picture.
 
-Run with ``python benchmarks/remains.py FILE --kev-per-adc 0.0649 --picture remains.png``.
+Run with ``python benchmarks/tails.py FILE --kev-per-adc 0.0649 --picture tails.png``.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from cpunet.electronics.baseline_tails import read_baselines
-from cpunet.electronics.remains import Remains
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.plotting import COLOURS, DATA_FILL, styled
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
@@ -26,20 +26,20 @@ from cpunet.recipes import load_recipe
 Values = npt.NDArray[np.float64]
 
 SHOWN = 12  # traces
-EMPTY = 0.5  # errors: traces with smaller remains count as empty
+EMPTY = 0.5  # errors: traces with smaller tails count as empty
 SIGMA_PER_MAD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Slopes of baselines in keV per decay time, an independent measure of the remains.
+    """Slopes of baselines in keV per decay time, an independent measure of the tails.
 
     Parameters
     ----------
     before, after
-        Slopes before and after subtraction of the estimated remains of each trace.
+        Slopes before and after subtraction of the estimated tails of each trace.
     empty
-        Mask of the traces with negligible remains, whose slopes are noise.
+        Mask of the traces with negligible tails, whose slopes are noise.
     """
 
     before: Values
@@ -47,21 +47,21 @@ class Slopes:
     empty: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, raw: Pulses, remains: Remains) -> Slopes:
-        """Slopes of the raw traces whose remains can be estimated."""
-        kev = remains.measure(raw)
+    def of(cls, raw: Pulses, tails: PileUpTails) -> Slopes:
+        """Slopes of the raw traces whose tails can be estimated."""
+        kev = tails.measure(raw)
         told = np.isfinite(kev)
-        flat = remains.subtracted_from(raw)
+        flat = tails.subtracted_from(raw)
         before, after = (
             read_baselines(
-                traces.waveforms[told, : remains.samples].astype(float),
-                remains.dt_ns,
-                remains.decay_us,
+                traces.waveforms[told, : tails.samples].astype(float),
+                tails.dt_ns,
+                tails.decay_us,
             )[1]
-            / remains.adc_per_kev
+            / tails.adc_per_kev
             for traces in (raw, flat)
         )
-        return cls(before, after, np.abs(kev[told]) < EMPTY * remains.error_kev)
+        return cls(before, after, np.abs(kev[told]) < EMPTY * tails.error_kev)
 
     @property
     def spreads(self) -> tuple[float, float]:
@@ -74,26 +74,26 @@ def _robust_std(values: Values) -> float:
 
 
 @styled
-def remains_figure(raw: Pulses, remains: Remains) -> Figure:
-    """Distribution of the remains with the law, slopes before and after, and some traces.
+def remains_figure(raw: Pulses, tails: PileUpTails) -> Figure:
+    """Distribution of the tails with the law, slopes before and after, and some traces.
 
     Parameters
     ----------
     raw
         Raw traces.
-    remains
-        Remains estimated from these traces, or from others of the same channel.
+    tails
+        Pile-up tails estimated from these traces, or from others of the same channel.
     """
     figure = Figure(figsize=(11, 3.6))
     sizes, slopes, traces = figure.subplots(1, 3)
-    kev = remains.measure(raw)
-    _sizes(sizes, kev[np.isfinite(kev)], remains.fit.law, remains.error_kev)
-    _slopes(slopes, Slopes.of(raw, remains))
-    _traces(traces, raw, remains, kev)
+    kev = tails.measure(raw)
+    _sizes(sizes, kev[np.isfinite(kev)], tails.fit.law, tails.error_kev)
+    _slopes(slopes, Slopes.of(raw, tails))
+    _traces(traces, raw, tails, kev)
     return figure
 
 
-def _sizes(axes: Axes, kev: Values, law: RemainsLaw, error_kev: float) -> None:
+def _sizes(axes: Axes, kev: Values, law: TailsLaw, error_kev: float) -> None:
     at = np.geomspace(error_kev, 0.95 * max(law.energies_kev), 60)
     shares = [100 * (kev > size).mean() for size in at]
     axes.loglog(at, shares, color=COLOURS["data"], drawstyle="steps-post", label="measured")
@@ -104,7 +104,7 @@ def _sizes(axes: Axes, kev: Values, law: RemainsLaw, error_kev: float) -> None:
 
 def _label_sizes(axes: Axes, traces: int) -> None:
     axes.set_ylim(max(30 / traces, 0.01), 100)
-    axes.set_xlabel("remainder at the first sample (keV)")
+    axes.set_xlabel("tail at the first sample (keV)")
     axes.set_ylabel("traces above (%)")
     axes.legend()
 
@@ -113,27 +113,27 @@ def _slopes(axes: Axes, slopes: Slopes) -> None:
     spread, noise = slopes.spreads
     edges = np.linspace(-8 * noise, 16 * noise, 97).tolist()
     axes.hist(slopes.before, edges, color=DATA_FILL, label="as measured")
-    after = f"without remains, spread {spread:.2f} keV"
+    after = f"without tails, spread {spread:.2f} keV"
     axes.hist(slopes.after, edges, histtype="step", color=COLOURS["ren"], label=after)
     axes.plot([], [], " ", label=f"empty baselines: {noise:.2f} keV")
     axes.set_yscale("log")
     axes.set_ylim(0.7, 10 * len(slopes.before) ** 0.7)
-    axes.set_xlabel("remainder according to the slope (keV)")
+    axes.set_xlabel("tail according to the slope (keV)")
     axes.set_ylabel("traces")
     axes.legend(loc="upper right")
 
 
-def _traces(axes: Axes, raw: Pulses, remains: Remains, kev: Values) -> None:
-    large = np.flatnonzero(np.nan_to_num(kev) > 20 * remains.error_kev)
+def _traces(axes: Axes, raw: Pulses, tails: PileUpTails, kev: Values) -> None:
+    large = np.flatnonzero(np.nan_to_num(kev) > 20 * tails.error_kev)
     chosen = large[np.argsort(kev[large])][:: max(1, len(large) // SHOWN)][:SHOWN]
-    flat = remains.subtracted_from(raw[chosen])
-    time_us = np.arange(remains.samples) * remains.dt_ns * 1e-3
+    flat = tails.subtracted_from(raw[chosen])
+    time_us = np.arange(tails.samples) * tails.dt_ns * 1e-3
     for traces, colour, label in (
         (raw.waveforms[chosen], DATA_FILL, "as measured"),
-        (flat.waveforms, COLOURS["ren"], "without remains"),
+        (flat.waveforms, COLOURS["ren"], "without tails"),
     ):
-        above = _in_kev(traces, remains)
-        axes.plot(time_us, above[:, : remains.samples].T, color=colour, lw=0.8)
+        above = _in_kev(traces, tails)
+        axes.plot(time_us, above[:, : tails.samples].T, color=colour, lw=0.8)
         axes.plot([], [], color=colour, label=label)
     axes.set_xlabel("time (µs)")
     axes.set_ylabel("above an empty baseline (keV)")
@@ -142,8 +142,8 @@ def _traces(axes: Axes, raw: Pulses, remains: Remains, kev: Values) -> None:
     axes.legend(loc="lower right")
 
 
-def _in_kev(traces: FloatArray, remains: Remains) -> Values:
-    return np.asarray((traces - remains.baseline_adc) / remains.adc_per_kev, float)
+def _in_kev(traces: FloatArray, tails: PileUpTails) -> Values:
+    return np.asarray((traces - tails.baseline_adc) / tails.adc_per_kev, float)
 
 
 def main() -> None:
@@ -155,15 +155,15 @@ def main() -> None:
     arguments = parser.parse_args()
     source = open_pulses(arguments.file, kev_per_adc=arguments.kev_per_adc)
     preparation = load_recipe("fast").preparation
-    remains = Remains.of_traces(source.blocks(4096), preparation, arguments.decay_us)
+    tails = PileUpTails.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
     raw = next(iter(source.blocks(4096)))
     console = Console()
-    for name, value in remains.describe().items():
+    for name, value in tails.describe().items():
         console.print(f"{name}: {value}")
-    after, noise = Slopes.of(raw, remains).spreads
-    console.print(f"slopes without remains {after:.2f} keV, of empty baselines {noise:.2f} keV")
+    after, noise = Slopes.of(raw, tails).spreads
+    console.print(f"slopes without tails {after:.2f} keV, of empty baselines {noise:.2f} keV")
     if arguments.picture:
-        remains_figure(raw, remains).savefig(arguments.picture, dpi=110)
+        remains_figure(raw, tails).savefig(arguments.picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,13 @@ arrived at most :math:`\tau \ln(E/x)` ago. Therefore
 
 .. math:: P(>x) = 1 - \exp(-R \tau \langle \max(0, \ln(E/x)) \rangle)
 
-is the fraction of traces with at least one remainder above :math:`x`. The sum of all
-remainders is shot noise (Campbell 1909). The logarithm of its characteristic function is
+is the fraction of traces with at least one tail above :math:`x`. The sum of all
+tails is shot noise (Campbell 1909). The logarithm of its characteristic function is
 
 .. math:: \ln \varphi(u) = R \tau \left\langle \int_0^E \frac{e^{iux} - 1}{x} dx \right\rangle
     = R \tau \left\langle i\,\mathrm{Si}(uE) - \mathrm{Cin}(uE) \right\rangle .
 
-"Remains" are these tails; a "remainder" is their height under one trace. The only free
+A tail is told by its height at the first sample of a trace, in keV. The only free
 parameter of the law is the rate.
 """
 
@@ -27,16 +27,16 @@ import numpy.typing as npt
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 
-# After this many decay times the remainder is below the noise: 0.02 keV of 2615 keV.
+# After this many decay times the tail is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
-MOST_EXPECTED = 10_000.0  # maximum expected number of pulses before a trace, for memory
+MAX_EXPECTED = 10_000.0  # maximum expected number of pulses before a trace, for memory
 _MIN_KEV = 1e-3
 _ENERGIES = 64  # energies that represent a spectrum in sums over it
 
 
 @dataclass(frozen=True, eq=False)
-class RemainsLaw:
-    """The law of remains of earlier pulses.
+class TailsLaw:
+    """The law of pile-up tails.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class RemainsLaw:
 
     Examples
     --------
-    >>> law = RemainsLaw(1.5, 84.6, (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615))
+    >>> law = TailsLaw(1.5, 84.6, (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615))
     >>> law.share_above([10.0, 50.0]).round(2).tolist()  # of the traces
     [0.34, 0.2]
     """
@@ -66,7 +66,7 @@ class RemainsLaw:
 
     @property
     def mean_kev(self) -> float:
-        r"""Mean remainder in keV, :math:`R \tau \langle E \rangle` (Campbell's theorem)."""
+        r"""Mean tail in keV, :math:`R \tau \langle E \rangle` (Campbell's theorem)."""
         return self.expected * float(_some(self.energies_kev).mean())
 
     def share_above(self, kev: npt.ArrayLike) -> FloatArray:
@@ -78,7 +78,7 @@ class RemainsLaw:
         --------
         With a single energy, :math:`x = E/e` lies one decay time back.
 
-        >>> law = RemainsLaw(1.0, 100.0, (300.0, 300.0))
+        >>> law = TailsLaw(1.0, 100.0, (300.0, 300.0))
         >>> bool(abs(law.share_above(300.0 / np.e) - (1 - np.exp(-0.1))) < 1e-12)
         True
         """
@@ -87,7 +87,7 @@ class RemainsLaw:
         return np.asarray(-np.expm1(-self.expected * lives), float)
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw the remainder in keV, summed over all earlier pulses, for `n` traces."""
+        """Draw the tail in keV, summed over all earlier pulses, for `n` traces."""
         row, kev, before_us = earlier_pulses(
             n, self.rate_khz, LIFETIMES * self.decay_us, self.energies_kev, rng
         )
@@ -121,7 +121,7 @@ def characteristic_exponents(
     >>> characteristic_exponents(np.array([1e-5]), np.array([100.0])).imag.round(6).tolist()
     [[0.001]]
     """
-    import scipy.special  # a fifth of a second, for those who look for remains only
+    import scipy.special  # a fifth of a second, for those who look for tails only
 
     phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
     sine, cosine = scipy.special.sici(phase)
@@ -144,7 +144,7 @@ def earlier_pulses(
     rate_khz, longest_us
         Rate in kHz and length of the interval in us.
     energies_kev
-        Quantiles of the energies in keV, see `RemainsLaw`.
+        Quantiles of the energies in keV, see `TailsLaw`.
     rng
         Random generator.
 
@@ -157,13 +157,13 @@ def earlier_pulses(
     Raises
     ------
     CpunetError
-        If more than `MOST_EXPECTED` pulses are expected for a trace.
+        If more than `MAX_EXPECTED` pulses are expected for a trace.
     """
     expected = rate_khz * 1e-3 * longest_us
-    if expected > MOST_EXPECTED:
+    if expected > MAX_EXPECTED:
         raise CpunetError(
             f"other pulses at {rate_khz:g} kHz: {expected:.3g} in {longest_us:.3g} us, more "
-            f"than {MOST_EXPECTED:g}; give a lower rate or a shorter decay"
+            f"than {MAX_EXPECTED:g}; give a lower rate or a shorter decay"
         )
     counts = rng.poisson(expected, size=n)
     row = np.repeat(np.arange(n), counts)
@@ -174,7 +174,7 @@ def earlier_pulses(
 def energies_at(share: FloatArray, energies_kev: Sequence[float]) -> FloatArray:
     """Energies in keV below which a fraction `share` of a spectrum lies.
 
-    The spectrum is given by its quantiles, see `RemainsLaw`.
+    The spectrum is given by its quantiles, see `TailsLaw`.
     """
     logs = np.log(np.maximum(np.asarray(energies_kev, float), _MIN_KEV))
     at = np.linspace(0, 1, len(logs))

@@ -1,8 +1,8 @@
-"""Add remains to a closure set, and measure the noise from its baselines.
+"""Add tails to a closure set, and measure the noise from its baselines.
 
-Writes the set with remains, and prints the noise density of all flat baselines, of those
-selected for measuring the noise, and of those without remains. Run with
-``python benchmarks/remains_noise.py CLOSURE --rate-khz 1 --decay-us 60 --out closure-remains``.
+Writes the set with tails, and prints the noise density of all flat baselines, of those
+selected for measuring the noise, and of those without tails. Run with
+``python benchmarks/tails_noise.py CLOSURE --rate-khz 1 --decay-us 60 --out closure-tails``.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from rich.console import Console
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.remains import Remains
-from cpunet.electronics.remains_law import RemainsLaw
+from cpunet.electronics.pile_up_tails import PileUpTails
+from cpunet.electronics.tails_law import TailsLaw
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
 FREQUENCIES_KHZ = (20, 60, 120, 400)
-LITTLE_KEV = 0.3  # smaller remainders count as none
+LITTLE_KEV = 0.3  # smaller tails count as none
 
 
 def main() -> None:
@@ -36,7 +37,7 @@ def main() -> None:
     arguments = parser.parse_args()
     config = load_recipe("fast").preparation
     raw = open_pulses(arguments.folder / "data.lh5").read()
-    law = RemainsLaw(
+    law = TailsLaw(
         arguments.rate_khz, arguments.decay_us, read_electronics("ornl").other_pulses_kev
     )
     left = law.draw(len(raw), np.random.default_rng(1))
@@ -53,16 +54,16 @@ def main() -> None:
         shutil.copyfile(arguments.folder / name, arguments.out / name)
 
     console = Console()
-    remains = Remains.of_traces([lifted], config)
-    console.print(remains.describe())
+    tails = PileUpTails.of(Baselines.of([lifted], config))
+    console.print(tails.describe())
     known = np.load(arguments.folder / "data_labels.npz")["flag"] == 0
     sets = {
-        "without remains": known & (left < LITTLE_KEV),
+        "without tails": known & (left < LITTLE_KEV),
         "all": np.ones(len(raw), bool),
-        "taken": remains.empty(lifted),
+        "taken": tails.empty(lifted),
     }
     for name, chosen in sets.items():
-        noise = BaselineNoise.from_traces(lifted[chosen], config)
+        noise = BaselineNoise.of(Baselines.of([lifted], config), chosen)
         khz = np.arange(len(noise.density)) / noise.samples / noise.dt_ns * 1e6
         at = ", ".join(f"{np.interp(f, khz, noise.density):.1f}" for f in FREQUENCIES_KHZ)
         console.print(

@@ -1,4 +1,4 @@
-"""Second pulses within the record of a trace (pile-up), drawn by a Poisson process."""
+"""In-trace pile-up: pulses within the record of a trace, drawn by a Poisson process."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.remains_law import earlier_pulses
+from cpunet.electronics.tails_law import earlier_pulses
 from cpunet.errors import CpunetError
 
-MOST_EXPECTED = 4.0  # maximum expected number of second pulses per trace
+MAX_EXPECTED = 4.0  # maximum expected number of piled-up pulses per trace
 
 Columns = dict[str, tuple[npt.NDArray[np.generic], str]]
 
 
 @dataclass(frozen=True, eq=False)
-class SecondPulses:
-    """Second pulses within the records of `n` traces.
+class InTracePileUp:
+    """Piled-up pulses within the records of `n` traces.
 
     Parameters
     ----------
     n
         Number of traces.
     row
-        Trace of each second pulse, shape ``(pulses,)``.
+        Trace of each piled-up pulse, shape ``(pulses,)``.
     kev
         Energies in keV, shape ``(pulses,)``.
     after_ns
@@ -53,7 +53,7 @@ class SecondPulses:
         record_ns: float,
         rng: np.random.Generator,
     ) -> Self:
-        """Draw second pulses at any time of a record.
+        """Draw piled-up pulses at any time of a record.
 
         Parameters
         ----------
@@ -63,7 +63,7 @@ class SecondPulses:
             Rate of the pulses in kHz.
         energies_kev
             Quantiles of their energies in keV, see
-            `cpunet.electronics.remains_law.RemainsLaw`.
+            `cpunet.electronics.tails_law.TailsLaw`.
         before_ns, record_ns
             Duration of the record before the trace's own pulse, and of the whole record, in ns.
         rng
@@ -72,29 +72,29 @@ class SecondPulses:
         Raises
         ------
         CpunetError
-            If more than `MOST_EXPECTED` pulses are expected in a record.
+            If more than `MAX_EXPECTED` pulses are expected in a record.
 
         Examples
         --------
         1 kHz in a record of 20 us corresponds to 0.02 pulses per trace.
 
         >>> rng = np.random.default_rng(1)
-        >>> second = SecondPulses.draw(10_000, 1.0, (10, 2615), 5e3, 20e3, rng)
-        >>> 150 < len(second.row) < 250, bool((second.after_ns >= -5e3).all())
+        >>> piled = InTracePileUp.draw(10_000, 1.0, (10, 2615), 5e3, 20e3, rng)
+        >>> 150 < len(piled.row) < 250, bool((piled.after_ns >= -5e3).all())
         (True, True)
         """
         expected = rate_khz * 1e-6 * record_ns
-        if expected > MOST_EXPECTED:
+        if expected > MAX_EXPECTED:
             raise CpunetError(
                 f"pile-up at {rate_khz:g} kHz: {expected:.3g} pulses in a record of "
-                f"{1e-3 * record_ns:.3g} us, more than {MOST_EXPECTED:g}; give a lower rate"
+                f"{1e-3 * record_ns:.3g} us, more than {MAX_EXPECTED:g}; give a lower rate"
             )
         row, kev, time_us = earlier_pulses(n, rate_khz, 1e-3 * record_ns, energies_kev, rng)
         partner = rng.integers(max(n, 1), size=len(row))
         return cls(n, row, kev, 1e3 * time_us - before_ns, partner)
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Self:
-        """Second pulses of selected traces, with the traces renumbered."""
+        """Piled-up pulses of selected traces, with the traces renumbered."""
         place = np.full(self.n, -1)
         place[rows] = np.arange(len(rows))
         kept = place[self.row] >= 0
@@ -107,7 +107,7 @@ class SecondPulses:
         )
 
     def largest(self) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-        """Number of second pulses in each trace, and energy and time of the largest.
+        """Number of piled-up pulses in each trace, and energy and time of the largest.
 
         Energies (keV) and times (ns) are NaN where there is none. All of shape ``(n,)``.
         """
@@ -138,12 +138,12 @@ class SecondPulses:
         dt_ns: float,
         length: int,
     ) -> FloatArray:
-        """Sum of the second pulses at each sample, relative to the trace's own pulse.
+        """Sum of the piled-up pulses at each sample, relative to the trace's own pulse.
 
         Parameters
         ----------
         shapes
-            Record of each second pulse as if it were the trace's own, in prepared units,
+            Record of each piled-up pulse as if it were the trace's own, in prepared units,
             shape ``(pulses, length + reach)``.
         energy_kev
             Energies of the traces' own pulses in keV, shape ``(n,)``.
@@ -162,9 +162,9 @@ class SecondPulses:
         The first sample of a step that comes half a period late has half its height.
 
         >>> one, kev, after_ns = np.array([0]), np.array([50.0]), np.array([24.0])
-        >>> second = SecondPulses(1, one, kev, after_ns, partner=one)
+        >>> piled = InTracePileUp(1, one, kev, after_ns, partner=one)
         >>> step = np.array([[0.0, 1, 1, 1, 1, 1, 1]])
-        >>> second.added(step, np.array([100.0]), 16.0, 5).tolist()
+        >>> piled.added(step, np.array([100.0]), 16.0, 5).tolist()
         [[0.0, 0.0, 0.25, 0.5, 0.5]]
         """
         total = np.zeros((self.n, length))
@@ -183,7 +183,7 @@ class SecondPulses:
 
 @dataclass(frozen=True)
 class DrawnPileUp:
-    """Parameters of the second pulses to be drawn.
+    """Parameters of the piled-up pulses to be drawn.
 
     Parameters
     ----------
@@ -199,9 +199,9 @@ class DrawnPileUp:
     energies_kev: tuple[float, ...]
     dt_ns: float
 
-    def draw(self, n: int, before: int, length: int, rng: np.random.Generator) -> SecondPulses:
-        """Draw second pulses for records of `length` samples, `before` before the own pulse."""
-        return SecondPulses.draw(
+    def draw(self, n: int, before: int, length: int, rng: np.random.Generator) -> InTracePileUp:
+        """Draw pulses for records of `length` samples, `before` before the own pulse."""
+        return InTracePileUp.draw(
             n,
             self.rate_khz,
             self.energies_kev,

@@ -1,13 +1,13 @@
-"""Likelihood fit of the rate of earlier pulses to the remainders under many traces.
+"""Likelihood fit of the rate of earlier pulses to the tails under many traces.
 
-Each trace contributes one measured remainder with an error, relative to the level of an empty
+Each trace contributes one measured tail with an error, relative to the level of an empty
 baseline. The density of the law, convolved with the error, is known. Rate, level and error are
 therefore fitted together. Real noise is not Gaussian: its wings would be mistaken for small
-remainders. They are determined from the side below 0, which remainders do not affect.
+tails. They are determined from the side below 0, which tails do not affect.
 
 The energies are those of the file. Where these cannot describe the rate (for example, in a file
 with a few gamma lines only), they follow a log-normal spectrum up to the maximum energy, which
-is fitted to the remainders.
+is fitted to the tails.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.remains_law import RemainsLaw, characteristic_exponents
+from cpunet.electronics.tails_law import TailsLaw, characteristic_exponents
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 Function = Callable[[FloatArray], float]
 
-# Range and number of energies of a spectrum; the lowest still leaves a visible remainder.
+# Range and number of energies of a spectrum; the lowest still leaves a visible tail.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
 # Points of the density. It is periodic, so the grid must hold all energies, also in steps of
@@ -47,7 +47,7 @@ MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
 
 @dataclass(frozen=True, eq=False)
 class RateFit:
-    """Result of a fit of the law to a set of remainders.
+    """Result of a fit of the law to a set of tails.
 
     Parameters
     ----------
@@ -58,10 +58,10 @@ class RateFit:
     recorded
         Whether the law uses the energies of the file rather than a fitted spectrum.
     gain_of_law
-        Log-likelihood relative to that without any remainders.
+        Log-likelihood relative to that without any tails.
     """
 
-    law: RemainsLaw
+    law: TailsLaw
     rate_error_khz: float
     level_kev: float
     sigma_kev: float
@@ -72,9 +72,9 @@ class RateFit:
 def fit_rate(
     kev: FloatArray, sigma_kev: float, decay_us: float, energies_kev: FloatArray
 ) -> RateFit:
-    r"""Fit rate, level and error to measured remainders.
+    r"""Fit rate, level and error to measured tails.
 
-    The log-likelihood of the remainders :math:`x_i` is
+    The log-likelihood of the tails :math:`x_i` is
 
     .. math:: \ln L = \sum_i \ln\left[(1 - \epsilon)\, p(x_i) + \epsilon u\right],
 
@@ -87,7 +87,7 @@ def fit_rate(
     Parameters
     ----------
     kev
-        Measured remainders in keV, near 0 for empty baselines.
+        Measured tails in keV, near 0 for empty baselines.
     sigma_kev
         Initial estimate of their standard deviation in keV.
     decay_us
@@ -107,7 +107,7 @@ def fit_rate(
     expected, error = best.expected
     energies = _quantiles(likelihood.energies, best.weights)
     return RateFit(
-        law=RemainsLaw(1e3 * expected / decay_us, decay_us, energies),
+        law=TailsLaw(1e3 * expected / decay_us, decay_us, energies),
         rate_error_khz=1e3 * error / decay_us,
         level_kev=float(best.vector[1]),
         sigma_kev=float(np.exp(best.vector[2])),
@@ -117,7 +117,7 @@ def fit_rate(
 
 
 class _Likelihood:
-    """Likelihood of the remainders as a function of rate, level, error and spectrum."""
+    """Likelihood of the tails as a function of rate, level, error and spectrum."""
 
     def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
         self.kev, self.sigma, self.energies = kev, sigma_kev, energies
@@ -153,7 +153,7 @@ class _Likelihood:
         return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
 
     def without(self) -> float:
-        """Maximum log-likelihood without any remainders."""
+        """Maximum log-likelihood without any tails."""
         weights = np.zeros(len(self.energies))
         spread = max(float(self.kev.std()), self.sigma)
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
@@ -162,7 +162,7 @@ class _Likelihood:
 
 
 def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
-    """Number of grid points for remainders and their noise; the first quarter is below 0."""
+    """Number of grid points for tails and their noise; the first quarter is below 0."""
     above = max(2 * highest_kev, float(kev.max())) + ROOM * sigma_kev
     below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
     points = max(4 * above / 3, 4 * below) / step_kev

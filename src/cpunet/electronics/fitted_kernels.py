@@ -1,0 +1,345 @@
+"""Kernels fitted to superpulses: a Gaussian with an exponential, and a free one.
+
+Superpulses are mean currents of pulses with similar rise times, aligned at half maximum.
+Simulated and measured pulses are of different events, so single pulses cannot be compared.
+Their means can, once both datasets are divided at the same quantiles of rise time. Pulses of
+one slice then originate from the same regions of the detector.
+
+`GaussExp` is the method of LEGEND's production: sigma and tau are fitted to the superpulses.
+`SuperpulseKernel` divides their spectra. In each slice the mean measured current is the mean
+simulated one convolved with the kernel. The transfer function of the kernel is therefore the
+ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener factor suppresses H
+where the measured spectrum does not exceed its statistical error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+import scipy.optimize
+
+from cpunet.electronics.finishing import PADDING_BEFORE, record_length
+from cpunet.electronics.window_response import (
+    Spectrum,
+    Values,
+    currents,
+    fitted_tail_slope,
+    require_enough,
+    respond,
+    without_decay,
+)
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+
+Groups = list[npt.NDArray[np.int64]]
+
+SLICES = 8
+SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is kept
+RISE_START, RISE_END = 0.02, 0.95  # above the noise at the start, below the slow top
+
+
+@dataclass(frozen=True, eq=False)
+class Superpulses:
+    """Spectra of the mean currents, shape ``(slices, frequencies)``.
+
+    ``error`` is the squared standard error of the mean. It includes noise and the differences
+    between pulses within a slice.
+    """
+
+    spectra: Spectrum
+    error: Values
+
+
+def crossing(steps: Values, fraction: float) -> Values:
+    """Sample at which each pulse of unit height last rises through a fraction.
+
+    The sample is interpolated linearly. It is NaN if there is no crossing before `RISE_END`.
+
+    Examples
+    --------
+    >>> crossing(np.array([[0.0, 0.0, 0.4, 0.8, 1.0, 1.0]]), 0.5)
+    array([2.25])
+    """
+    samples = np.arange(steps.shape[1])
+    top = (steps >= RISE_END).argmax(axis=1)[:, np.newaxis]
+    below = (steps < fraction) & (samples < top)
+    last = steps.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    last = np.minimum(last, steps.shape[1] - 2)
+    rows = np.arange(len(steps))
+    low, high = steps[rows, last], steps[rows, last + 1]
+    known = below.any(axis=1)
+    rise = np.where(known, high - low, 1.0)
+    return np.asarray(np.where(known, last + (fraction - low) / rise, np.nan), float)
+
+
+def rise_times(steps: Values) -> Values:
+    """Rise times from 2 to 95 % of pulses of unit height in samples; NaN if undefined."""
+    return crossing(steps, RISE_END) - crossing(steps, RISE_START)
+
+
+def slices(current: Values) -> Groups:
+    """Rows of single-site-like pulses between quantiles of rise time.
+
+    The pulses with the highest current in each slice are kept. They differ far less from
+    each other than multi-site pulses, and so do their means between datasets.
+
+    Parameters
+    ----------
+    current
+        Currents of pulses of unit height, shape ``(n, length)``.
+
+    Raises
+    ------
+    CpunetError
+        If too few pulses rise from baseline to top.
+    """
+    rise = rise_times(np.cumsum(current, axis=1))
+    rows = np.flatnonzero(np.isfinite(rise))
+    if len(rows) < 2 * SLICES / SINGLE_SITE:
+        raise CpunetError(
+            f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
+            "check that they are prepared charge pulses"
+        )
+    # Over three samples, the peak hardly depends on the sampling phase.
+    height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
+    ordered = rows[np.argsort(rise[rows], kind="stable")]
+    return [
+        group[np.argsort(height[group])[-int(np.ceil(SINGLE_SITE * len(group))) :]]
+        for group in np.array_split(ordered, SLICES)
+    ]
+
+
+def superpulses(
+    spectra: Spectrum,
+    half_times: Values,
+    groups: Groups,
+    length: int,
+) -> Superpulses:
+    r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
+
+    .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
+
+    with the half maximum :math:`t_p` of pulse :math:`p` in samples.
+
+    Parameters
+    ----------
+    spectra
+        Spectra of the currents, shape ``(n, length // 2 + 1)``.
+    half_times
+        Sample of the half maximum of each pulse, finite in all groups.
+    groups
+        Rows of each slice.
+    length
+        Number of samples of the records.
+    """
+    turn = 2j * np.pi * scipy.fft.rfftfreq(length)
+    means = np.empty((len(groups), spectra.shape[1]), complex)
+    error = np.empty(means.shape)
+    for k, rows in enumerate(groups):
+        moved = spectra[rows] * np.exp(half_times[rows, np.newaxis] * turn)
+        means[k] = moved.mean(axis=0)
+        error[k] = moved.var(axis=0) / max(1, len(rows) - 1)
+    return Superpulses(means, error)
+
+
+# maximum number of pulses of either dataset in the fit of sigma and tau, and its iterations,
+# each with slices from the response fitted so far
+GAUSS_PULSES, GAUSS_ROUNDS = 2000, 3
+EDGE = 96  # samples compared before and after the half maximum
+START = 2.0  # initial sigma and tau, in samples
+LONGEST = 64.0  # maximum sigma and tau, in samples
+
+
+@dataclass(frozen=True)
+class GaussExp:
+    r"""A Gaussian and an exponential kernel followed by an exponential decay.
+
+    .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period in ns.
+    sigma_ns, tau_ns
+        Standard deviation of the Gaussian and time constant of the exponential, in ns.
+    tail_slope_per_ms
+        Logarithmic slope of the tail in 1/ms.
+    """
+
+    dt_ns: float
+    sigma_ns: float
+    tau_ns: float
+    tail_slope_per_ms: float
+    name: ClassVar[str] = "gauss_exp"
+
+    @classmethod
+    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
+        """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
+        require_enough(sim, data)
+        slope = fitted_tail_slope(data, dt_ns, align)
+        steps = without_decay(data[:GAUSS_PULSES], slope, dt_ns, align).astype(np.float32)
+        measured = currents(steps)
+        length = record_length(sim.shape[1])
+        of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
+        wanted = _mean_currents(of_data, slices(measured), length)
+        spectra = np.asarray(scipy.fft.rfft(currents(sim[:GAUSS_PULSES]), axis=1), complex)
+
+        best = np.array([START, START])
+        for _ in range(GAUSS_ROUNDS):
+            transfer = _gauss_exp(length, 1.0, best[0], best[1])
+            groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
+            # pulses outside the slices do not enter the fit
+            sliced = spectra[np.concatenate(groups)]
+            ends = np.cumsum([len(group) for group in groups])
+            places = np.split(np.arange(ends[-1]), ends[:-1])
+
+            def residual(
+                parameters: Values, sliced: Spectrum = sliced, places: Groups = places
+            ) -> Values:
+                response = sliced * _gauss_exp(length, 1.0, parameters[0], parameters[1])
+                return (_mean_currents(response, places, length) - wanted).ravel()
+
+            best = scipy.optimize.least_squares(
+                residual, best, bounds=(0.0, LONGEST), diff_step=1e-3, xtol=1e-4
+            ).x
+        sigma, tau = (best * dt_ns).tolist()
+        return cls(dt_ns, sigma, tau, slope)
+
+    def translate(self, waveforms: FloatArray) -> FloatArray:
+        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
+        length = record_length(waveforms.shape[1])
+        transfer = _gauss_exp(length, self.dt_ns, self.sigma_ns, self.tau_ns)
+        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+
+    def describe(self) -> Mapping[str, float]:
+        """Widths of the kernel, and tail slope."""
+        return {
+            "sigma_ns": self.sigma_ns,
+            "tau_ns": self.tau_ns,
+            "tail_slope_per_ms": self.tail_slope_per_ms,
+        }
+
+
+def _gauss_exp(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spectrum:
+    """Fourier transform of the kernel at the frequencies of a record."""
+    omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
+    gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
+    return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
+
+
+def _mean_currents(spectra: Spectrum, groups: Groups, length: int) -> Values:
+    """Superpulses of currents around the half maximum, shape ``(slices, 2 * EDGE)``."""
+    steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
+    means = superpulses(spectra, crossing(steps, 0.5), groups, length)
+    return np.asarray(
+        np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)[:, : 2 * EDGE],
+        float,
+    )
+
+
+# the same of the free kernel, whose iterations take half maxima of the response found so far
+FREE_PULSES, FREE_ROUNDS = 4000, 4
+LEAD, LAG = 32, 256  # samples of the kernel before and after the half maximum
+FADE_IN, FADE_OUT = 8, 64  # samples over which the ends of the kernel are tapered
+
+
+@dataclass(frozen=True, eq=False)
+class SuperpulseKernel:
+    r"""A free kernel followed by an exponential decay.
+
+    .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad
+        W = \max\left(0, 1 - \frac{\sum \sigma_D^2}{\sum |D|^2}\right)
+
+    The sums run over the slices. :math:`D` and :math:`S` are the mean spectra of data and
+    simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors.
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period in ns.
+    kernel
+        Weights with a sum of 1: `LEAD` samples before zero delay and `LAG` from it on.
+    tail_slope_per_ms
+        Logarithmic slope of the tail in 1/ms.
+    """
+
+    dt_ns: float
+    kernel: Values
+    tail_slope_per_ms: float
+    name: ClassVar[str] = "superpulse"
+
+    @classmethod
+    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
+        """Divide the mean spectra, see `BaselineMethod.fit`."""
+        require_enough(sim, data)
+        slope = fitted_tail_slope(data, dt_ns, align)
+        steps = without_decay(data[:FREE_PULSES], slope, dt_ns, align).astype(np.float32)
+        length = record_length(sim.shape[1])
+        current = currents(steps)
+        wanted = _superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
+
+        spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES]), axis=1))
+        kernel = np.zeros(LEAD + LAG)
+        kernel[LEAD] = 1.0
+        for _ in range(FREE_ROUNDS):
+            # The simulated pulses are placed by the half maximum of their response. A shift
+            # of their own half maximum does not give this exactly.
+            response = scipy.fft.irfft(spectra * _transfer(kernel, length), length, axis=1)
+            kernel = _kernel(wanted, _superpulses(spectra, response), length)
+        found = cls(dt_ns, kernel, slope)
+        # subtract the contribution of the kernel's late part to the tail slope from the decay
+        windows = found.translate(sim[:FREE_PULSES])[
+            :, PADDING_BEFORE : PADDING_BEFORE + sim.shape[1]
+        ]
+        excess = fitted_tail_slope(windows, dt_ns, align) - slope
+        return replace(found, tail_slope_per_ms=slope - excess)
+
+    def translate(self, waveforms: FloatArray) -> FloatArray:
+        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
+        transfer = _transfer(self.kernel, record_length(waveforms.shape[1]))
+        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+
+    def describe(self) -> Mapping[str, float]:
+        """Mean and standard deviation of the kernel, and tail slope."""
+        time = np.arange(len(self.kernel)) * self.dt_ns
+        mean = float(self.kernel @ time)
+        variance = float(self.kernel @ (time - mean) ** 2)
+        return {
+            "kernel_mean_ns": mean - LEAD * self.dt_ns,
+            "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
+            "tail_slope_per_ms": self.tail_slope_per_ms,
+        }
+
+
+def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
+    """Superpulses of currents, aligned and sliced by their responses."""
+    steps = np.cumsum(response, axis=1)
+    half_times = crossing(steps, 0.5)
+    return superpulses(spectra, half_times, slices(response), response.shape[1])
+
+
+def _kernel(data: Superpulses, sim: Superpulses, length: int) -> Values:
+    """Regularised ratio as weights around zero delay with a sum of 1."""
+    power = (np.abs(data.spectra) ** 2).sum(axis=0)
+    wiener = np.clip(1 - data.error.sum(axis=0) / power, 0, 1)
+    below = (np.abs(sim.spectra) ** 2 + sim.error).sum(axis=0)
+    ratio = wiener * (data.spectra * sim.spectra.conj()).sum(axis=0) / below
+    weights = np.roll(scipy.fft.irfft(ratio, length), LEAD)[: LEAD + LAG]
+    weights[:FADE_IN] *= _fade(FADE_IN)
+    weights[-FADE_OUT:] *= _fade(FADE_OUT)[::-1]
+    return np.asarray(weights / weights.sum(), float)
+
+
+def _fade(samples: int) -> Values:
+    return np.asarray(np.sin(0.5 * np.pi * (np.arange(samples) + 0.5) / samples) ** 2, float)
+
+
+def _transfer(kernel: Values, length: int) -> Spectrum:
+    around_zero = np.zeros(length)
+    around_zero[: len(kernel)] = kernel
+    return np.asarray(scipy.fft.rfft(np.roll(around_zero, -LEAD)), complex)

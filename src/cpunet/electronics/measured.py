@@ -1,0 +1,173 @@
+"""Noise and pile-up tails of the measured side, from its baselines."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_tails import DrawnTails, passing
+from cpunet.electronics.finishing import PADDING_BEFORE
+from cpunet.electronics.pile_up_tails import PileUpTails
+from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.loading import InputSet
+from cpunet.recipes.schema import PreparationConfig
+
+log = logging.getLogger(__name__)
+
+LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is stored
+NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
+MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
+
+
+class FoundTails(NamedTuple):
+    """Pile-up tails in measured traces.
+
+    Parameters
+    ----------
+    measured
+        Pile-up tails in the traces; None if they cannot be estimated.
+    drawn
+        Distribution to draw from; None if the existence of tails is not certain.
+    told
+        Entry of ``run.json``: what was measured, even if the existence of tails is not
+        certain.
+    """
+
+    measured: PileUpTails | None
+    drawn: DrawnTails | None
+    told: dict[str, Any]
+
+
+def find_tails(data: InputSet, config: PreparationConfig) -> FoundTails:
+    """Measure the tails in the data of a training, and note what was found.
+
+    Parameters
+    ----------
+    data
+        Measured pulses that passed the cuts, with the baselines of their file.
+    config
+        Preparation of the pulses.
+    """
+    found, reason = tails_of(data)
+    if found is None:
+        log.info(f"pile-up tails are not measured: {reason}")
+        return FoundTails(None, None, {"missing": reason})
+    drawn = drawn_like(found, data, config)
+    told = found.describe() | {"sizes": _sizes(found), "drawn": drawn.describe()}
+    if found.law is None:
+        return FoundTails(found, None, told)
+    tenth = told["percent_above"]["10_kev"]["law"]
+    alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
+    log.info(
+        f"pile-up tails: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
+        f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are given "
+        "them"
+    )
+    return FoundTails(found, drawn, told)
+
+
+def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
+    """Pile-up tails of the data and None, or None and why they cannot be estimated."""
+    try:
+        return PileUpTails.of(_baselines(data)), None
+    except CpunetError as error:
+        return None, str(error)
+
+
+def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) -> DrawnTails:
+    """Distribution of tails like that of the data after their quality cuts.
+
+    Parameters
+    ----------
+    tails
+        Pile-up tails measured in the data.
+    data
+        Measured pulses that passed the cuts.
+    config
+        Preparation of the pulses.
+    """
+    windows, whole = data.prepared.pulses.waveforms, _baselines(data).whole
+    begins = (
+        float(np.median(data.prepared.align_sample)) - config.samples_before - PADDING_BEFORE
+    )
+    passed = None
+    if data.cuts is not None and whole is not None and tails.law is not None:
+        passed = passing(tails, whole, config, data.cuts)
+    return DrawnTails(
+        law=tails.fit.law,
+        height=float(np.median(windows.max(axis=1))),
+        lead_us=begins * data.dt_ns * 1e-3,
+        dt_ns=data.dt_ns,
+        passed=passed,
+        decay_error_us=tails.decay_error_us,
+    )
+
+
+def measured_noise(
+    data: InputSet, config: PreparationConfig, tails: PileUpTails | None = None
+) -> tuple[BaselineNoise, str | None]:
+    """Measure the noise of the data, from prepared windows if baselines are too short.
+
+    Parameters
+    ----------
+    data
+        Measured pulses, with the baselines of their file.
+    config
+        Preparation of the pulses.
+    tails
+        Pile-up tails in the traces; baselines with tails are left out.
+
+    Returns
+    -------
+    tuple
+        Noise, and a remark on it or None.
+
+    Raises
+    ------
+    CpunetError
+        If neither traces nor windows have enough flat baselines.
+    """
+    try:
+        return noise_of(data, tails), None
+    except CpunetError as error:
+        half = config.baseline_samples // 2
+        noise = BaselineNoise.from_windows(data.prepared.pulses, half)
+        return noise, f"noise is taken from {half} samples a pulse: {error}"
+
+
+def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
+    """Measure the noise from the raw samples before the pulses.
+
+    If traces have pile-up tails, only those at the level of empty baselines are
+    used.
+
+    Raises
+    ------
+    CpunetError
+        If the baselines are too few or too short.
+    """
+    baselines = _baselines(data)
+    first = baselines.first
+    known = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
+    known[NOISE_TRACES:] = False
+    if tails is not None and tails.law is not None:
+        empty = known & tails.empty(first)
+        known = empty if empty.sum() >= MIN_EMPTY else known
+    return BaselineNoise.of(baselines, known)
+
+
+def _baselines(data: InputSet) -> Baselines:
+    assert data.baselines is not None  # these are measured pulses
+    return data.baselines
+
+
+def _sizes(tails: PileUpTails) -> dict[str, list[float]]:
+    """Percentages of the traces above sizes in keV, for a figure."""
+    kev = np.geomspace(max(tails.error_kev, 0.01), LARGEST_KEV, SIZES)
+    told = np.sort(tails.kev[np.isfinite(tails.kev)])
+    above = 1 - np.searchsorted(told, kev, side="right") / max(len(told), 1)
+    return {"kev": kev.round(4).tolist(), "percent_above": (100 * above).round(3).tolist()}

@@ -1,0 +1,419 @@
+r"""Pile-up tails under raw traces, from the level and slope of their baselines.
+
+A tail of height :math:`A` above the level of an empty baseline follows
+:math:`A e^{-t/\tau}`. It raises the baseline and tilts it. With a DC-coupled amplifier the
+*level* is the more precise measure, since levels vary little between traces. Level and slope
+are weighted by their errors. These come from the lower side of each distribution, which the
+tails do not affect. Large tails also give the decay time: the means of the two halves of
+their baselines, a time :math:`h` apart, have a ratio of :math:`e^{h/\tau}`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.electronics.exponentials import FloatArray
+from cpunet.electronics.tails_fit import RateFit, fit_rate
+from cpunet.electronics.tails_law import TailsLaw
+from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.container import Pulses
+
+MIN_BASELINES = 30  # minimum number of baselines
+SIGMA_PER_MAD = 1.4826
+MIN_LARGE = 20  # minimum number of large tails to determine coupling and decay time
+# A baseline whose level differs by more than this factor from what its tilt implies is not
+# that of a tail.
+COUPLED = 2.5
+# Number of Gaussian standard deviations of the residual RMS beyond which a baseline holds
+# another pulse.
+DISTURBED = 6.0
+MIN_SAMPLES = 64  # minimum length of a baseline
+
+
+class UsableBaselines(NamedTuple):
+    """Baselines of one length, in ADC counts, and what is known of their traces."""
+
+    values: FloatArray
+    energy_kev: FloatArray
+    adc_per_kev: float
+    tail_decay_us: float
+    dt_ns: float
+
+
+def usable(baselines: Baselines) -> UsableBaselines:
+    """Baselines as pile-up tails are measured from them.
+
+    Raises
+    ------
+    CpunetError
+        If too few traces can be prepared or have a known energy, the baselines are too short,
+        or the pulses do not decay.
+    """
+    prepared, length = baselines.prepared, baselines.length
+    if len(prepared) < MIN_BASELINES:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+        raise CpunetError(
+            f"only {len(prepared)} of {len(baselines)} traces can be prepared "
+            f"({reasons or 'there are no more'}); {MIN_BASELINES} or more are needed to tell "
+            "pile-up tails"
+        )
+    if length < MIN_SAMPLES:
+        raise CpunetError(
+            f"the traces have {length} samples before the pulse; pile-up tails "
+            f"need {MIN_SAMPLES} or more, so give traces with a longer baseline"
+        )
+    with np.errstate(divide="ignore"):  # an energy of 0 is left out
+        gains = baselines.height / prepared.pulses.energy_kev
+    gains = gains[np.isfinite(gains) & (gains > 0)]
+    if len(gains) < MIN_BASELINES:
+        raise CpunetError(
+            f"only {len(gains)} traces have a known energy and can be prepared; "
+            f"{MIN_BASELINES} or more are needed to tell pile-up tails in keV"
+        )
+    large = prepared.scale >= np.median(prepared.scale)
+    slope = float(np.median(prepared.tail_slope[large]))
+    if not slope < 0:
+        raise CpunetError(
+            "the tails of the traces do not decay, so nothing is known of earlier pulses; "
+            "are these measured traces?"
+        )
+    return UsableBaselines(
+        baselines.first.waveforms[:, :length].astype(float),
+        baselines.first.energy_kev,
+        float(np.median(gains)),
+        -1e3 / slope,
+        baselines.first.dt_ns,
+    )
+
+
+def tail_shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:
+    """Decay of a tail that is 1 at the first sample, shape ``(length,)``."""
+    return np.asarray(np.exp(-np.arange(length) * dt_ns * 1e-3 / decay_us), float)
+
+
+def read_baselines(
+    baselines: FloatArray, dt_ns: float, decay_us: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    r"""Mean of each baseline, the tail from its tilt, and the residual RMS.
+
+    The tail is the least-squares height :math:`A` of
+
+    .. math:: b_j = c + A e^{-t_j / \tau},
+
+    with a free level :math:`c`. Its height refers to the first sample.
+
+    Parameters
+    ----------
+    baselines
+        First samples of the traces, shape ``(n, samples)``.
+    dt_ns
+        Sampling period in ns.
+    decay_us
+        Decay time in us.
+
+    Returns
+    -------
+    tuple of array
+        Mean, tail and RMS in the units of the baselines, each of shape ``(n,)``.
+
+    Examples
+    --------
+    >>> tail = 100 + 7 * np.exp(-np.arange(500) * 0.016 / 50)
+    >>> _, left, width = read_baselines(tail[np.newaxis], 16.0, 50.0)
+    >>> round(float(left[0]), 6), bool(width[0] < 1e-9)
+    (7.0, True)
+    """
+    shape = tail_shape(baselines.shape[1], dt_ns, decay_us)
+    lever = shape - shape.mean()
+    with np.errstate(invalid="ignore", over="ignore"):
+        mean = baselines.mean(axis=1)
+        left = baselines @ lever / (lever @ lever)
+        width = (baselines - mean[:, np.newaxis] - left[:, np.newaxis] * lever).std(axis=1)
+    return mean, left, np.where(np.isfinite(width), width, np.inf)
+
+
+def widest(width: FloatArray) -> float:
+    """RMS beyond which a baseline holds another pulse."""
+    finite = width[np.isfinite(width)]
+    if len(finite) < MIN_BASELINES:
+        raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
+    centre = float(np.median(finite))
+    sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))
+    return centre + max(DISTURBED * sigma, 0.1 * centre)
+
+
+def mode(values: FloatArray) -> float:
+    """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
+    ordered = np.sort(values)
+    while len(ordered) > 8:
+        half = len(ordered) // 2
+        first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
+        ordered = ordered[first : first + half + 1]
+        if ordered[-1] == ordered[0]:
+            break
+    return float(ordered.mean())
+
+
+def lower_spread(values: FloatArray) -> float:
+    """Standard deviation of the side below 0, which tails do not affect."""
+    below = -values[values <= 0]
+    return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
+
+
+def lifted(above: FloatArray, left: FloatArray) -> bool:
+    """Whether tilted baselines are as high as their tilt implies, as with DC coupling."""
+    if len(above) < MIN_LARGE:
+        return False
+    ratio = float(np.median(above[:, : above.shape[1] // 4].mean(axis=1) / left))
+    return 1 / COUPLED < ratio < COUPLED
+
+
+def own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None:
+    """Decay time from the two halves of tilted baselines, and its error, in us."""
+    half = above.shape[1] // 2
+    first, second = above[:, :half].mean(axis=1), above[:, half : 2 * half].mean(axis=1)
+    whole = (first > 0) & (second > 0)
+    fall = np.log(first[whole] / second[whole])
+    middle = float(np.median(fall)) if whole.sum() >= MIN_LARGE else 0.0
+    if not middle > 0:
+        return None
+    error = 1.2533 * SIGMA_PER_MAD * float(np.median(np.abs(fall - middle)))
+    decay = half * dt_ns * 1e-3 / middle
+    return decay, decay * error / middle / float(np.sqrt(len(fall)))
+
+
+LARGE = 12.0  # minimum height in errors of tails used for the decay time
+# If a larger fraction of traces has tails above the error, noise is measured only from
+# traces with tails below 0, at the cost of half of the noise.
+MANY = 0.1
+LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
+# The rate is significant above SURE errors, with a log-likelihood gain above SURE_GAIN.
+SURE, SURE_GAIN = 4.0, 12.0
+MAX_FULL = 0.97  # maximum fraction of traces with a tail larger than the error
+MIN_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
+SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
+
+
+@dataclass(frozen=True, eq=False)
+class PileUpTails:
+    """Tails measured under the traces of a channel, and their law.
+
+    Parameters
+    ----------
+    kev
+        Tail at the first sample of each measured trace in keV. NaN where it cannot be
+        determined.
+    error_kev
+        Standard deviation of the tails in keV.
+    coupled
+        Whether the levels are used in addition to the slopes.
+    level_weight
+        Weight of the tail from the level. That of the slope is the complement.
+    level_error_kev
+        Standard deviation of the tail from the level alone, in keV.
+    decay_us, decay_error_us
+        Decay time of the tails and its error in us. The error is None if the decay time
+        is that of the pulses' tails.
+    baseline_adc, adc_per_kev
+        Level of an empty baseline in ADC counts, and gain in ADC counts per keV.
+    widest_adc
+        Maximum RMS, about its tail, of a baseline without another pulse.
+    fit
+        Fit of the law.
+    samples
+        Number of samples used of each baseline.
+    dt_ns
+        Sampling period in ns.
+    """
+
+    kev: FloatArray
+    error_kev: float
+    coupled: bool
+    level_weight: float
+    level_error_kev: float
+    decay_us: float
+    decay_error_us: float | None
+    baseline_adc: float
+    adc_per_kev: float
+    widest_adc: float
+    fit: RateFit
+    samples: int
+    dt_ns: float
+
+    def empty(self, raw: Pulses) -> npt.NDArray[np.bool_]:
+        """Select traces without tails, from whose baselines noise can be measured.
+
+        If levels are precise, these are the traces with a level close to that of an empty
+        baseline. No condition is placed on the slopes, so that noise alone determines them.
+        Otherwise, if many traces have tails, those with a measured tail of 0 or less are
+        selected: by symmetry, the noise on this side has the power of all noise, while tails
+        are mostly on the other side. If few traces have tails, all are selected.
+        """
+        if not self.coupled or self.level_weight < LEVEL_TELLS:
+            if float(self.fit.law.share_above(self.error_kev)) < MANY:
+                return np.ones(len(raw), bool)
+            return np.asarray(np.nan_to_num(self.measure(raw), nan=np.inf) <= 0)
+        level = raw.waveforms[:, : self.samples].mean(axis=1)
+        shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
+        highest = self.baseline_adc + self.level_error_kev * self.adc_per_kev * shape
+        return np.asarray(level < highest)
+
+    @property
+    def law(self) -> TailsLaw | None:
+        """The law, or None if the tails are not significant."""
+        sure = self.fit.law.rate_khz > SURE * self.fit.rate_error_khz
+        return self.fit.law if sure and self.fit.gain_of_law > SURE_GAIN else None
+
+    @classmethod
+    def of(cls, baselines: Baselines, decay_us: float | None = None) -> PileUpTails:
+        """Measure the tails under raw traces and fit their law.
+
+        Parameters
+        ----------
+        baselines
+            Baselines of measured traces of one channel, from any mixture of peaks.
+        decay_us
+            Decay time of the preamplifier in us, if known. Otherwise it is taken from large
+            tails or, if there are none, from the tails of the pulses.
+
+        Raises
+        ------
+        CpunetError
+            If the baselines are too short, the energies are unknown, or too few traces can
+            be used.
+        """
+        seen = usable(baselines)
+        decay = decay_us or seen.tail_decay_us
+        mean, left, quiet, broadest = _read(seen, decay)
+        level = mode(mean[quiet])
+        tilted = left > LARGE * lower_spread(left[quiet])
+        large = seen.values[quiet & tilted] - level
+        coupled = lifted(large, left[quiet & tilted])
+        own = own_decay_us(large, seen.dt_ns) if coupled else None
+        error: float | None = None
+        if own is not None and decay_us is None:
+            decay, error = own
+            mean, left, quiet, broadest = _read(seen, decay)
+        samples = seen.values.shape[1]
+        height = tail_shape(samples, seen.dt_ns, decay).mean() * seen.adc_per_kev
+        of_slope, of_level = left / seen.adc_per_kev, (mean - level) / height
+        slope_error = lower_spread(of_slope[quiet])
+        level_error = lower_spread(of_level[quiet]) if coupled else np.inf
+        weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
+        kev = (1 - weight) * of_slope + weight * of_level
+        guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
+        fit = fit_rate(kev[quiet], guess, decay, seen.energy_kev)
+        _require_empty(fit)
+        return cls(
+            kev=np.where(quiet, kev - fit.level_kev, np.nan),
+            error_kev=fit.sigma_kev,
+            coupled=coupled,
+            level_weight=weight,
+            level_error_kev=level_error,
+            decay_us=decay,
+            decay_error_us=error,
+            baseline_adc=level + (fit.level_kev / weight * height if coupled else 0.0),
+            adc_per_kev=seen.adc_per_kev,
+            widest_adc=broadest,
+            fit=fit,
+            samples=samples,
+            dt_ns=seen.dt_ns,
+        )
+
+    def measure(self, raw: Pulses) -> FloatArray:
+        r"""Tail at the first sample of raw traces in keV; NaN where undetermined.
+
+        It is the weighted mean of the tails from slope and level,
+
+        .. math:: A = (1 - w)\, A_{\mathrm{slope}} + w\, \frac{\bar{b} - b_0}{\bar{e}},
+
+        with the mean :math:`\bar{b}` of the baseline, the level :math:`b_0` of an empty one and
+        the mean :math:`\bar{e}` of :math:`e^{-t/\tau}` over the baseline.
+        """
+        baselines = np.asarray(raw.waveforms[:, : self.samples], float)
+        mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
+        kev = (1 - self.level_weight) * left / self.adc_per_kev
+        if self.coupled:
+            shape = tail_shape(self.samples, self.dt_ns, self.decay_us)
+            height = shape.mean() * self.adc_per_kev
+            kev += self.level_weight * (mean - self.baseline_adc) / height
+        else:
+            kev -= self.fit.level_kev
+        return np.where(width <= self.widest_adc, kev, np.nan)
+
+    def describe(self) -> dict[str, Any]:
+        """Summary: the rate, its error, and fractions of traces above several thresholds.
+
+        The measured fractions include the effect of the measurement error. Those of the law
+        do not.
+        """
+        told = self.kev[np.isfinite(self.kev)]
+        law, surely = self.fit.law, self.law is not None
+        of_law = law.share_above(SHARES_KEV) if surely else np.zeros(len(SHARES_KEV))
+        return {
+            "rate_khz": law.rate_khz if surely else 0.0,
+            "rate_error_khz": self.fit.rate_error_khz,
+            "decay_us": self.decay_us,
+            "decay_error_us": self.decay_error_us,
+            "error_kev": self.error_kev,
+            "told_by": "level and slope" if self.coupled else "slope",
+            "energies": "recorded" if self.fit.recorded else "learned from the tails",
+            "traces": len(told),
+            "not_told": len(self.kev) - len(told),
+            "percent_above": {
+                f"{kev:g}_kev": {
+                    "measured": round(100 * float((told > kev).mean()), 2),
+                    "law": round(100 * float(share), 2),
+                }
+                for kev, share in zip(SHARES_KEV, of_law, strict=True)
+            },
+        }
+
+    def subtracted_from(self, raw: Pulses) -> Pulses:
+        """Traces with their tails subtracted; unchanged where these are undetermined."""
+        decay = tail_shape(raw.length, self.dt_ns, self.decay_us)
+        heights = np.nan_to_num(self.measure(raw)) * self.adc_per_kev
+        less = np.asarray(raw.waveforms - heights[:, np.newaxis] * decay, np.float32)
+        return raw.with_waveforms(less)
+
+
+def tails_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Names and texts for the result of `PileUpTails.describe`."""
+    if not told["rate_khz"]:
+        return [("pile-up tails", "none that are certain")]
+    shares = ", ".join(
+        f"{share['measured']:.3g} % above {size.partition('_')[0]} keV"
+        for size, share in told["percent_above"].items()
+    )
+    rate = f"{told['rate_khz']:.3g} ± {told['rate_error_khz']:.2g} kHz"
+    by = f"told by {told['told_by']}, error {told['error_kev']:.2g} keV"
+    return [
+        ("pile-up tails", f"{rate}, decaying with {told['decay_us']:.3g} µs"),
+        ("", f"{shares} ({by})"),
+    ]
+
+
+def _read(
+    seen: UsableBaselines, decay_us: float
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
+    """Mean of each baseline, tail, whether it holds no other pulse, and largest RMS."""
+    mean, left, width = read_baselines(seen.values, seen.dt_ns, decay_us)
+    broadest = widest(width)
+    return mean, left, width <= broadest, broadest
+
+
+def _require_empty(fit: RateFit) -> None:
+    """Raise a `CpunetError` if no baseline is empty, so that there is no reference level."""
+    # no curvature despite a rate: the fit did not find the level of empty baselines
+    blind = fit.law.expected > MIN_EXPECTED and not fit.rate_error_khz > 0
+    if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
+        raise CpunetError(
+            "nearly all traces lie on pile-up tails, so that the level of an empty "
+            "baseline is not seen and they cannot be measured; measure at a lower rate"
+        )

@@ -1,0 +1,153 @@
+"""Independent work in several processes, one thread each; one failure does not stop the others.
+
+What is made does not depend on the number of processes: with one, the work is done here, with
+one thread as well, since the last bits of a network depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from logging.handlers import QueueHandler
+from queue import SimpleQueue
+from types import FrameType
+from typing import Any, TypeVar
+
+from cpunet.errors import CpunetError
+from cpunet.kernels import use_threads
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def usable_cores() -> int:
+    """Cores that this process may use; no more than ``OMP_NUM_THREADS``, if that is set."""
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux only
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores, int(asked)) if asked.isdecimal() and int(asked) else cores
+
+
+def outcomes(
+    make: Callable[[], Callable[[T], R]], tasks: Sequence[T], jobs: int, *, once: bool = False
+) -> Generator[tuple[T, R | CpunetError]]:
+    """Yield each task with its result, or the error it failed with, as they arrive.
+
+    Parameters
+    ----------
+    make
+        Called once in each process; returns the function that does a task.  It, the tasks and
+        the results are pickled.
+    tasks
+        What to do.
+    jobs
+        Processes, at most; they end when the generator is closed.
+    once
+        Log a message once, however many tasks have it.
+
+    Raises
+    ------
+    CpunetError
+        If a process is ended from outside.
+    """
+    if (jobs := min(jobs, len(tasks))) > 1:
+        yield from _in_processes(make, tasks, jobs, once)
+        return
+    import torch  # imported late: seconds
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        work = make()
+        for task in tasks:
+            yield task, _outcome(partial(work, task))
+    finally:
+        torch.set_num_threads(before)
+
+
+def _outcome(result: Callable[[], R]) -> R | CpunetError:
+    try:
+        return result()
+    except (CpunetError, OSError) as error:
+        return CpunetError(str(error))
+
+
+def _in_processes(
+    make: Callable[[], Callable[[T], R]], tasks: Sequence[T], jobs: int, once: bool
+) -> Generator[tuple[T, R | CpunetError]]:
+    context = multiprocessing.get_context("spawn")  # torch does not survive a fork
+    others = {*multiprocessing.active_children()}
+    noted: set[str] = set()
+    left: dict[Future[tuple[Any, list[logging.LogRecord]]], T] = {}
+    with ProcessPoolExecutor(jobs, context, _begin, (make,)) as pool:
+        try:
+            left |= {pool.submit(_work, task): task for task in tasks}
+            while left:
+                for future in wait(left, return_when=FIRST_COMPLETED).done:
+                    outcome, records = future.result()
+                    for record in records:
+                        logger = logging.getLogger(record.name)
+                        if not (once and record.msg in noted) and logger.isEnabledFor(
+                            record.levelno
+                        ):
+                            logger.handle(record)
+                        noted.add(record.msg)
+                    yield left.pop(future), outcome
+        except BrokenProcessPool as error:
+            raise CpunetError(
+                "a process was ended, perhaps for lack of memory; use fewer processes "
+                "(OMP_NUM_THREADS, or `jobs`), and continue with `resume`"
+            ) from error
+        finally:
+            if left:
+                for process in {*multiprocessing.active_children()} - others:
+                    process.terminate()
+                pool.shutdown(cancel_futures=True)
+
+
+# in a process of the pool: its work, and the messages that it has for its parent
+_do: Callable[[Any], Any]
+_messages: SimpleQueue[logging.LogRecord] = SimpleQueue()
+
+
+def _begin(make: Callable[[], Callable[[Any], Any]]) -> None:
+    """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _leave)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    use_threads(1)
+    global _do
+    _do = make()
+    logger = logging.getLogger("cpunet")
+    logger.addHandler(QueueHandler(_messages))
+    logger.setLevel(logging.INFO)
+    logging.getLogger("cpunet.progress").setLevel(logging.ERROR)  # the parent counts tasks
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
+    """End in a way that removes what is being written."""
+    signal.signal(number, signal.SIG_IGN)  # the pool repeats it
+    sys.exit(128 + number)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _work(task: Any) -> tuple[Any, list[logging.LogRecord]]:
+    try:
+        outcome = _outcome(partial(_do, task))
+    except SystemExit:  # which the pool would take for an outcome
+        os._exit(1)
+    return outcome, [_messages.get() for _ in range(_messages.qsize())]

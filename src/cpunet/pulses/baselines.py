@@ -1,0 +1,117 @@
+"""What noise and pile-up tails need of raw traces, kept while these are read once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import FloatColumn, Prepared, prepare
+from cpunet.recipes.schema import PreparationConfig
+
+TRACES = 16384  # whose baselines are kept
+WHOLE = 1024  # traces of the selected energies that are kept as a whole
+SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
+KEPT_SHARE = 0.5  # the same for those kept, since those of some of the traces may be longer
+# Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
+START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
+
+Rows = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Baselines:
+    """First samples and properties of the first traces of a channel, of any energy.
+
+    Parameters
+    ----------
+    first
+        First samples of each trace, in ADC counts, with its energy.
+    prepared
+        Those that can be prepared, without their windows.
+    before
+        Number of samples that safely precede the pulse of each prepared trace.
+    height
+        Height of each prepared pulse in ADC counts.
+    length
+        Number of samples that precede nearly all pulses.
+    whole
+        Whole traces that have passed the quality cuts; None if there were no cuts.
+    """
+
+    first: Pulses
+    prepared: Prepared
+    before: Rows
+    height: FloatColumn
+    length: int
+    whole: Pulses | None = None
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @classmethod
+    def of(cls, blocks: Iterable[Pulses], config: PreparationConfig) -> Self:
+        """Baselines of raw traces, of which no more are read than are needed.
+
+        Parameters
+        ----------
+        blocks
+            Measured traces of one channel with their energies, from any mixture of peaks.
+        config
+            Preparation settings.
+        """
+        parts: list[Self] = []
+        for raw in blocks:
+            parts.append(cls.of_block(raw, config, *parts[:1]))
+            if sum(map(len, parts)) >= TRACES:
+                break
+        return cls.concatenate(parts)
+
+    @classmethod
+    def of_block(
+        cls, raw: Pulses, config: PreparationConfig, like: Baselines | None = None
+    ) -> Self:
+        """Baselines of some traces, as long as those of the first ones."""
+        prepared = prepare(raw, config, "measured")
+        before = samples_before_pulses(prepared, config)
+        if like is not None:
+            length, kept = like.length, like.first.length
+        else:
+            shares = np.quantile(before if len(before) else [0], (SHORTEST_SHARE, KEPT_SHARE))
+            length, kept = (max(int(samples), 0) for samples in shares)
+        windows = prepared.pulses.waveforms
+        return cls(
+            first=raw.with_waveforms(raw.waveforms[:, :kept].copy()),
+            prepared=replace(
+                prepared, pulses=prepared.pulses.with_waveforms(windows[:, :0].copy())
+            ),
+            before=before,
+            height=windows.max(axis=1) * prepared.scale,
+            length=length,
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Baselines], whole: Pulses | None = None) -> Self:
+        """Baselines of consecutive blocks."""
+        return cls(
+            first=Pulses.concatenate([part.first for part in parts]),
+            prepared=Prepared.concatenate([part.prepared for part in parts]),
+            before=np.concatenate([part.before for part in parts]),
+            height=np.concatenate([part.height for part in parts]),
+            length=parts[0].length,
+            whole=whole,
+        )
+
+
+def samples_before_pulses(prepared: Prepared, config: PreparationConfig) -> Rows:
+    """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
+    windows = prepared.pulses.waveforms[:, : config.samples_before]
+    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+    above = windows >= level[:, np.newaxis]
+    # Start of the pulse proper: every sample from there to the alignment is above threshold.
+    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
+    return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)

@@ -1,0 +1,330 @@
+"""Pile-up tails: their law, what is measured under known ones, and what is drawn."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.chain import read_electronics
+from cpunet.electronics.drawn_tails import (
+    SIZES_KEV,
+    DrawnTails,
+    SameNoise,
+    TraceNoise,
+    passing,
+)
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
+from cpunet.electronics.readout import RawTraces, read_out
+from cpunet.electronics.tails_fit import fit_rate
+from cpunet.electronics.tails_law import (
+    TailsLaw,
+    characteristic_exponents,
+    energies_at,
+)
+from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.cuts import apply_cuts, fit_cuts
+from cpunet.pulses.preparation import prepare
+from cpunet.pulses.reading.opening import open_pulses
+from cpunet.recipes import load_recipe
+
+TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
+
+
+def test_share_above_is_the_closed_form():
+    law = TailsLaw(2.0, 50.0, (100, 100))
+    expected = 1 - np.exp(-0.1 * np.log([100, 10, 1]))
+    assert law.share_above([1, 10, 100]) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("rate_khz", [0.3, 3.0])
+def test_drawn_tails_have_the_characteristic_function_of_the_law(rate_khz: float):
+    law = TailsLaw(rate_khz, 54.6, TH228)
+    drawn = law.draw(100_000, np.random.default_rng(1))
+    assert drawn.mean() == pytest.approx(law.mean_kev, rel=0.1)
+    u = np.geomspace(1e-3, 0.5, 10)
+    energies = energies_at((np.arange(1000) + 0.5) / 1000, TH228)
+    wanted = np.exp(law.expected * characteristic_exponents(u, energies).mean(axis=1))
+    found = np.exp(1j * u[:, np.newaxis] * drawn).mean(axis=1)
+    np.testing.assert_allclose(found, wanted, atol=0.01)  # three errors of either part
+
+
+def test_energies_follow_their_quantiles():
+    drawn = energies_at(np.random.default_rng(2).random(20_000), TH228)
+    assert np.quantile(drawn, np.linspace(0, 1, 11)) == pytest.approx(TH228, rel=0.05)
+
+
+@pytest.mark.parametrize("error_kev", [pytest.param(0.3, marks=pytest.mark.thorough), 3.0])
+def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
+    law, rng = TailsLaw(1.5, 54.6, TH228), np.random.default_rng(3)
+    energies = energies_at(rng.random(8000), TH228)
+    measured = law.draw(8000, rng) + rng.normal(0, error_kev, 8000)
+    found = fit_rate(measured, error_kev, 54.6, energies)
+    assert found.recorded
+    assert found.law.rate_khz == pytest.approx(1.5, abs=3 * found.rate_error_khz)
+    assert found.sigma_kev == pytest.approx(error_kev, rel=0.05)
+
+
+def test_too_many_earlier_pulses_are_refused_before_they_fill_the_memory():
+    endless = TailsLaw(0.02, 1e12, TH228)
+    with pytest.raises(CpunetError, match="give a lower rate or a shorter decay"):
+        endless.draw(1000, np.random.default_rng(1))
+
+
+PREPARATION = load_recipe("fast").preparation
+N = 3000
+
+
+def traces_of(
+    rate_khz: float, preset: str = "ornl", broad: bool = False, pile_up_khz: float = 0.4
+) -> RawTraces:
+    rng = np.random.default_rng(1)
+    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (N, 1)), 0, 1)
+    energy = rng.choice([1592.5, 2103.5, 2614.5], N)
+    rates = {"earlier_pulses.rate_kHz": rate_khz, "pile_up.rate_kHz": pile_up_khz}
+    chain = read_electronics(preset, rates)
+    if broad:
+        energy = np.exp(rng.uniform(np.log(100), np.log(2614), N))
+        chain = chain.model_copy(update={"other_pulses_kev": tuple(np.quantile(energy, at))})
+    return read_out(Pulses.of(ramps, dt_ns=4, energy_kev=energy), chain, seed=2)
+
+
+at = np.linspace(0, 1, 21)
+
+
+def as_pulses(traces: RawTraces, rows: slice = slice(None)) -> Pulses:
+    return Pulses.of(
+        traces.waveforms[rows], dt_ns=traces.dt_ns, energy_kev=traces.energy_kev[rows]
+    )
+
+
+def in_blocks(raw: Pulses, size: int = 1000) -> Iterator[Pulses]:
+    return (raw[slice(first, first + size)] for first in range(0, len(raw), size))
+
+
+@pytest.fixture(scope="module")
+def busy() -> RawTraces:
+    return traces_of(1.0)
+
+
+@pytest.fixture(scope="module")
+def found(busy: RawTraces) -> PileUpTails:
+    return PileUpTails.of(Baselines.of(in_blocks(as_pulses(busy)), PREPARATION))
+
+
+def test_each_trace_has_its_tail(busy: RawTraces, found: PileUpTails):
+    alone = np.isfinite(found.kev) & (busy.n_piled == 0)
+    off = (found.kev - busy.tails_kev)[alone & (busy.tails_kev < 50)]
+    assert abs(np.median(off)) < 0.3
+    assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.error_kev, rel=0.1)
+    large = alone & (busy.tails_kev > 100)
+    # heights of pulses, not their charge, are the scale: 1.5 % less of `ornl`
+    assert np.median(found.kev[large] / busy.tails_kev[large]) == pytest.approx(1, abs=0.02)
+    assert alone.mean() > 0.9
+
+
+def test_the_decay_is_that_of_the_slowest(found: PileUpTails):
+    assert found.coupled
+    assert found.decay_error_us is not None
+    # tails within the window are 25 % steeper, by the decay of 2.9 us
+    assert found.decay_us == pytest.approx(54.6, rel=0.01)
+
+
+def test_the_rate_is_found_without_the_energies(found: PileUpTails):
+    assert not found.fit.recorded  # the file has lines alone
+    assert found.law is not None
+    assert found.law.rate_khz == pytest.approx(1, abs=3 * found.fit.rate_error_khz)
+    assert found.fit.rate_error_khz < 0.12
+    assert found.describe()["percent_above"]["30_kev"]["law"] == pytest.approx(10.5, abs=1.5)
+
+
+@pytest.mark.thorough
+def test_recorded_energies_are_taken_if_they_do():
+    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.5, broad=True))], PREPARATION))
+    assert found.fit.recorded
+    assert found.law is not None
+    assert found.law.rate_khz == pytest.approx(0.5, abs=3 * found.fit.rate_error_khz)
+
+
+@pytest.mark.parametrize(
+    "preset", [pytest.param("ornl", marks=pytest.mark.thorough), "legend200"]
+)
+def test_nothing_is_invented_where_there_is_nothing(preset: str):
+    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.0, preset))], PREPARATION))
+    assert found.law is None
+    assert found.describe()["rate_khz"] == 0
+
+
+def test_tails_are_taken_off(busy: RawTraces, found: PileUpTails):
+    raw = as_pulses(busy)
+    flat = found.subtracted_from(raw)
+    alone = np.isfinite(found.kev) & (busy.n_piled == 0)
+    slopes = [
+        read_baselines(traces.waveforms[:, : found.samples].astype(float), 16, 54.6)[1]
+        for traces in (raw, flat)
+    ]
+    empty = alone & (busy.tails_kev < 0.01)
+    spread = 1.4826 * np.median(np.abs(slopes[1][alone]))
+    noise = 1.4826 * np.median(np.abs(slopes[0][empty]))
+    # less than noise alone, of which a part is taken for a tail and off
+    assert 0.5 * noise < spread < 1.1 * noise
+    assert slopes[0][alone].std() > 10 * spread
+
+
+def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
+    """Behind a capacitor levels say nothing: here each trace has lost its own."""
+    raw = as_pulses(busy)
+    lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
+    blocks = [raw.with_waveforms(lost.astype(np.float32))]
+    found = PileUpTails.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
+    assert not found.coupled
+    assert found.describe()["told_by"] == "slope"
+    large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)
+    ratio = np.median(found.kev[large] / busy.tails_kev[large])
+    assert ratio == pytest.approx(1, abs=0.1)
+    # noise is measured where slopes are negative: it has all its power, and few tails
+    empty = found.empty(blocks[0])
+    assert (busy.tails_kev[empty] > found.error_kev).mean() < 0.05
+    told = np.isfinite(found.kev) & (busy.tails_kev < 0.2 * found.error_kev)
+    square, alone = found.kev[told & empty] ** 2, found.kev[told] ** 2
+    assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
+
+
+@pytest.mark.thorough
+def test_traces_that_all_lie_on_tails_are_told():
+    with pytest.raises(CpunetError, match="nearly all traces lie on pile-up tails"):
+        PileUpTails.of(Baselines.of([as_pulses(traces_of(3.0, "legend200"))], PREPARATION))
+
+
+@pytest.mark.thorough
+def test_slow_decays_are_told_by_their_levels():
+    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.3, "legend200"))], PREPARATION))
+    assert found.law is not None
+    assert found.law.rate_khz == pytest.approx(0.3, abs=3 * found.fit.rate_error_khz)
+    assert found.decay_us == pytest.approx(570, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda raw: raw[slice(0, 10)], "only 10 of 10 traces can be prepared"),
+        (lambda raw: raw.with_waveforms(-raw.waveforms), "can be prepared"),
+        (lambda raw: raw.with_waveforms(raw.waveforms[:, 430:]), "window_outside_record"),
+        (lambda raw: Pulses.of(raw.waveforms, dt_ns=16), "have a known energy"),
+    ],
+)
+def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: str):
+    with pytest.raises(CpunetError, match=said) as caught:
+        PileUpTails.of(Baselines.of([change(as_pulses(busy, slice(0, 400)))], PREPARATION))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.thorough
+def test_a_bench_detector_follows_the_law(reference_data: Path):
+    source = open_pulses(reference_data / "real" / "th228.fcio", kev_per_adc=2614.5 / 40265)
+    found = PileUpTails.of(Baselines.of(source.blocks(1000), PREPARATION))
+    assert found.law is not None
+    assert found.fit.recorded
+    assert found.decay_us == pytest.approx(85, rel=0.04)
+    assert found.law.rate_khz == pytest.approx(1.4, abs=0.3)
+    shares = found.describe()["percent_above"].values()
+    for share in shares:  # in percent of a thousand traces
+        assert share["measured"] == pytest.approx(share["law"], abs=3)
+
+
+RECIPE = load_recipe("fast")
+LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
+BELOW_30 = tuple(float(kev < 30) for kev in SIZES_KEV)
+DRAWN = DrawnTails(LAW, 0.9, 0.5, 16.0, BELOW_30)
+
+
+def test_what_cuts_take_is_not_drawn():
+    rng = np.random.default_rng(1)
+    kev, all_kev = DRAWN.draw_kev(20_000, rng), DRAWN.uncut().draw_kev(20_000, rng)
+    assert kev.max() < 40
+    assert (all_kev > 40).mean() == pytest.approx(LAW.share_above(40), abs=0.02)
+    # below the cuts it is the same law
+    share = (all_kev > 5).sum() - (all_kev > 20).sum()
+    passed = (all_kev < 30).sum() / len(all_kev)
+    assert ((kev > 5) & (kev < 20)).mean() == pytest.approx(share / len(kev) / passed, rel=0.06)
+
+
+def test_another_rate_is_without_cuts():
+    busy = DRAWN.uncut(20.0)
+    assert busy.passed is None
+    assert busy.draw_kev(4000, np.random.default_rng(1)).mean() == pytest.approx(
+        10 * LAW.mean_kev, rel=0.1
+    )
+
+
+def test_they_are_told_and_read_again():
+    again = DrawnTails.of(json.loads(json.dumps(DRAWN.describe())))
+    assert again.describe() == DRAWN.describe()
+
+
+def test_noise_of_several_methods_is_drawn_once_and_is_what_each_would_draw():
+    noise = TraceNoise(BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50), DRAWN)
+    energies = np.linspace(500.0, 2000.0, 20)
+    # the second as the first; then after another draw, for other pulses, for other records
+    asked = [
+        (1, 0, energies, 600),
+        (1, 0, energies, 600),
+        (1, 1, energies, 600),
+        (1, 0, energies[:9], 600),
+        (1, 0, energies, 700),
+        (2, 0, energies, 700),
+    ]
+    same = SameNoise(noise)
+    for seed, before, kev, length in asked:
+        own, shared = (np.random.default_rng(seed) for _ in range(2))
+        own.random(before), shared.random(before)
+        expected = noise.draw(kev, length, own)
+        found = same.draw(kev, length, shared)
+        np.testing.assert_array_equal(found, expected)
+        assert shared.random() == own.random()
+        found += 1  # the caller's own
+
+
+def test_records_get_noise_and_tails_in_proportion_to_their_energies():
+    noise = BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50)
+    energies = np.repeat([500.0, 2000.0], 4000)
+    rng = np.random.default_rng(3)
+    records = TraceNoise(noise, DRAWN).draw(energies, 600, rng)
+    assert TraceNoise(noise).draw(energies, 600, rng).std() < 1e-3
+    first = records[:, 0] * energies / DRAWN.height
+    for part in (first[:4000], first[4000:]):
+        assert (part > 5).mean() == pytest.approx(
+            (DRAWN.draw_kev(4000, rng) * np.exp(-0.5 / 54.6) > 5).mean(), abs=0.03
+        )
+    large = first > 20
+    ratio = records[large, 500] / records[large, 0]
+    assert ratio == pytest.approx(np.exp(-8 / 54.6), rel=1e-3)
+
+
+@pytest.mark.thorough
+def test_what_passes_is_measured_by_adding_tails_to_traces_without():
+    rng = np.random.default_rng(1)
+    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (2500, 1)), 0, 1)
+    steps = Pulses.of(ramps, dt_ns=4, energy_kev=np.full(2500, 2614.5))
+    traces = read_out(steps, read_electronics("ornl", {"earlier_pulses.rate_kHz": 1}), seed=2)
+    raw = Pulses.of(traces.waveforms, dt_ns=16, energy_kev=traces.energy_kev)
+    prepared = prepare(raw, RECIPE.preparation, "measured")
+    cuts = fit_cuts(prepared, RECIPE.cuts)
+    kept = apply_cuts(prepared, cuts)
+    found = PileUpTails.of(Baselines.of([raw], RECIPE.preparation))
+    passed = passing(found, raw[kept.index], RECIPE.preparation, cuts)
+    assert passed is not None
+    assert passed[0] == 1
+    assert passed[-1] == 0
+    drawn = DrawnTails(found.fit.law, 0.9, 0.0, 16.0, passed)
+    kev, true = drawn.draw_kev(20_000, rng), traces.tails_kev[kept.index]
+    for size in (3, 10, 20):
+        assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)
+    few = passing(found, raw[slice(0, 5)], RECIPE.preparation, cuts)
+    assert few is None

@@ -1,0 +1,257 @@
+"""NumPy, HDF5 that is not LH5, spectra and text of siggen, and what is wrong with files."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.writing import write_pulses
+
+VALUES = np.random.default_rng(2).normal(size=(11, 30)).astype(np.float32)
+ENERGY = np.linspace(500, 3000, 11)
+
+
+def write_npz(path: Path, **arrays) -> Path:
+    np.savez_compressed(path, **arrays)
+    return path
+
+
+def write_hdf5(path: Path, **arrays) -> Path:
+    with h5py.File(path, "w") as h5:
+        for name, values in arrays.items():
+            h5[name] = values
+    return path
+
+
+WRITERS = [(write_npz, "pulses.npz"), (write_hdf5, "pulses.h5")]
+
+
+@pytest.mark.parametrize(("write", "name"), WRITERS)
+@pytest.mark.parametrize("waveform", ["waveform", "waveforms", "values"])
+@pytest.mark.parametrize("dt_ns", [16.0, [16.0], np.full(11, 16.0)])
+@pytest.mark.parametrize("energy", ["energy_kev", "energy_keV"])
+def test_the_usual_names_are_understood(tmp_path, write, name, waveform, dt_ns, energy):
+    arrays = {
+        waveform: VALUES,
+        "dt_ns": dt_ns,
+        energy: ENERGY,
+        "event_number": np.arange(11) * 3,
+    }
+    source = open_pulses(write(tmp_path / name, **arrays))
+    assert (source.n_pulses, source.length, source.dt_ns) == (11, 30, 16.0)
+    blocks = list(source.blocks(4))
+    assert [len(block) for block in blocks] == [4, 4, 3]
+    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), VALUES)
+    np.testing.assert_array_equal(np.concatenate([b.energy_kev for b in blocks]), ENERGY)
+    assert source.read().event_number.tolist() == list(range(0, 33, 3))
+
+
+@pytest.mark.parametrize(("write", "name"), WRITERS)
+def test_an_energy_without_units_is_not_in_kev(tmp_path, write, name):
+    path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, energy=ENERGY)
+    assert np.isnan(open_pulses(path).read().energy_kev).all()
+    np.testing.assert_array_equal(open_pulses(path, kev_per_adc=1).read().energy_kev, ENERGY)
+
+
+def test_a_choice_between_arrays(tmp_path):
+    path = write_npz(tmp_path / "pulses.npz", wf1=VALUES, wf16=VALUES[:, ::2], note="text")
+    with pytest.raises(CpunetError, match=r"2 arrays of two dimensions \(wf1, wf16\); choose"):
+        open_pulses(path, dt_ns=16)
+    assert open_pulses(path, table="wf16", dt_ns=16).length == 15
+    with pytest.raises(CpunetError, match=r"no array wf2 .*; there are wf1, wf16"):
+        open_pulses(path, table="wf2", dt_ns=16)
+
+
+def test_npy_needs_the_period(tmp_path):
+    path = tmp_path / "pulses.npy"
+    np.save(path, VALUES)
+    with pytest.raises(CpunetError, match="period is not in the file; give `dt_ns`"):
+        open_pulses(path)
+    np.testing.assert_array_equal(open_pulses(path, dt_ns=8).read().waveforms, VALUES)
+    for dt_ns in (0, -1, np.nan):
+        with pytest.raises(CpunetError, match=r"dt_ns is .*; expected more than 0"):
+            open_pulses(path, dt_ns=dt_ns)
+
+
+def test_columnwise_arrays_and_objects_beside_the_waveforms(tmp_path):
+    path = write_npz(tmp_path / "pulses.npz", waveform=np.asfortranarray(VALUES), more={"a": 1})
+    read = open_pulses(path, dt_ns=16).read()
+    np.testing.assert_array_equal(read.waveforms, VALUES)
+
+
+def test_simulated_reference_pulses(reference_data: Path):
+    path = reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
+    pulses = open_pulses(path, table="wf16", dt_ns=16).read()
+    with np.load(path) as arrays:
+        np.testing.assert_array_equal(pulses.waveforms, arrays["wf16"])
+
+
+PULSE = np.linspace(0, 1000, 50, dtype=np.float32)
+
+
+def spectrum(rows: np.ndarray) -> bytes:
+    """As siggen's `write_spectrum` lays it out: two Fortran records."""
+    n_rows, length = rows.shape
+    title = struct.pack("<i8siiiii", 24, b"pulse   ", length, n_rows, 1, 1, 24)
+    data = rows.astype("<f4").tobytes()
+    mark = struct.pack("<i", len(data))
+    return title + mark + data + mark
+
+
+def test_a_spectrum_is_a_pulse(tmp_path):
+    path = tmp_path / "pulse.spe"
+    path.write_bytes(spectrum(PULSE[np.newaxis]))
+    with pytest.raises(CpunetError, match="give `dt_ns`"):
+        open_pulses(path)
+    source = open_pulses(path, dt_ns=1)
+    assert (source.n_pulses, source.length, source.dt_ns) == (1, 50, 1)
+    np.testing.assert_array_equal(source.read().waveforms, [PULSE])
+
+
+def test_the_rows_of_a_spectrum_are_pulses(tmp_path):
+    path = tmp_path / "pulses.spe"
+    rows = np.stack([PULSE + i for i in range(5)])
+    path.write_bytes(spectrum(rows))
+    blocks = list(open_pulses(path, dt_ns=1).blocks(2))
+    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), rows)
+
+
+@pytest.mark.parametrize("cut", [40, 100, 235])
+def test_a_cut_off_spectrum(tmp_path, cut):
+    path = tmp_path / "pulse.spe"
+    path.write_bytes(spectrum(PULSE[np.newaxis])[:cut])
+    with pytest.raises(CpunetError, match=r"pulse.spe: is cut off after \d+ of 50 samples"):
+        open_pulses(path, dt_ns=1)
+
+
+def test_time_and_value(tmp_path):
+    path = tmp_path / "pulse.txt"
+    time_ns = np.arange(50) * 1.6
+    np.savetxt(path, np.c_[time_ns, PULSE], header="time [ns] charge", fmt="%.2f")
+    source = open_pulses(path)
+    assert source.dt_ns == pytest.approx(1.6, rel=1e-3)
+    np.testing.assert_allclose(source.read().waveforms[0], PULSE, atol=0.01)
+    with pytest.raises(CpunetError, match="drop `dt_ns`"):
+        open_pulses(path, dt_ns=16)
+
+
+def test_uneven_times_are_refused(tmp_path):
+    path = tmp_path / "pulse.txt"
+    time_ns = np.arange(50.0)
+    time_ns[30:] += 0.5
+    np.savetxt(path, np.c_[time_ns, PULSE])
+    with pytest.raises(CpunetError, match="no evenly rising time"):
+        open_pulses(path)
+
+
+@pytest.mark.parametrize("delimiter", [" ", ",", ", "])
+def test_one_pulse_a_line(tmp_path, delimiter):
+    path = tmp_path / "pulses.csv"
+    rows = np.stack([PULSE + i for i in range(5)])
+    np.savetxt(path, rows, delimiter=delimiter, comments="#", header="pulses")
+    source = open_pulses(path, dt_ns=1)
+    assert (source.n_pulses, source.length) == (None, 50)
+    assert [len(block) for block in source.blocks(2)] == [2, 2, 1]
+    np.testing.assert_array_equal(source.read().waveforms, rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("crystal_length: 96.0\n", r"line 1: 'crystal_length: 96.0' is no line of numbers"),
+        ("# nothing\n\n", "holds no numbers"),
+        ("1 2 3 4 5\n" * 4, "5 numbers are no pulse"),
+        (" ".join("1" * 20) + "\n1 2\n", r"line 2: 2 numbers, before it 20"),
+    ],
+)
+def test_other_text_is_refused(tmp_path, text, message):
+    path = tmp_path / "other.txt"
+    path.write_text(text)
+    with pytest.raises(CpunetError, match=message):
+        open_pulses(path, dt_ns=1).read()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_comments_may_have_any_signs(tmp_path, encoding):
+    path = tmp_path / "pulses.txt"
+    rows = "\n".join(" ".join(f"{v:g}" for v in PULSE) for _ in range(2))
+    path.write_text(f"# steps of 1 µs, ±2 %\n{rows}\n", encoding=encoding)
+    source = open_pulses(path, dt_ns=1)
+    np.testing.assert_allclose(source.read().waveforms, [PULSE, PULSE], rtol=1e-5)
+    path.write_text(f"µ\n{rows}\n", encoding=encoding)
+    with pytest.raises(CpunetError, match="of no known format"):
+        open_pulses(path, dt_ns=1)
+    path.write_bytes(b"#\x00\x01\n" + rows.encode())
+    with pytest.raises(CpunetError, match="of no known format"):
+        open_pulses(path, dt_ns=1)
+
+
+PNG = b"\x89PNG\r\n\x1a\n" + bytes(600)
+
+
+@pytest.mark.parametrize("suffix", [".lh5", ".h5", ".fcio", ".npz", ".npy", ".spe", ".dat", ""])
+@pytest.mark.parametrize("content", [b"", PNG, b"\0" * 700], ids=["empty", "png", "zeros"])
+def test_foreign_files(tmp_path, suffix, content):
+    path = tmp_path / f"file{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(CpunetError, match=r"^[^\n]*file[^\n]*: [^\n]*; [^\n]*$") as error:
+        open_pulses(path, dt_ns=16)
+    assert ("is empty" in str(error.value)) == (content == b"")
+
+
+def test_content_counts_more_than_the_name(tmp_path):
+    pulses = Pulses.of(np.zeros((2, 20)), dt_ns=16)
+    write_pulses(tmp_path / "pulses.npz", pulses)
+    assert open_pulses(tmp_path / "pulses.npz").describe()["format"] == "LH5"
+
+
+def write_all(folder: Path) -> list[Path]:
+    values = np.random.default_rng(3).normal(size=(30, 40)).astype("<f4")
+    pulses = Pulses.of(values, dt_ns=16, energy_kev=np.arange(30.0))
+    write_pulses(folder / "a.lh5", pulses)
+    np.savez(folder / "b.npz", waveform=values, energy_kev=np.arange(30.0))
+    np.savez_compressed(folder / "c.npz", waveform=values)
+    np.save(folder / "d.npy", values)
+    head = struct.pack("<i8siiiiii", 24, b"p" * 8, 40, 30, 1, 1, 24, values.nbytes)
+    (folder / "e.spe").write_bytes(head + values.tobytes() + head[-4:])
+    return sorted(folder.iterdir())
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(fraction=st.floats(0, 0.99), which=st.integers(0, 4))
+def test_any_truncation_is_one_line_naming_the_file(tmp_path_factory, fraction, which):
+    folder = tmp_path_factory.mktemp("cut")
+    path = write_all(folder)[which]
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(fraction * len(whole))])
+    dt_ns = None if path.suffix == ".lh5" else 16
+    with pytest.raises(CpunetError, match=r"^[^\n]+; [^\n]+$") as error:
+        open_pulses(path, dt_ns=dt_ns).read()
+    assert str(error.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [np.zeros(5), np.zeros((5, 4, 4)), np.full((5, 9), b"a")],
+    ids=["1d", "3d", "text"],
+)
+def test_lh5_values_that_are_no_traces(tmp_path, values):
+    path = tmp_path / "file.lh5"
+    write_pulses(path, Pulses.of(np.zeros((5, 20)), dt_ns=16))
+    with h5py.File(path, "r+") as file:
+        old = "geds/sim/waveform/values"
+        attributes = dict(file[old].attrs)
+        del file[old]
+        file[old] = values
+        file[old].attrs.update(attributes)
+    with pytest.raises(CpunetError, match=r"file.lh5: [^\n]*; [^\n]*$"):
+        open_pulses(path)
