@@ -83,7 +83,7 @@ def test_other_pulses_are_added_with_the_noise(run, sim):
     piled = InTracePileUp(
         len(sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
     )
-    drawn = Drawn(generator=ren.seeded(1), second=piled, **energies)
+    drawn = Drawn(generator=ren.seeded(1), piled=piled, **energies)
     result, _ = ren.apply_with_codes(sim, drawn)
     step = result[4] - plain[4]
     # 0.2 of the height of 1, less by the scale: the tail is higher too

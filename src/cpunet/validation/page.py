@@ -288,14 +288,8 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
                 f"{law['at_reference_percent']:.2f}",
             ]
         )
-    head = [
-        "Method",
-        "Slope [% per MeV]",
-        "χ² / degrees",
-        "Width at all energies [%]",
-        "Noise [keV]",
-        f"Width at {REFERENCE_KEV:g} keV [%]",
-    ]
+    head = ["Method", "Slope [% per MeV]", "χ² / degrees", "Width at all energies [%]"]
+    head += ["Noise [keV]", f"Width at {REFERENCE_KEV:g} keV [%]"]
     return joined([_table(head, rows, words={0}), _grid([figure])])
 
 
