@@ -244,7 +244,7 @@ def tails_figure(
     Parameters
     ----------
     summary
-        Result of `Remains.describe`.
+        Result of `PileUpTails.describe`.
     sizes
         ``kev``: sizes in keV; ``percent_above``: percentages of the traces above each.
     energies_kev
@@ -260,7 +260,7 @@ def tails_figure(
         kev, 100 * (share - error), 100 * (share + error), color=COLOURS["data"], alpha=0.3
     )
     axes.loglog(kev, 100 * share, color=COLOURS["data"], label=f"measured, {n:,} traces")
-    law = TailsLaw(float(summary["rate_khz"]), float(summary["decay_us"]), tuple(energies_kev))
+    law = TailsLaw(summary["rate_khz"], summary["decay_us"], tuple(energies_kev))
     axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
     twice = 2 * summary["error_kev"]
     axes.axvline(twice, color="0.6", lw=0.8, ls=":", label="twice the error of a size")
@@ -269,7 +269,7 @@ def tails_figure(
         f"decay {summary['decay_us']:.1f} µs"
     )
     axes.set_ylim(max(30 / n, 0.01), 100)
-    axes.set_xlabel("remainder at the first sample (keV)")
+    axes.set_xlabel("tail at the first sample (keV)")
     axes.set_ylabel("traces above (%)")
     axes.legend()
     return figure
