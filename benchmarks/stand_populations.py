@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.stand_plan import Side, StandPlan
+from cpunet.electronics.stand_sides import Side, stand_sides
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
@@ -37,14 +37,14 @@ def main() -> None:
     print("seed", *NAMES, sep=" | ")
     sides: list[list[Values]] = [[], []]
     for seed in range(first, last + 1):
-        plan = StandPlan.of(
+        sim, data, _ = stand_sides(
             read_electronics("legend200"),
             read_detector("icpc"),
             {FEP: arguments.events},
             shift=Shift.of(["default"]),
             seed=seed,
         )
-        here = [events_of(side) for side in (plan.sim, plan.data)]
+        here = [events_of(side) for side in (sim, data)]
         for all_of_side, events in zip(sides, here, strict=True):
             all_of_side.append(events)
         print(seed, *deviations(*here), sep=" | ", flush=True)

@@ -15,15 +15,15 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numba
 import platformdirs
 import threadpoolctl
-from numba.core import config
+from numba.core import config, entrypoints
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
@@ -51,6 +51,7 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     compiled = numba.njit(nogil=True, **options)(function)
     cache = _Cache(function, parallel=bool(options.get("parallel")))
     compiled._cache = cache  # noqa: SLF001  numba has no public way
+    compiled._compilation_chain_init_hook = lambda: None  # noqa: SLF001  see `_unextended`
     return compiled
 
 
@@ -154,4 +155,16 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         if self._parallel:
             start_threads()  # before numba does so itself when it loads or compiles the loop
-        return super().load_overload(sig, target_context)
+        with _unextended():
+            return super().load_overload(sig, target_context)
+
+
+@contextmanager
+def _unextended() -> Iterator[None]:
+    """Load no extensions of numba: those of awkward take 0.4 s, and no loop here needs them."""
+    before = entrypoints._already_initialized  # noqa: SLF001
+    entrypoints._already_initialized = True  # noqa: SLF001
+    try:
+        yield
+    finally:
+        entrypoints._already_initialized = before  # noqa: SLF001

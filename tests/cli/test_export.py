@@ -47,7 +47,7 @@ def test_a_library_is_translated(command, trained, tmp_path):
 
 def test_a_library_is_made(command, tmp_path):
     words = ["library", "make", "--detector", "ppc", "--out", tmp_path / "psl.lh5"]
-    short = ["--grid-mm", "12", "--dt-ns", "8", "--length-ns", "2400"]
+    short = ["--grid-mm", "12", "--set", "dt_ns=8", "--set", "length_ns=2400"]
     done = command(*words, *short, "--angles", "0,30,45")
     assert done.code == 0, done.err
     assert "places have a template" in done.out

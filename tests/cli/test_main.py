@@ -36,10 +36,12 @@ def test_words_that_are_missing_or_unknown_are_named(command):
     assert command("trai").err.startswith('error: Unknown command "trai"')
 
 
-def test_the_help_does_not_load_torch():
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"]])
+def test_the_help_does_not_load_torch(words):
     program = (
-        "import sys; import cpunet.cli; "
-        "heavy = {'torch', 'lh5', 'lgdo', 'dspeed', 'matplotlib', 'scipy'}; "
+        "import io, sys; import cpunet.cli; sys.stdout = io.StringIO(); "
+        f"cpunet.cli.run({words}); "
+        "heavy = {'torch', 'lh5', 'lgdo', 'dspeed', 'matplotlib', 'scipy', 'numba'}; "
         "sys.exit(', '.join(sorted(heavy & sys.modules.keys())) or 0)"
     )
     done = subprocess.run(

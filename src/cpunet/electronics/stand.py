@@ -16,7 +16,7 @@ import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import respond
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
-from cpunet.electronics.stand_plan import LABELS, OTHER, Labels, Side, StandPlan
+from cpunet.electronics.stand_sides import LABELS, OTHER, Labels, Side, stand_sides
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import FloatArray, Pulses
@@ -204,42 +204,42 @@ def make_stand(
     readout = Electronics.model_fields.keys() - {"name"}
     of_chain = {k: of_detector.pop(k) for k in [*of_detector] if k.split(".")[0] in readout}
     physics = read_settings(SimulationSettings, settings_file, of_settings)
-    plan = StandPlan.of(
-        read_electronics(electronics, of_chain),
+    seed, moved = require_seed(seed), Shift.of(shift) if shift else None
+    chain = read_electronics(electronics, of_chain)
+    sim, data, readout_seed = stand_sides(
+        chain,
         read_detector(detector, of_detector),
         wanted_events(events, load_recipe("fast").peaks, physics.window_kev),
-        shift=Shift.of(shift) if shift else None,
+        shift=moved,
         settings=physics,
-        seed=require_seed(seed),
+        seed=seed,
     )
-    return write_stand(plan, Path(out), force=force)
-
-
-def write_stand(plan: StandPlan, out: Path, *, force: bool = False) -> Stand:
-    """Make a planned stand, see `make_stand`."""
-    mode, events = plan.sim.settings.mode, sum(plan.sim.source.events)
-    many = mode == "library" or (mode == "auto" and events >= _LIBRARY_FROM_EVENTS)
-    stand = Stand(out, plan.electronics)
-    with folder_written_aside(out, STAND, force=force) as folder:
-        library = plan.sim.library() if many else None
-        _write_sim(folder, plan, library, stand)
-        if many and plan.shift is not None:
-            library = plan.data.library()
-        _write_data(folder, plan, library, stand)
-        made = {"cpunet": cpunet.__version__, **plan.provenance(), "counts": stand.counts}
+    mode, n_events = sim.settings.mode, sum(sim.source.events)
+    many = mode == "library" or (mode == "auto" and n_events >= _LIBRARY_FROM_EVENTS)
+    stand = Stand(Path(out), chain)
+    with folder_written_aside(stand.folder, STAND, force=force) as folder:
+        library = sim.library() if many else None
+        _write_sim(folder, sim, library, stand)
+        if many and moved is not None:
+            library = data.library()
+        _write_data(folder, data, readout_seed, library, stand)
+        made = {
+            "cpunet": cpunet.__version__,
+            "shift": None if moved is None else moved.model_dump(mode="json"),
+            "seed": seed,
+            "electronics": chain.model_dump(mode="json"),
+            "sim": sim.provenance(),
+            "data": data.provenance(),
+            "counts": stand.counts,
+        }
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
     return stand
 
 
-def _write_sim(
-    folder: Path,
-    plan: StandPlan,
-    library: Library | None,
-    stand: Stand,
-) -> None:
+def _write_sim(folder: Path, side: Side, library: Library | None, stand: Stand) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
-    electronics, side = plan.electronics, plan.sim
+    electronics = stand.electronics
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
     # the truth grows in a file of its own: it may be larger than memory
     rows = folder / "truth.rows"
@@ -252,7 +252,9 @@ def _write_sim(
             writer.append_rows(HIT_TABLE, hit_columns(hits))
             truth.write(respond(fine, electronics).astype(np.float32).tobytes())
             labels.append(label)
-        writer.annotate({"simulation": json.dumps(_simulated(side, electronics.dt_ns))})
+        simulation = {"cpunet": cpunet.__version__, **side.provenance()}
+        simulation["settings"] |= {"dt_ns": electronics.dt_ns}  # that of the means
+        writer.annotate({"simulation": json.dumps(simulation)})
     label = np.concatenate(labels)
     np.savez(
         folder / "truth.npz",
@@ -266,23 +268,18 @@ def _write_sim(
 
 
 def _write_data(
-    folder: Path,
-    plan: StandPlan,
-    library: Library | None,
-    stand: Stand,
+    folder: Path, side: Side, seed: int, library: Library | None, stand: Stand
 ) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
-    electronics = plan.electronics
+    electronics = stand.electronics
     labels: list[Labels] = []
     known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in OF_DATA}
     writer = PulseWriter(
         folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by("measured")
     )
     with writer:
-        for fine, label, _ in plan.data.blocks("Measured events", library):
-            block_seed = np.random.SeedSequence(
-                (plan.readout_seed, writer.n_pulses)
-            ).generate_state(1)
+        for fine, label, _ in side.blocks("Measured events", library):
+            block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(_as_pulses(traces))
             labels.append(label)
@@ -304,16 +301,6 @@ def _write_data(
     stand.data_lines = _by_line(label)
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
         stand.flags[name] = int((flag & bit > 0).sum())
-
-
-def _simulated(side: Side, dt_ns: float) -> dict[str, Any]:
-    """Provenance of the pulses of a side after averaging to the period `dt_ns`."""
-    return {
-        "cpunet": cpunet.__version__,
-        "detector": side.detector.model_dump(mode="json"),
-        "settings": side.settings.model_dump(mode="json") | {"dt_ns": dt_ns},
-        "hits": side.source.provenance(),
-    }
 
 
 def _block_means(pulses: Pulses, per_sample: int) -> Pulses:

@@ -17,11 +17,11 @@ import numpy.typing as npt
 import yaml
 
 import cpunet
-from cpunet.electronics.equivalent import Equivalent, ae_ratios, current_delay_ns
-from cpunet.electronics.equivalent import equivalent_kernel as fitted_kernel
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.legend.equivalent import Equivalent, ae_ratios, current_delay_ns
+from cpunet.legend.equivalent import equivalent_kernel as fitted_kernel
 from cpunet.legend.ideal_library import (
     IdealLibrary,
     chosen_libraries,

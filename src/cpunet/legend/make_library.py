@@ -19,7 +19,7 @@ from cpunet.settings import Set, read_settings
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.settings import SimulationSettings, split_overrides
 from cpunet.simulation.signals import hit_signals
 
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
@@ -62,8 +62,6 @@ def make_library(
     *,
     grid_mm: float = 1.0,
     angles: str | Sequence[int] = ANGLES_DEG,
-    dt_ns: float | None = None,
-    length_ns: float | None = None,
     settings: Set = (),
     settings_file: str | Path | SimulationSettings | None = None,
     force: bool = False,
@@ -87,14 +85,11 @@ def make_library(
         Spacing of the places in r and z.
     angles
         Azimuths from <100> in degrees, as 0,45.
-    dt_ns
-        Sampling period in ns; 1 by default.
-    length_ns
-        Length of a template; 5000 by default.
     settings
-        Override a value of the detector: bias_V=3500 (repeatable).
+        Override a value of the detector or the simulation: bias_V=3500, dt_ns=2 (repeatable).
     settings_file
-        YAML file of settings of the simulation, which then has period and length.
+        YAML file of settings of the simulation, with the sampling period and the length of a
+        template; without one they are 1 ns and 5000 ns.
     force
         Replace an existing file.
 
@@ -112,14 +107,18 @@ def make_library(
     Examples
     --------
     cpunet library make --detector icpc --out psl.lh5
+
+    cpunet library make --detector icpc --out psl.lh5 --grid-mm 0.5 --set dt_ns=2
     """
     out = Path(out)
     inputs = [given for given in (detector, settings_file) if isinstance(given, str | Path)]
     refuse_existing(out, *inputs, force=force)
+    of_detector, of_settings = split_overrides(settings)
     if not isinstance(detector, Detector):
-        detector = read_detector(detector, settings)
+        detector = read_detector(detector, of_detector)
     angles_deg = _degrees(angles)
-    wanted = _settings(settings_file, dt_ns, length_ns)
+    sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS} if settings_file is None else {}
+    wanted = read_settings(SimulationSettings, settings_file, sampling | of_settings)
     counts = _write(detector, out, wanted, grid_mm, angles_deg)
     return Library(out, **counts)
 
@@ -134,21 +133,6 @@ def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:
     if wrong or not degrees or len(set(degrees)) < len(degrees):
         raise CpunetError(f"`angles` {angles}: give different ones from 0 to 359 degrees")
     return degrees
-
-
-def _settings(
-    given: str | Path | SimulationSettings | None, dt_ns: float | None, length_ns: float | None
-) -> SimulationSettings:
-    if isinstance(given, SimulationSettings):
-        return given
-    sampling = {"dt_ns": dt_ns, "length_ns": length_ns}
-    if given is None:
-        sampling = {
-            "dt_ns": DT_NS if dt_ns is None else dt_ns,
-            "length_ns": LENGTH_NS if length_ns is None else length_ns,
-        }
-    chosen = {name: value for name, value in sampling.items() if value is not None}
-    return read_settings(SimulationSettings, given, chosen)
 
 
 def _write(

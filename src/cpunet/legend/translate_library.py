@@ -126,7 +126,6 @@ def translate_library(
     detector: Sequence[str] = (),
     rings: int = RINGS,
     low_rank: int | None = None,
-    device: str = "auto",
     force: bool = False,
 ) -> TranslatedLibrary:
     """Translate every template of a library without noise.
@@ -157,8 +156,6 @@ def translate_library(
         With simflow: rings of nodes beyond the crystal; 3 as production.
     low_rank
         With simflow: number of components in place of whole templates.
-    device
-        cpu, cuda or auto.
     force
         Replace an existing file.
 
@@ -183,7 +180,7 @@ def translate_library(
         )
     run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
-    ren = REN.of(run, resolve_device(device))
+    ren = REN.of(run, resolve_device("auto"))
     if format == "simflow":
         numbers = translate_for_production(
             run, ren, source, out, detectors=detector, rings=rings, rank=low_rank

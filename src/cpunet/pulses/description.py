@@ -13,9 +13,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.peaks import label_peaks
-from cpunet.pulses.preparation import Prepared, Rejection, prepare
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.energies import amplitude
@@ -58,6 +56,10 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
     CpunetError
         If too few traces contain a pulse.
     """
+    # compiled loops, which a look at plain pulses does not need
+    from cpunet.pulses.cuts import apply_cuts, fit_cuts
+    from cpunet.pulses.preparation import Prepared, Rejection, prepare
+
     seen = list(islice(blocks, BLOCKS))
     found = [_edges(block) for block in seen]
     half, start, noise = (np.concatenate(part) for part in zip(*found, strict=True))

@@ -7,15 +7,17 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened, text_attribute
-from cpunet.pulses.preparation import Kind
 from cpunet.pulses.reading.source import PulseSource
+
+if TYPE_CHECKING:  # compiled loops, which a look into a file does not need
+    from cpunet.pulses.preparation import Kind
 
 # attributes of a table, and of a file
 SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from cpunet.networks.response_layer import Readout
 from cpunet.progress import stage
 from cpunet.training.fit import known_response, match
-from cpunet.training.job import TrainingJob
 from cpunet.training.loop import Record
 from cpunet.training.run import Run, append_losses
+
+if TYPE_CHECKING:
+    from cpunet.training.job import TrainingJob
 
 
 def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:

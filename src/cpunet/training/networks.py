@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -17,10 +17,12 @@ from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import UnfinishedRun
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.job import TrainingJob
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
 from cpunet.training.outside import Outside
 from cpunet.training.run import FitInfo, Run, read_losses
+
+if TYPE_CHECKING:
+    from cpunet.training.job import TrainingJob
 
 log = logging.getLogger(__name__)
 

@@ -4,44 +4,22 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from cpunet.errors import CpunetError
-from cpunet.matrices import one_thread_for_matrices
-from cpunet.memory import keep_freed_memory
-from cpunet.outputs import folder_written_aside, refuse_inputs
-from cpunet.pulses.channels import ALL, Outcome, Pair, each_channel, own_folder, paired
-from cpunet.pulses.loading import (
-    load_pulses,
-    require_both_sides,
-    require_same_sampling,
-)
-from cpunet.pulses.peaks import parse_selection
+from cpunet.outputs import refuse_inputs
+from cpunet.pulses.channels import ALL, Outcome, each_channel, paired
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
-from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import Recipe
-from cpunet.settings import require_seed
-from cpunet.training.chain import train_chain
-from cpunet.training.check import Level, compare_sides
-from cpunet.training.checkpoints import unfinished_folder, unfinished_name
-from cpunet.training.devices import resolve_device
-from cpunet.training.job import TrainingJob
-from cpunet.training.networks import train_networks
-from cpunet.training.run import INFO, RUN, Run, RunLike, as_run, read_losses
+
+if TYPE_CHECKING:
+    from cpunet.recipes.schema import Recipe
+    from cpunet.training.run import Run, RunLike
+else:  # as the command line reads them
+    Recipe, Run, RunLike = str, Any, str | Path
 
 log = logging.getLogger(__name__)
-
-FITS: dict[str, Callable[[TrainingJob], Run]] = {
-    "matching": train_chain,
-    "cyclegan": train_networks,
-}
 
 
 def train(
@@ -109,6 +87,14 @@ def train(
 
     ``cpunet train --sim sim.lh5 --data raw.lh5 --data-table all --out runs``
     """
+    # imported late: torch takes seconds, and the help of the command must not wait for it
+    from cpunet.recipes import load_recipe
+    from cpunet.recipes.schema import Recipe
+    from cpunet.settings import require_seed
+    from cpunet.training.devices import resolve_device
+    from cpunet.training.job import Training
+    from cpunet.training.run import Run, as_run
+
     target = None if out is None else Path(out)
     if target is not None and not isinstance(recipe, Recipe):
         refuse_inputs(target, recipe)
@@ -116,7 +102,7 @@ def train(
     chosen, device = load_recipe(recipe, settings), resolve_device(device)
     sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
 
-    training = _Training(chosen, peak, init, seed, device, resume, force)
+    training = Training(chosen, peak, init, seed, device, resume, force)
     if sides[1].table != ALL:
         start = None if init is None else as_run(init)
         run = training.run(sides, target, start, go_on=resume)
@@ -129,41 +115,6 @@ def train(
     return Outcome({name: Run.load(run) for name, run in trained.done.items()}, trained.failed)
 
 
-@dataclass(frozen=True)
-class _Training:
-    """How to train, see `train`."""
-
-    recipe: Recipe
-    peak: str
-    init: RunLike | None
-    seed: int
-    device: str
-    resume: bool
-    force: bool
-
-    def of_channel(self, name: str, pair: Pair, folder: Path) -> Path:
-        """The folder of the run of a channel, trained in a process of its own."""
-        if self.resume and (folder / INFO).is_file():
-            log.info(f"{name}: trained already")
-            return folder
-        init = self.init
-        if isinstance(init, str | Path):
-            init = own_folder(Path(init), name, INFO)
-        start = None if init is None else as_run(init)
-        go_on = self.resume and unfinished_name(folder).exists()
-        self.run(pair, folder, start, go_on=go_on)
-        return folder
-
-    def run(self, pair: Pair, out: Path | None, start: Run | None, *, go_on: bool) -> Run:
-        """Read, train and write a run."""
-        files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
-        with _workplace(out, files, self.recipe, go_on, self.force) as folder:
-            job = _job(
-                pair, folder, self.recipe, self.peak, start, self.seed, self.device, go_on
-            )
-            return _trained(job, out)
-
-
 def _tell_next(sim: PulseFile, data: PulseFile, out: Path | None) -> None:
     """Say how to validate runs of files."""
     if out is None or sim.pulses is not None or data.pulses is not None:
@@ -172,61 +123,3 @@ def _tell_next(sim: PulseFile, data: PulseFile, out: Path | None) -> None:
     of_all = ["--data-table", ALL] if data.table == ALL else []
     report = out.with_name(f"{out.name}-report")
     log.info(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
-
-
-def _workplace(
-    out: Path | None,
-    read: Sequence[Path | str | None],
-    recipe: Recipe,
-    resume: bool,
-    force: bool,
-) -> AbstractContextManager[Path | str]:
-    """Context of the folder to write to, which becomes `out` when the training is complete."""
-    networks = recipe.training.method == "cyclegan"
-    if resume and (out is None or not networks):
-        why = "takes a minute and keeps no checkpoints" if out else "was kept in memory only"
-        raise CpunetError(
-            f"recipe {recipe.name}: {why}",
-            "give what the training was begun with, or leave out `resume`",
-        )
-    if out is None:
-        return TemporaryDirectory()
-    if networks:
-        return unfinished_folder(out, *read, resume=resume, force=force)
-    return folder_written_aside(out, RUN, *read, force=force)
-
-
-def _job(
-    pair: Pair,
-    folder: Path | str,
-    recipe: Recipe,
-    peak: str,
-    init: Run | None,
-    seed: int,
-    device: str,
-    resume: bool,
-) -> TrainingJob:
-    """Read and prepare both sides, and warn of what makes a training on them doubtful."""
-    selection = parse_selection(peak, recipe.peaks)
-    sim = load_pulses(pair[0], "simulated", recipe, selection)
-    data = load_pulses(pair[1], "measured", recipe, selection)
-    require_same_sampling(sim, data)
-    require_both_sides(sim, data, selection)
-    for finding in compare_sides(sim, data, selection):
-        if finding.level != Level.FINE:
-            log.warning(finding)
-    if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
-        kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-        raise CpunetError(f"{init.name}: {kinds}; resample them")
-    return TrainingJob(recipe, peak, seed, device, sim, data, Path(folder), init, resume)
-
-
-def _trained(job: TrainingJob, out: Path | None) -> Run:
-    """Train, and write the folder of the job, which becomes `out`."""
-    keep_freed_memory()
-    with one_thread_for_matrices():
-        run = FITS[job.recipe.training.method](job)
-    run.write(job.folder)
-    run = run.model_copy(update={"folder": out})
-    vars(run)["records"] = read_losses(job.folder)  # the folder moves, or goes
-    return run

@@ -1,10 +1,10 @@
-"""Plan of a test stand: two sides of independent events, and the inputs of each."""
+"""The two sides of a test stand: independent events, each with its detector and settings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,14 @@ class Side:
     detector: Detector
     settings: SimulationSettings
     source: GammaSource
+
+    def provenance(self) -> dict[str, Any]:
+        """Detector, settings and hits, for ``stand.json``."""
+        return {
+            "detector": self.detector.model_dump(mode="json"),
+            "settings": self.settings.model_dump(mode="json"),
+            "hits": self.source.provenance(),
+        }
 
     def _fields(self) -> FieldMaps:
         with stage(f"Fields of {self.detector.name}"):
@@ -87,92 +95,61 @@ class Side:
             )
 
 
-@dataclass(frozen=True)
-class StandPlan:
-    """All inputs of a stand.
+def stand_sides(
+    electronics: Electronics,
+    detector: Detector,
+    events: Mapping[Window, int],
+    *,
+    shift: Shift | None = None,
+    settings: SimulationSettings | None = None,
+    seed: int = 0,
+) -> tuple[Side, Side, int]:
+    """Sides of the simulation and of the data, and the seed of the readout.
 
     Parameters
     ----------
     electronics
         Readout chain of the data and of the truth.
+    detector, settings
+        Detector and settings of the simulation.
+    events
+        Number of events of each side by window.
     shift
         Deviations of the data's detector from the simulated one; None for the same detector.
-    sim, data
-        The two sides.
     seed
         Seed of all random numbers.
-    readout_seed
-        Seed of the noise and other effects of the readout, derived from `seed`.
+
+    Raises
+    ------
+    CpunetError
+        If a window has no events, the chain's period is not a multiple of that of the
+        pulses, the settings have another period, or the shifted detector is not valid.
     """
-
-    electronics: Electronics
-    shift: Shift | None
-    sim: Side
-    data: Side
-    seed: int
-    readout_seed: int
-
-    @classmethod
-    def of(
-        cls,
-        electronics: Electronics,
-        detector: Detector,
-        events: Mapping[Window, int],
-        *,
-        shift: Shift | None = None,
-        settings: SimulationSettings | None = None,
-        seed: int = 0,
-    ) -> Self:
-        """Plan a stand, see `cpunet.make_stand`.
-
-        Raises
-        ------
-        CpunetError
-            If a window has no events, the chain's period is not a multiple of that of the
-            pulses, the settings have another period, or the shifted detector is not valid.
-        """
-        for window, number in events.items():
-            if number < 1:
-                raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
-        settings = _finely_sampled(settings or SimulationSettings(), electronics)
-        # seeds of the events of both sides and of the readout
-        sim_seed, data_seed, readout_seed = map(
-            int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
+    for window, number in events.items():
+        if number < 1:
+            raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
+    settings = _finely_sampled(settings or SimulationSettings(), electronics)
+    # seeds of the events of both sides and of the readout
+    sim_seed, data_seed, readout_seed = map(
+        int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
+    )
+    sim_hits, data_hits = (
+        GammaSource(
+            tuple(events),
+            tuple(events.values()),
+            settings.source_height_mm,
+            settings.source_radius_mm,
+            s,
         )
-        sim_hits, data_hits = (
-            GammaSource(
-                tuple(events),
-                tuple(events.values()),
-                settings.source_height_mm,
-                settings.source_radius_mm,
-                s,
-            )
-            for s in (sim_seed, data_seed)
-        )
-        sim = Side(detector, settings, sim_hits)
-        data = Side(
-            detector if shift is None else shift.detector(detector),
-            settings if shift is None else shift.settings(settings),
-            data_hits,
-        )
-        return cls(electronics, shift, sim, data, seed, readout_seed)
-
-    def provenance(self) -> dict[str, Any]:
-        """Provenance for ``stand.json``."""
-        sides = {
-            name: {
-                "detector": side.detector.model_dump(mode="json"),
-                "settings": side.settings.model_dump(mode="json"),
-                "hits": side.source.provenance(),
-            }
-            for name, side in (("sim", self.sim), ("data", self.data))
-        }
-        return {
-            "shift": None if self.shift is None else self.shift.model_dump(mode="json"),
-            "seed": self.seed,
-            "electronics": self.electronics.model_dump(mode="json"),
-            **sides,
-        }
+        for s in (sim_seed, data_seed)
+    )
+    sim = Side(detector, settings, sim_hits)
+    data = Side(
+        detector if shift is None else shift.detector(detector),
+        settings if shift is None else shift.settings(settings),
+        data_hits,
+    )
+    return sim, data, readout_seed
 
 
 def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) -> Labels:
@@ -194,26 +171,22 @@ def _calibration(share: npt.NDArray[np.float64], labels: Labels) -> float:
 def _finely_sampled(
     settings: SimulationSettings, electronics: Electronics
 ) -> SimulationSettings:
-    fine = _fine_ns(electronics)
-    if "dt_ns" in settings.model_fields_set and settings.dt_ns != fine:
-        raise CpunetError(
-            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
-            "period; leave dt_ns out"
-        )
-    try:
-        return SimulationSettings.model_validate(settings.model_dump() | {"dt_ns": fine})
-    except ValidationError as error:
-        raise CpunetError(
-            f"settings: step_ns = {settings.step_ns:g} does not divide the {fine:g} ns of a "
-            "stand's pulses; give one that does"
-        ) from error
-
-
-def _fine_ns(electronics: Electronics) -> float:
+    """Settings with the period of the pulses of a stand, of which the chain's is a multiple."""
     ratio = electronics.dt_ns / _FINE_NS
     if abs(ratio - round(ratio)) > 1e-9:
         raise CpunetError(
             f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
             f"{_FINE_NS:g}, the pulses' period; choose another"
         )
-    return _FINE_NS
+    if "dt_ns" in settings.model_fields_set and settings.dt_ns != _FINE_NS:
+        raise CpunetError(
+            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
+            "period; leave dt_ns out"
+        )
+    try:
+        return SimulationSettings.model_validate(settings.model_dump() | {"dt_ns": _FINE_NS})
+    except ValidationError as error:
+        raise CpunetError(
+            f"settings: step_ns = {settings.step_ns:g} does not divide the {_FINE_NS:g} ns of "
+            "a stand's pulses; give one that does"
+        ) from error

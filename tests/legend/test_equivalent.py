@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.electronics.equivalent import (
+from cpunet.electronics.exponentials import Exponentials
+from cpunet.legend.equivalent import (
     ae_ratios,
     current_delay_ns,
     equivalent_kernel,
     kernel_step,
 )
-from cpunet.electronics.exponentials import Exponentials
 
 
 class KernelStep:
