@@ -25,8 +25,8 @@ import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.legend.peak_currents import currents_about_peak, heights
-from cpunet.legend.realistic_library import read_library
+from cpunet.legend.current_library import read_library
+from cpunet.legend.currents import currents_about_peak, heights
 from cpunet.legend.templates import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
@@ -72,7 +72,7 @@ def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
     translate = TemplateTranslator(REN.load(folder), 1.0)
     for first in range(0, hits.n_events, 500):
         waveforms = simulate_events(fields, hits[first : first + 500], SETTINGS).waveforms
-        found.append(heights(currents_about_peak(translate(waveforms)[0])[0]) / mode)
+        found.append(heights(currents_about_peak(translate(waveforms))[0]) / mode)
     return np.concatenate(found)
 
 
@@ -131,7 +131,7 @@ def main() -> None:
         ideal, whole = Path(folder) / "ideal.lh5", Path(folder) / "psl.lh5"
         run("library", "make", "--detector", given.detector, "--grid-mm", given.grid_mm,
             "--out", ideal)  # fmt: skip
-        words = ["library", "translate", given.run, ideal, "--format", "simflow"]
+        words = ["library", "translate", given.run, ideal]
         name = read_detector(given.detector).name
         words += ["--detector", name] if name else []
         run(*words, "--out", whole)

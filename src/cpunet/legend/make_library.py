@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.legend.library_arrays import put_column
+from cpunet.legend.library_files import put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
