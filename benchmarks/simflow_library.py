@@ -33,7 +33,7 @@ from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.translation.translator import REN
@@ -58,7 +58,7 @@ def run(*words: object) -> None:
 
 def events_of(path: Path, detector: str) -> Hits:
     """Events above 600 keV: their hits merged, those in the lithium left out."""
-    hits = read_hits(path).hits
+    hits = read_hits(path)
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
     maps = drift_maps(compute_fields(read_detector(detector)), SETTINGS)
     places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)

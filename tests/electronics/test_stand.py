@@ -20,11 +20,10 @@ from cpunet.electronics.stand import make_stand, write_stand
 from cpunet.electronics.stand_plan import StandPlan
 from cpunet.errors import CpunetError
 from cpunet.simulation.again import SameHits
-from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource, OpenHits
+from cpunet.simulation.hit_sources import EnergyWindow, GammaSource, OpenHits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
@@ -82,7 +81,7 @@ class Dead(GammaSource):
 
 @pytest.mark.parametrize("side", ["sim", "data"])
 def test_a_side_without_any_signal_is_told_in_one_line(tmp_path: Path, side: str) -> None:
-    window = Window("FEP", 2614.0, 2615.0)
+    window = EnergyWindow("FEP", 2614.0, 2615.0)
     plan = StandPlan.of(read_electronics("ornl"), DETECTOR, {window: 2})
     dead = replace(getattr(plan, side), source=Dead((window,), (2,), 20.0, 5.0, 0))
     with pytest.raises(

@@ -35,7 +35,7 @@ from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run, SideInfo
@@ -285,7 +285,10 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
         ({"z": Array(Z, attrs={"units": "m"})}, "z reaches 7000 mm"),
         ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
-        ({"r": Array(np.arange(4.0), attrs={"units": "mm"})}, "expected numbers of shape (r, z, samples)"),
+        (
+            {"r": Array(np.arange(4.0), attrs={"units": "mm"})},
+            "expected numbers of shape (r, z, samples)",
+        ),
         ({"waveform_000_deg": Array(without(charge(), 2))}, "1 rows of 000_deg are NaN"),
         ({"waveform_045_deg": Array(without(charge(), np.s_[:]))}, "no template of 045_deg"),
         (
@@ -349,7 +352,7 @@ def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
 def geant4_events(reference_data: Path, n_events: int | None) -> tuple[Any, Hits]:
     """Geometry A, and events above 600 keV: merged hits without those in the lithium."""
     detector = read_detector(str(reference_data / "siggen" / "geometry_A.yaml"))
-    hits = read_hits(reference_data / "geant4" / "g4_h20mm.npz").hits
+    hits = read_hits(reference_data / "geant4" / "g4_h20mm.npz")
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)[:n_events]], 0.05)
     maps = drift_maps(compute_fields(detector), SETTINGS)
     places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)

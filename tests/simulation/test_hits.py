@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hits import Hits
+from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.hits import FARTHEST_MM, Hits
 
 
 def hits_with(counts: list[int], seed: int = 0) -> Hits:
@@ -69,3 +70,8 @@ def test_events_by_their_numbers() -> None:
     assert twice.of_events([7]).energy_kev.tolist() == [4]
     with pytest.raises(CpunetError, match="several events have the number 5"):
         twice.of_events([7, 5])
+
+
+def test_hits_at_the_edge_of_what_is_allowed_are_merged() -> None:
+    places = [[FARTHEST_MM, 0, 0], [-FARTHEST_MM, 0, 0]]
+    assert cluster_hits(Hits.of(places, [1.0, 1.0], [0, 2]), 0.05).n_events == 1

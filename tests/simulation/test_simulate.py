@@ -21,12 +21,17 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.settings import read_settings
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.energy_windows import Window, energy_windows
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import Transform, read_hits
-from cpunet.simulation.hit_sources import GammaSource, HitFile, OpenHits
-from cpunet.simulation.hits import Hits
+from cpunet.simulation.hit_files import read_hits
+from cpunet.simulation.hit_sources import (
+    EnergyWindow,
+    GammaSource,
+    HitFile,
+    OpenHits,
+    energy_windows,
+)
+from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
 
@@ -122,7 +127,7 @@ def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
 def test_kept_hits_read_back_as_they_were(ppc, source, tmp_path: Path):
     out, again = tmp_path / "sim.lh5", tmp_path / "again.lh5"
     simulate(out, detector=ppc, hits=source, settings_file=SETTINGS)
-    kept = read_hits(out).hits
+    kept = read_hits(out)
     assert np.array_equal(kept.position_mm, HITS[:2].position_mm)
     assert np.array_equal(kept.edep_kev, HITS[:2].edep_kev)
     assert np.array_equal(kept.offsets, HITS[:2].offsets)
@@ -196,11 +201,11 @@ def test_only_events_in_the_windows_of_a_file(ppc, source, tmp_path: Path):
     summary = simulate(out, detector=ppc, hits=source, events="900-1100")
     assert (summary.n_events, summary.lines) == (1, {"900-1100": 1})
     with pytest.raises(CpunetError, match="no event in none"):
-        replace(source, windows=(Window("none", 1, 2),)).open(ppc)
+        replace(source, windows=(EnergyWindow("none", 1, 2),)).open(ppc)
 
 
 def test_hits_all_outside_say_where_they_are(ppc, source):
-    away = replace(source, transform=Transform((0, 0, -500)))
+    away = replace(source, options=HitOptions(origin=(0, 0, -500)))
     with pytest.raises(CpunetError, match=r"5 hits lie outside ppc .* z 520 to 800 mm; move"):
         away.open(ppc)
 

@@ -18,7 +18,7 @@ import pytest
 import yaml
 from lgdo import Array, Scalar, Struct, Table, VectorOfVectors
 
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 
 pytest.importorskip("snakemake", reason="snakemake is not installed: pip install '.[workflow]'")
 
@@ -32,7 +32,7 @@ def write_steps(path: Path, sims: dict[str, Path], events: slice) -> dict[str, A
     """Hits of simulations as remage writes steps, each detector at a place of its own."""
     kept: dict[str, Any] = {}
     for name, sim in sims.items():
-        hits = read_hits(sim).hits[events]
+        hits = read_hits(sim)[events]
         kept[name] = hits
         origin = ORIGIN_M[name]
         steps = {

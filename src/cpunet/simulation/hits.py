@@ -35,7 +35,8 @@ class HitOptions:
     energy_unit
         Unit of energies, if the file names none: keV, MeV, eV or GeV.
     time_window_us
-        Hits of an event number that come later than this are another event.
+        Hits of an event number that come later than this are another event; remage's interval
+        by default.
     """
 
     hits_detector: str | None = None
@@ -44,6 +45,16 @@ class HitOptions:
     length_unit: str | None = None
     energy_unit: str | None = None
     time_window_us: float = 10.0
+
+    def to_crystal(self, position_mm: FloatArray) -> FloatArray:
+        """Positions of shape ``(n, 3)`` in mm, from the frame of the file to the crystal's.
+
+        `origin` is subtracted. With `flip_z`, z (and y, so that the frame remains right-handed)
+        are then mirrored.
+        """
+        moved = position_mm - np.asarray(self.origin)
+        mirror = np.array([1.0, -1.0, -1.0]) if self.flip_z else np.ones(3)
+        return np.asarray(moved * mirror, np.float64)
 
 
 @dataclass(frozen=True, eq=False)

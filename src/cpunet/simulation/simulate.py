@@ -23,16 +23,20 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, read_settings, require_seed
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.energy_windows import Window, energy_windows, wanted_events
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas import with_resolution
 from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import Transform
-from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
-from cpunet.simulation.hit_readers.hit_table import hit_columns
-from cpunet.simulation.hit_sources import GammaSource, HitFile, HitSource
+from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
+from cpunet.simulation.hit_sources import (
+    EnergyWindow,
+    GammaSource,
+    HitFile,
+    HitSource,
+    energy_windows,
+    wanted_events,
+)
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings, split_overrides
@@ -177,7 +181,7 @@ def simulate(
     windows = tuple(energy_windows(",".join(peaks), peaks, physics.window_kev))
     source: HitSource
     if hits is not None:
-        source = hits if isinstance(hits, HitFile) else _hit_file(hits, frame)
+        source = hits if isinstance(hits, HitFile) else HitFile(Path(hits), frame)
         if events is not None:
             names = events if isinstance(events, str) else ",".join(events)
             windows = tuple(energy_windows(names, peaks, physics.window_kev))
@@ -197,21 +201,10 @@ def simulate(
     return simulation
 
 
-def _hit_file(path: str | Path, frame: HitOptions) -> HitFile:
-    return HitFile(
-        Path(path),
-        frame.hits_detector,
-        Transform(frame.origin, frame.flip_z),
-        frame.length_unit,
-        frame.energy_unit,
-        time_window_us=frame.time_window_us,
-    )
-
-
 def _simulate(
     simulation: Simulation,
     source: HitSource,
-    windows: tuple[Window, ...],
+    windows: tuple[EnergyWindow, ...],
     writer: PulseWriter,
     resolution: Resolution | None,
     seed: int,
@@ -277,9 +270,8 @@ def _merged(
 
 
 def _count(
-    simulation: Simulation, hits: Hits, events: EventPulses, windows: tuple[Window, ...]
+    simulation: Simulation, hits: Hits, events: EventPulses, windows: tuple[EnergyWindow, ...]
 ) -> None:
-    """Count a block of events."""
     """Count a block of events."""
     r = np.hypot(hits.x_mm, hits.y_mm)
     inside = simulation.detector.inside(r, hits.z_mm)

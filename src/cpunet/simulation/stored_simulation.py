@@ -13,8 +13,7 @@ from pydantic import ValidationError
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_readers import read_hits
-from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
+from cpunet.simulation.hit_files import HIT_TABLE, read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 
@@ -63,7 +62,7 @@ class StoredSimulation:
             raise CpunetError(
                 f"{file}: several pulses have the same event_number; simulate them again"
             )
-        hits = read_hits(file).hits.of_events(numbers)
+        hits = read_hits(file).of_events(numbers)
         missing = np.diff(hits.offsets) == 0
         if missing.any():
             raise CpunetError(

@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hit_readers.grouping import event_of_step
-from cpunet.simulation.hits import FARTHEST_MM, MAX_KEV, Hits
+from cpunet.simulation.hits import FARTHEST_MM, MAX_KEV, FloatArray, HitOptions, Hits, IntArray
 
-FloatArray = npt.NDArray[np.float64]
-
+# Numbers in a row that rise, on average, in files of jobs
+_LONG_RISE = 3
 _MAX_NUMBER = 2.0**62
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
 _KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
@@ -23,57 +22,33 @@ _NS = {"ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9, "ps": 1e-3}
 _LEAST_KEV, _MOST_KEV = 5.0, 1e5
 
 
-@dataclass(frozen=True)
-class Transform:
-    """Transformation from the frame of a file to that of the crystal.
+def unit_factor(
+    options: HitOptions, role: str, path: Path, column: str, named: str = ""
+) -> float:
+    """Conversion factor of a column with the unit `named` to keV, ns or mm.
 
-    Subtracts `origin_mm`. With `flip_z` it then mirrors z (and y, so that the frame remains
-    right-handed), for crystals with the point contact on top. `origin_mm` is the centre of
-    the face of the contact.
+    `role` is ``"edep"``, ``"time"`` or an axis. Units of columns that name none are those of
+    the options; times without a unit are in ns, Geant4's own.
+
+    Raises
+    ------
+    CpunetError
+        If the unit is unknown, or nobody tells it.
     """
-
-    origin_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    flip_z: bool = False
-
-    def apply(self, position_mm: FloatArray) -> FloatArray:
-        """Transform positions of shape ``(n, 3)`` in mm to the frame of the crystal."""
-        moved = position_mm - np.asarray(self.origin_mm)
-        mirror = np.array([1.0, -1.0, -1.0]) if self.flip_z else np.ones(3)
-        return np.asarray(moved * mirror, np.float64)
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units of columns that name none; None if the user gave none."""
-
-    length: str | None = None
-    energy: str | None = None
-
-    def factor(self, role: str, path: Path, column: str, named: str) -> float:
-        """Conversion factor of a column with the unit `named` to keV, ns or mm.
-
-        `role` is ``"edep"``, ``"time"`` or an axis. Times without a unit are in ns, Geant4's
-        own.
-
-        Raises
-        ------
-        CpunetError
-            If the unit is unknown, or nobody tells it.
-        """
-        given, known, option = {
-            "edep": (self.energy, _KEV, "energy_unit"),
-            "time": ("ns", _NS, ""),
-        }.get(role, (self.length, _MM, "length_unit"))
-        unit = named or given
-        if unit is None:
-            raise CpunetError(
-                f"{path}: column {column} names no unit; give `{option}`: {', '.join(known)}"
-            )
-        if unit not in known:
-            raise CpunetError(
-                f"{path}: column {column} is in {unit!r}; expected one of {', '.join(known)}"
-            )
-        return known[unit]
+    given, known, option = {
+        "edep": (options.energy_unit, _KEV, "energy_unit"),
+        "time": ("ns", _NS, ""),
+    }.get(role, (options.length_unit, _MM, "length_unit"))
+    unit = named or given
+    if unit is None:
+        raise CpunetError(
+            f"{path}: column {column} names no unit; give `{option}`: {', '.join(known)}"
+        )
+    if unit not in known:
+        raise CpunetError(
+            f"{path}: column {column} is in {unit!r}; expected one of {', '.join(known)}"
+        )
+    return known[unit]
 
 
 @dataclass(frozen=True)
@@ -83,7 +58,7 @@ class Steps:
     `time_ns` is None where the file tells no times.
     """
 
-    event: npt.NDArray[np.int64]
+    event: IntArray
     position_mm: FloatArray
     edep_kev: FloatArray
     time_ns: FloatArray | None = None
@@ -98,22 +73,13 @@ class Steps:
         return replace(self, position_mm=self.position_mm + by_mm)
 
 
-@dataclass(frozen=True)
-class ReadHits:
-    """Hits of a file, and the number of steps without energy deposit, which are omitted."""
-
-    hits: Hits
-    steps_without_energy: int
-
-
 def to_hits(
     path: Path,
     steps: Steps,
-    transform: Transform,
-    window_us: float,
+    options: HitOptions,
     first_free: int | None = None,
-) -> ReadHits:
-    """Group steps by event (see `event_of_step`), in the order of the file.
+) -> Hits:
+    """Group steps with a deposit by event (see `event_of_step`), in the order of the file.
 
     Positions are moved to the frame of the crystal. An event whose number an earlier one has
     gets a new one: `first_free` and those after it, by default from the largest on.
@@ -137,9 +103,8 @@ def to_hits(
         )
     if first_free is None:
         first_free = int(steps.event.max(initial=-1)) + 1
-    with_energy = steps.edep_kev > 0
-    kept = steps[with_energy]
-    found = event_of_step(kept.event, kept.time_ns, window_us)
+    kept = steps[steps.edep_kev > 0]
+    found = event_of_step(kept.event, kept.time_ns, options.time_window_us)
     _, first, label = np.unique(found, return_index=True, return_inverse=True)
     in_file = np.argsort(first)
     rank = np.empty_like(in_file)
@@ -151,13 +116,12 @@ def to_hits(
     again = np.ones(len(numbers), bool)
     again[np.unique(numbers, return_index=True)[1]] = False
     numbers[again] = first_free + np.arange(again.sum())
-    hits = Hits.of(
-        transform.apply(kept.position_mm[order]),
+    return Hits.of(
+        options.to_crystal(kept.position_mm[order]),
         kept.edep_kev[order],
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
     )
-    return ReadHits(hits, int((~with_energy).sum()))
 
 
 def require_some(path: Path, n_events: int) -> None:
@@ -178,7 +142,7 @@ def require_physics(path: Path, energy_kev: FloatArray) -> None:
         )
 
 
-def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> IntArray:
     """Convert a column of whole numbers, which may be stored as floats, to int64.
 
     Raises
@@ -193,3 +157,47 @@ def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> npt.NDArra
     if not fit:
         raise CpunetError(f"{path}: {name} holds what is no whole number; write it again")
     return values.astype(np.int64)
+
+
+def event_of_step(number: IntArray, time_ns: FloatArray | None, window_us: float) -> IntArray:
+    """Label of the event of each step; labels are arbitrary, equal within an event.
+
+    Steps of a number are parted where none comes for `window_us` (the decays of a chain are
+    simulated as one event), and where the numbering starts anew (jobs joined in one file).
+
+    Examples
+    --------
+    >>> event_of_step(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]), 10)
+    array([0, 1, 2])
+    >>> event_of_step(np.array([0, 1, 2, 0, 1, 2]), None, 10)
+    array([0, 2, 4, 1, 3, 5])
+    """
+    job = _job_of_step(number)
+    keys = (job, number) if time_ns is None else (time_ns, job, number)
+    order = np.lexsort(keys)
+    new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
+    if time_ns is not None:
+        new |= np.diff(time_ns[order]) > 1000 * window_us
+    label = np.empty(len(number), np.int64)
+    label[order] = np.cumsum(np.append(0, new))[: len(number)]
+    return label
+
+
+def _job_of_step(number: IntArray) -> IntArray:
+    """Index of the job of each step among those with its number.
+
+    The numbers of a job rise. An event that a thread wrote in two blocks ends one such rise and
+    begins another; where more come back otherwise, the numbering has started anew. Rows in
+    another order, as that of time, rise and fall all the time (by two on average).
+    """
+    starts = np.flatnonzero(np.append(True, np.diff(number) != 0)[: len(number)])
+    runs = number[starts]
+    falls = np.diff(runs) < 0
+    begins, ends = np.append(True, falls), np.append(falls, True)
+    order = np.argsort(runs, kind="stable")
+    again = np.diff(runs[order]) == 0
+    again &= ~(ends[order[:-1]] & begins[order[1:]])
+    job = np.zeros(len(runs), np.int64)
+    if again.sum() > 1 and len(runs) >= _LONG_RISE * begins.sum():
+        job[order[1:]] = np.cumsum(again)
+    return np.repeat(job, np.diff(np.append(starts, len(number))))

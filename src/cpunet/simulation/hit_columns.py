@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hit_readers.steps import Steps, Units, whole_numbers
+from cpunet.simulation.hit_steps import Steps, unit_factor, whole_numbers
+from cpunet.simulation.hits import HitOptions
 
 # values of a column for all steps, and the unit that belongs to them ("" for none)
 ReadColumn = Callable[[], tuple[npt.NDArray[Any], str]]
@@ -50,7 +51,7 @@ def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     return found
 
 
-def steps_of(path: Path, columns: Mapping[str, ReadColumn], units: Units) -> Steps:
+def steps_of(path: Path, columns: Mapping[str, ReadColumn], options: HitOptions) -> Steps:
     """Steps of a table with these columns.
 
     Raises
@@ -76,7 +77,7 @@ def steps_of(path: Path, columns: Mapping[str, ReadColumn], units: Units) -> Ste
         if role == "event":
             values[role] = whole_numbers(path, name, read)
         else:
-            values[role] = read * units.factor(role, path, name, unit or in_name)
+            values[role] = read * unit_factor(options, role, path, name, unit or in_name)
         if len(read) != len(values["event"]):
             raise CpunetError(
                 f"{path}: columns {name} and {found['event'][0]} differ in length; truncated?"
