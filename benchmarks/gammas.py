@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas import WantedLine, simulate_gammas
+from cpunet.simulation.gammas.sample import WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
 
 N_EVENTS = 3_000

@@ -49,17 +49,6 @@ def test_order_of_rows_is_kept() -> None:
     np.testing.assert_array_equal(hits[1:].offsets, [0, 2, 5])
 
 
-@pytest.mark.parametrize("offsets", [[0, 2], [1, 3], [0, 5, 3], []])
-def test_offsets_that_do_not_fit_are_refused(offsets: list[int]) -> None:
-    with pytest.raises(CpunetError, match="offsets must rise"):
-        Hits.of(np.zeros((3, 3)), np.ones(3), offsets)
-
-
-def test_nothing_to_join_is_refused() -> None:
-    with pytest.raises(CpunetError, match="no sets of hits"):
-        Hits.concatenate([])
-
-
 def test_events_by_their_numbers() -> None:
     hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 3]], [1, 2, 4], [0, 2, 2, 3], [5, 9, 7])
     chosen = hits.of_events([7, 6, 5, 7])

@@ -13,7 +13,7 @@ from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.noise_traces import noise_of
 from cpunet.electronics.other_pulses import draw_other_pulses
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.gammas import with_resolution
+from cpunet.simulation.gammas.sample import with_resolution
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
 """Bits of a trace's flags. A baseline decays if its remainder exceeds the noise RMS."""

@@ -29,7 +29,7 @@ ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
 @dataclass(frozen=True)
-class Library:
+class MadeLibrary:
     """A library of charge pulses that was made.
 
     Parameters
@@ -67,7 +67,7 @@ def make_library(
     settings: Set = (),
     settings_file: str | Path | SimulationSettings | None = None,
     force: bool = False,
-) -> Library:
+) -> MadeLibrary:
     """Simulate the charge pulse of every place in a detector.
 
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
@@ -100,7 +100,7 @@ def make_library(
 
     Returns
     -------
-    Library
+    MadeLibrary
         The file, with numbers of its templates.
 
     Raises
@@ -121,7 +121,7 @@ def make_library(
     angles_deg = _degrees(angles)
     wanted = _settings(settings_file, dt_ns, length_ns)
     counts = _write(detector, out, wanted, grid_mm, angles_deg)
-    return Library(out, **counts)
+    return MadeLibrary(out, **counts)
 
 
 def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:

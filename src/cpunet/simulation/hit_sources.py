@@ -15,7 +15,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
+from cpunet.simulation.gammas.sample import GammaStatistics, WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import hit_parts
 from cpunet.simulation.hit_steps import require_some

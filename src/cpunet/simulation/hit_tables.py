@@ -16,16 +16,17 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
-from cpunet.simulation.hit_columns import (
+from cpunet.simulation.hit_steps import (
     NEEDED,
     ReadColumn,
+    Steps,
     choose,
     detectors_there,
     of_detector,
     roles,
     steps_of,
+    unit_factor,
 )
-from cpunet.simulation.hit_steps import Steps, unit_factor
 from cpunet.simulation.hits import HitOptions
 
 NTUPLES, STEPS = "default_ntuples", "stp"

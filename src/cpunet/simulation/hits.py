@@ -78,7 +78,7 @@ class Hits:
     Raises
     ------
     CpunetError
-        If the lengths disagree, the offsets decrease, or a hit lies beyond `FARTHEST_MM`.
+        If a hit lies beyond `FARTHEST_MM`.
 
     Examples
     --------
@@ -97,24 +97,12 @@ class Hits:
     event_number: IntArray
 
     def __post_init__(self) -> None:
-        n = len(self.edep_kev)
-        for name in ("x_mm", "y_mm", "z_mm", "edep_kev"):
-            if getattr(self, name).shape != (n,):
-                raise CpunetError(f"hits: {name} does not have one value per hit ({n})")
         for values in (self.x_mm, self.y_mm, self.z_mm):
             if np.any(np.abs(values) > FARTHEST_MM):
                 raise CpunetError(
                     f"hits: one lies {np.nanmax(np.abs(values)):g} mm away; check the units "
                     "and the origin"
                 )
-        ends_fit = len(self.offsets) > 0 and self.offsets[0] == 0 and self.offsets[-1] == n
-        if not ends_fit or np.any(np.diff(self.offsets) < 0):
-            raise CpunetError(f"hits: offsets must rise from 0 to the number of hits, {n}")
-        if self.event_number.shape != (len(self.offsets) - 1,):
-            raise CpunetError(
-                f"hits: {len(self.event_number)} event numbers for "
-                f"{len(self.offsets) - 1} events"
-            )
 
     @classmethod
     def of(
@@ -219,8 +207,6 @@ class Hits:
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:
         """Concatenate several sets, keeping the order of events."""
-        if not sets:
-            raise CpunetError("no sets of hits to join")
         counts = [np.diff(s.offsets) for s in sets]
         return cls.of(
             np.concatenate([s.position_mm for s in sets]),
