@@ -140,6 +140,11 @@ SHAPES: dict[str, Detector] = {name: read_detector(name) for name in detector_na
         ditch_depth=3.3, ditch_thickness=5.5, bottom_bullet_radius=7, outer_taper_length=30,
         taper_angle_deg=8, siggen_conventions=False,
     ),
+    "cylinders": crystal(
+        top_cylinder_length=20, top_cylinder_radius=33, bottom_cylinder_length=25,
+        bottom_cylinder_radius=36, bottom_transition_length=6, top_groove_depth=9,
+        top_groove_radius=19, bottom_taper_length=4,
+    ),
     "low": crystal(
         crystal_length=30, bore_length=0, bore_radius=0, ditch_depth=2, ditch_thickness=3,
         top_bullet_radius=4, bottom_taper_length=5, bottom_taper_angle_deg=60, grid_mm=0.5,

@@ -314,7 +314,7 @@ def test_json_indented_by_tabs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("height", 30.0), ("height_in_cm", 3.0), ("extra", {"topgroove": {"depth_in_mm": 3}})],
+    [("height", 30.0), ("height_in_cm", 3.0), ("extra", {"hole": {"depth_in_mm": 3}})],
 )
 def test_unknown_shapes_and_units_are_named(tmp_path: Path, key: str, value: object) -> None:
     diode = {**DIODE, "geometry": {**DIODE["geometry"], key: value}}

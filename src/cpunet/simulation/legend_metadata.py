@@ -43,6 +43,13 @@ _GEOMETRY = {
     "bulletization.top_radius_in_mm": "top_bullet_radius",
     "bulletization.bottom_radius_in_mm": "bottom_bullet_radius",
     "bulletization.borehole_radius_in_mm": "bore_bullet_radius",
+    "extra.topgroove.radius_in_mm": "top_groove_radius",
+    "extra.topgroove.depth_in_mm": "top_groove_depth",
+    "extra.top_cylinder.radius_in_mm": "top_cylinder_radius",
+    "extra.top_cylinder.height_in_mm": "top_cylinder_length",
+    "extra.bottom_cylinder.radius_in_mm": "bottom_cylinder_radius",
+    "extra.bottom_cylinder.height_in_mm": "bottom_cylinder_length",
+    "extra.bottom_cylinder.transition_in_mm": "bottom_transition_length",
     "bulletization.pp-contact_radius_in_mm": "",
     "bulletization.contact_radius_in_mm": "",
 }
@@ -67,13 +74,16 @@ _MEASURED = {
         "characterization.manufacturer.dl_thickness_in_mm",
     ),
 }
-# shapes of `geometry.extra`, and what they do to the crystal unless they are neutral
-_EXTRA = {
-    "crack": "cuts off a side; only axially symmetric crystals are simulated",
-    "topgroove": "is not simulated",
-    "top_cylinder": "is not simulated",
-    "bottom_cylinder": "is not simulated",
-}
+# Shapes that change nothing where their radius is another one, or they have no size.
+_EXTRA = (
+    ("top_groove", "bore_radius", ("top_groove_depth",)),
+    ("top_cylinder", "crystal_radius", ("top_cylinder_length",)),
+    (
+        "bottom_cylinder",
+        "crystal_radius",
+        ("bottom_cylinder_length", "bottom_transition_length"),
+    ),
+)
 # of the argon around LEGEND's detectors
 LIQUID_ARGON_K = 87.0
 _NOT_SIMULATED = {"coax": "semi-coaxial detectors collect on their bore"}
@@ -115,7 +125,7 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     ------
     CpunetError
         If the geometry has an unknown key (for example, one without its unit), lacks one, or
-        has an ``extra`` shape that changes the crystal.
+        has a crack, which is not symmetric.
     """
     kind = diode.get("type")
     if kind is not None and kind not in _SIMULATED:
@@ -128,10 +138,15 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     for key in _REQUIRED:
         if key not in geometry:
             raise CpunetError(f"detector {name}: no geometry.{key}; add it to the file")
-    _refuse_extra(diode["geometry"], name)
+    extra = diode["geometry"].get("extra") or {}
+    if _at(extra, "crack") and _at(extra, "crack.width_in_mm") != 0:
+        raise CpunetError(
+            f"detector {name}: geometry.extra.crack cuts off a side; only axially symmetric "
+            "crystals are simulated; remove it to simulate the crystal without it"
+        )
     values: dict[str, Any] = {"name": str(diode["name"])} if "name" in diode else {}
     for key, value in geometry.items():
-        if key.partition(".")[0] == "extra":
+        if key == "extra" or key.startswith("extra.crack"):
             continue
         if key not in _GEOMETRY:
             raise CpunetError(
@@ -140,6 +155,10 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             )
         if field := _GEOMETRY[key]:
             values[field] = value
+    for shape, same, sizes in _EXTRA:
+        none = not any(values.get(size) for size in sizes)
+        if none or values.get(f"{shape}_radius") == values.get(same, 0):
+            values = {k: v for k, v in values.items() if k not in (f"{shape}_radius", *sizes)}
     outer, inner = (geometry.get(f"groove.radius_in_mm.{x}", 0) for x in ("outer", "inner"))
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = _number(outer, name) - _number(inner, name)
@@ -154,32 +173,6 @@ def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
     """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
     diode_name = str(diode.get("name", name))
     return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
-
-
-def _refuse_extra(geometry: Mapping[str, Any], name: str) -> None:
-    """Refuse the shapes of ``geometry.extra``, but for those that change nothing."""
-    shapes = geometry.get("extra") or {}
-    for shape in shapes:
-        if shape not in _EXTRA:
-            raise CpunetError(
-                f"detector {name}: geometry.extra.{shape} is an unknown shape; remove it"
-            )
-        radius, height, transition, depth, width = (
-            _at(shapes, f"{shape}.{size}_in_mm")
-            for size in ("radius", "height", "transition", "depth", "width")
-        )
-        as_crystal = radius == geometry["radius_in_mm"]
-        neutral = {
-            "crack": width == 0,
-            "topgroove": depth == 0 or radius == (_at(geometry, "borehole.radius_in_mm") or 0),
-            "top_cylinder": height == 0 or as_crystal,
-            "bottom_cylinder": (height == 0 and not transition) or as_crystal,
-        }
-        if not neutral[shape]:
-            raise CpunetError(
-                f"detector {name}: geometry.extra.{shape} {_EXTRA[shape]}; remove it to "
-                "simulate the crystal without it"
-            )
 
 
 def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:

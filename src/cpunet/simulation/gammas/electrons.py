@@ -58,11 +58,17 @@ def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float)
     if z - reach < shape.bottom_bullet:
         narrowing = max(narrowing, shape.bottom_bullet)
     below = max(shape.bottom_taper_end - z + reach, 0.0) * shape.bottom_taper_slope
+    if z + reach > shape.top_step_start:
+        narrowing += shape.top_step
+    if z - reach < shape.bottom_step_end + shape.bottom_transition:
+        below += shape.bottom_step
     if r + reach > shape.radius - narrowing - below:
         return False
     widest = shape.bore_radius
     widest += (shape.length - shape.inner_taper_start) * shape.inner_taper_slope
-    return z + reach < shape.bore_end or r - reach > widest
+    if z + reach > shape.groove_start:
+        widest = max(widest, shape.groove_radius)
+    return z + reach < min(shape.bore_end, shape.groove_start) or r - reach > widest
 
 
 @kernel(error_model="numpy")
