@@ -145,12 +145,29 @@ def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, kind,
     assert any("2 to 4 samples are continued" in message for message in caplog.messages)
 
 
-def test_contacts_of_one_table_are_told_apart(tmp_path):
-    contacts = np.repeat([1, 2], N // 2)
-    columns = {"chnid": Array(contacts), "waveform": waveform(traces(kev()))}
-    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
-    with pytest.raises(CpunetError, match="contacts 1, 2"):
-        open_pulses(tmp_path / "sim.lh5")
+@pytest.mark.parametrize(("table", "n_first"), [("sim/chnid=2", 50), ("chnid=2", 3)])
+def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
+    path, energies, values = tmp_path / "sim.lh5", kev(), traces(kev())
+    contacts = np.repeat([1, 2], [n_first, N - n_first])
+    energy = Array(energies, attrs={"units": "keV"})
+    columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform(values)}
+    lh5.write(Table(col_dict=columns), "sim", path)
+    with pytest.raises(CpunetError, match=r"contacts 1, 2 .*`table` chnid=1"):
+        open_pulses(path)
+    with pytest.raises(CpunetError, match=r"no contact 3 .*; it holds 1, 2"):
+        open_pulses(path, table="chnid=3")
+    source = open_pulses(path, table=table)
+    assert source.n_pulses == N - n_first
+    for size in (7, N):
+        blocks = list(source.blocks(size))
+        found = np.concatenate([block.waveforms for block in blocks])
+        np.testing.assert_array_equal(found, values[n_first:])
+        kev_found = np.concatenate([block.energy_kev for block in blocks])
+        np.testing.assert_array_equal(kev_found, energies[n_first:])
+    with h5py.File(path, "a") as file:
+        file["sim/chnid"][...] = np.arange(N) % 2
+    with pytest.raises(CpunetError, match="the rows of contacts 0, 1 are mixed"):
+        open_pulses(path, table="chnid=1")
 
 
 def test_arrays_that_could_be_traces_are_named(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +32,26 @@ def open_hdf5(options: PulseFile) -> PulseSource:
     with opened(options.path) as file:
         if is_majorana(file):
             return MajoranaSource(options)
-        chosen = choose_waveforms(options.path, file, options.table)
-    return Lh5Source(options, chosen) if chosen.is_lh5 else Hdf5Source(options, chosen)
+        table, _, contact = (options.table or "").partition(f"{_CONTACT}=")
+        chosen = choose_waveforms(options.path, file, table)
+    if chosen.is_lh5:
+        return Lh5Source(options, chosen, contact)
+    return Hdf5Source(options, chosen)
 
 
 class Lh5Source(PulseSource):
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
-    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
+    def __init__(self, options: PulseFile, chosen: WaveformColumn, contact: str = "") -> None:
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
-            n_pulses = _n_rows(file[self._values])
             columns = columns_of(options.path, file[chosen.table or "/"])
-            _require_one_contact(options.path, columns)
+            rows = _rows_of_contact(options.path, columns, contact)
+            self._first, n_pulses = rows or (0, _n_rows(file[self._values]))
+            period = columns_of(options.path, file[chosen.path]).get("dt")
+            if rows is not None:
+                columns = {name: column.part(*rows) for name, column in columns.items()}
+                period = period.part(*rows) if period is not None else None
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
             shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
             if shortest < longest and first.dtype.kind == "f":
@@ -59,19 +66,21 @@ class Lh5Source(PulseSource):
                 length=longest,
                 columns=columns,
                 period_name=f"{chosen.path}/dt",
-                period=columns_of(options.path, file[chosen.path]).get("dt"),
+                period=period,
             )
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
         with opened(self.path) as file:
-            for start in range(0, self.n_pulses or 0, size):
-                yield Traces(self._rows(file, start, size, self.length))
+            n_pulses = self.n_pulses or 0
+            for start in range(0, n_pulses, size):
+                n = min(size, n_pulses - start)
+                yield Traces(self._rows(file, start, n, self.length))
 
     def _rows(
         self, file: h5py.File, start: int, size: int, length: int | None
     ) -> npt.NDArray[Any]:
-        item = file[self._values]
+        item, start = file[self._values], self._first + start
         plain = isinstance(item, h5py.Dataset)
         values = item[start : start + size] if plain else lh5_rows(item, start, size)
         if not hasattr(values, "cumulative_length"):
@@ -107,16 +116,30 @@ def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
     return (int(lengths.min()), int(lengths.max())) if len(lengths) else None
 
 
-def _require_one_contact(path: Path, columns: dict[str, Hdf5Column]) -> None:
-    """Refuse a table with the pulses of several contacts, one after another."""
+def _rows_of_contact(
+    path: Path, columns: dict[str, Hdf5Column], contact: str
+) -> tuple[int, int] | None:
+    """First row and number of rows of a contact, where a table holds several one by one."""
     column = columns.get(_CONTACT)
-    contacts = np.unique(column.read(0, len(column))) if column is not None else ()
-    if len(contacts) > 1:
-        names = ", ".join(map(str, contacts))
+    values = column.read(0, len(column)) if column is not None else np.empty(0)
+    contacts = [str(one) for one in np.unique(values)]
+    if contact and contact not in contacts:
+        held = ", ".join(contacts) or "none"
+        raise CpunetError(f"{path}: no contact {contact} (column {_CONTACT}); it holds {held}")
+    if len(contacts) < 2:
+        return None
+    if not contact:
         raise CpunetError(
-            f"{path}: holds the pulses of contacts {names} (column {_CONTACT})",
-            "give a file with the rows of one contact, the one that is read out",
+            f"{path}: holds the pulses of contacts {', '.join(contacts)} (column {_CONTACT})",
+            f"choose the one that is read out with `table` chnid={contacts[0]}",
         )
+    rows = np.flatnonzero(values == type(values[0])(contact))
+    if len(rows) <= rows[-1] - rows[0]:
+        raise CpunetError(
+            f"{path}: the rows of contacts {', '.join(contacts)} are mixed",
+            "write those of a contact one after another",
+        )
+    return int(rows[0]), len(rows)
 
 
 class Hdf5Source(PulseSource):
@@ -151,6 +174,8 @@ class Hdf5Column:
         Number of values.
     constant
         Whether it is a scalar, which applies to all events.
+    first
+        Row of the first event.
     """
 
     path: Path
@@ -158,16 +183,21 @@ class Hdf5Column:
     units: str
     size: int
     constant: bool
+    first: int = 0
 
     def __len__(self) -> int:
         return self.size
+
+    def part(self, first: int, size: int) -> Hdf5Column:
+        """The rows of some events."""
+        return self if self.constant else replace(self, first=first, size=size)
 
     def read(self, start: int, stop: int) -> npt.NDArray[Any]:
         """Values of the events `start` to `stop` - 1, shape ``(stop - start,)``."""
         with opened(self.path) as file:
             if self.constant:
                 return np.full(stop - start, file[self.dataset][()])
-            return np.asarray(file[self.dataset][start:stop])
+            return np.asarray(file[self.dataset][self.first + start : self.first + stop])
 
 
 def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
@@ -304,6 +334,8 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
     by_name = {column.name: column for column in found}
     for name in _PREFERRED:
         if name in by_name:
+            others = ", ".join(sorted(by_name.keys() - {name}))
+            log.info(f"{path.name}: {name} is read, at the full rate, not {others} (`table`)")
             return by_name[name]
     raise CpunetError(
         f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "
