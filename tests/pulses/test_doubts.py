@@ -170,7 +170,48 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
         open_pulses(path, table="chnid=1")
 
 
+def test_pulses_padded_by_nan_are_continued(tmp_path, caplog):
+    caplog.set_level("INFO", "cpunet")
+    values = np.array([[0, 1, 3, 4], [0, 5, np.nan, np.nan], [0, np.nan, 2, 7], [np.nan] * 4])
+    lh5.write(Table(col_dict={"waveform": waveform(values)}), "sim", tmp_path / "sim.lh5")
+    source = open_pulses(tmp_path / "sim.lh5")
+    found = np.concatenate([block.waveforms for block in source.blocks(2)])
+    expected = [[0, 1, 3, 4], [0, 5, 5, 5], [0, np.nan, 2, 7], [np.nan] * 4]
+    np.testing.assert_array_equal(found, expected)
+    assert sum("padded by NaN" in message for message in caplog.messages) == 1
+
+
+@pytest.mark.parametrize("suffix", ["h5", "npz"])
+def test_reversed_dimensions_are_named(tmp_path, suffix):
+    path, energy = tmp_path / f"julia.{suffix}", kev()
+    arrays = {"waveform": traces(energy).T, "energy_kev": energy}
+    if suffix == "npz":
+        np.savez(path, **arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(arrays)
+    with pytest.raises(CpunetError, match=rf"julia.*\(1400, {N}\) .* reversed; .* transposed"):
+        open_pulses(path, dt_ns=16)
+
+
+def test_units_in_an_array_of_one(tmp_path):
+    columns = {
+        "energy": Array(kev(), attrs={"units": "MeV"}),
+        "waveform": waveform(traces(kev())),
+    }
+    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
+    with h5py.File(tmp_path / "sim.lh5", "a") as file:
+        file["sim/energy"].attrs["units"] = np.array(["MeV"], h5py.string_dtype())
+        file["sim/waveform/dt"].attrs["units"] = np.array([b"ns"])
+    pulses = open_pulses(tmp_path / "sim.lh5").read()
+    np.testing.assert_allclose(pulses.energy_kev, 1000 * kev())
+
+
 def test_arrays_that_could_be_traces_are_named(tmp_path):
+    with h5py.File(tmp_path / "hits.lh5", "w") as file:
+        file["mc/pos"] = np.zeros((50, 3))
+    with pytest.raises(CpunetError, match="no waveforms in it; it holds mc; give a file of"):
+        open_pulses(tmp_path / "hits.lh5")
     with h5py.File(tmp_path / "dsp.lh5", "w") as file:
         file["ch1/dsp/blsub"] = np.zeros((3, 50))
     with pytest.raises(

@@ -101,6 +101,22 @@ def test_decays_of_a_chain_are_events_of_their_own(tmp_path: Path, layout: str) 
     assert read_hits(path, HitOptions(time_window_us=1e-3)).n_events == 3 * N
 
 
+@pytest.mark.parametrize("size", [4, 1000])
+def test_late_deposits_are_counted_once(tmp_path, monkeypatch, caplog, size) -> None:
+    """A third of the events has its second step 500 ns after the first."""
+    monkeypatch.setattr(parts_of, "__defaults__", (size,))
+    time = TIME_NS.copy()
+    time[1::9] += 500
+    path = written(tmp_path, "vectors", steps(time=(time, "ns")))
+    for _ in HitFile(path).open(read_detector("icpc")).blocks:
+        pass
+    (told,) = caplog.messages
+    assert f"{N // 3} events have deposits more than 50 ns after their first" in told
+    caplog.clear()
+    HitFile(path, HitOptions(time_window_us=0.1)).open(read_detector("icpc"))
+    assert not caplog.messages
+
+
 def test_a_description_has_the_same_events(tmp_path: Path) -> None:
     path = written(tmp_path, "flat", steps(det_uid=(np.tile([11, 11, 2], N), "")), "germanium")
     for window_us, table in ((10.0, {"2": N, "11": N}), (1e-3, {"2": N, "11": 2 * N})):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -19,7 +20,9 @@ from cpunet.simulation.gammas.sample import GammaStatistics, WantedLine, simulat
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import hit_parts
 from cpunet.simulation.hit_steps import require_some
-from cpunet.simulation.hits import HitOptions, Hits
+from cpunet.simulation.hits import LATE_NS, HitOptions, Hits
+
+log = logging.getLogger(__name__)
 
 BLOCK_EVENTS = 2000
 # Events per round of the Monte Carlo, and maximum number of gammas per event; the rarest
@@ -151,21 +154,26 @@ class HitFile:
         """
         parts = hit_parts(self.path, self.options)
 
-        def chosen() -> Iterator[Hits]:
-            for hits in parts():
-                yield hits[_in_windows(hits.energy_kev, self.windows)] if self.windows else hits
+        def chosen(hits: Hits) -> Hits:
+            return hits[_in_windows(hits.energy_kev, self.windows)] if self.windows else hits
 
-        n_events, astray = 0, _Astray(detector)
-        for hits in chosen():
-            n_events += hits.n_events
+        n_events, n_late, astray = 0, 0, _Astray(detector)
+        for part in parts():
+            hits = chosen(part)
+            n_events, n_late = n_events + hits.n_events, n_late + part.n_late
             if not self.placed:
                 astray.add(hits)
+        if n_late:
+            log.warning(
+                f"{self.path}: {n_late} events have deposits more than {LATE_NS:g} ns after "
+                "their first, simulated as if at once; a shorter `time_window_us` parts them"
+            )
         if not n_events and self.windows:
             names = ", ".join(window.name for window in self.windows)
             raise CpunetError(f"{self.path}: no event in {names}; widen window_kev")
         require_some(self.path, n_events)
         warning = "" if self.placed else astray.warning(self.path)
-        return OpenHits(n_events, _regrouped(chosen(), BLOCK_EVENTS), warning)
+        return OpenHits(n_events, _regrouped(map(chosen, parts()), BLOCK_EVENTS), warning)
 
     def provenance(self) -> dict[str, Any]:
         """Provenance of the hits, for the output."""

@@ -12,7 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hits import FARTHEST_MM, MAX_KEV, FloatArray, HitOptions, Hits, IntArray
+from cpunet.simulation.hits import (
+    FARTHEST_MM,
+    LATE_NS,
+    MAX_KEV,
+    FloatArray,
+    HitOptions,
+    Hits,
+    IntArray,
+)
 
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
@@ -133,12 +141,17 @@ def to_hits(
     again = np.ones(len(numbers), bool)
     again[np.unique(numbers, return_index=True)[1]] = False
     numbers[again] = first_free + np.arange(again.sum())
-    return Hits.of(
+    hits = Hits.of(
         options.to_crystal(kept.position_mm[order]),
         kept.edep_kev[order],
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
     )
+    if kept.time_ns is None or not len(counts):
+        return hits
+    times, starts = kept.time_ns[order], hits.offsets[:-1]
+    spread = np.maximum.reduceat(times, starts) - np.minimum.reduceat(times, starts)
+    return replace(hits, n_late=int((spread > LATE_NS).sum()))
 
 
 def require_some(path: Path, n_events: int) -> None:

@@ -16,6 +16,8 @@ IntArray = npt.NDArray[np.int64]
 # Larger than any laboratory and any event. Compiled loops convert positions into indices and
 # would overflow beyond.
 FARTHEST_MM, MAX_KEV = 1e7, 1e9
+# Deposits of an event are simulated at once; later ones would change the edge of its pulse.
+LATE_NS = 50.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,9 @@ class Hits:
         Int64 array of ``n_events + 1``, from 0 to the number of hits.
     event_number
         Event numbers of the source.
+    n_late
+        Number of events with a deposit more than `LATE_NS` after their first, where a file
+        tells the times.
 
     Raises
     ------
@@ -95,6 +100,7 @@ class Hits:
     edep_kev: FloatArray
     offsets: IntArray
     event_number: IntArray
+    n_late: int = 0
 
     def __post_init__(self) -> None:
         for values in (self.x_mm, self.y_mm, self.z_mm):

@@ -43,7 +43,7 @@ class Lh5Source(PulseSource):
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
     def __init__(self, options: PulseFile, chosen: WaveformColumn, contact: str = "") -> None:
-        self._values = f"{chosen.path}/values"
+        self._values, self._told, self._name = f"{chosen.path}/values", False, options.path.name
         with opened(options.path) as file:
             columns = columns_of(options.path, file[chosen.table or "/"])
             rows = _rows_of_contact(options.path, columns, contact)
@@ -90,7 +90,7 @@ class Lh5Source(PulseSource):
                     f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
                     f"{traces.shape}; give a file of traces"
                 )
-            return traces
+            return self._continued(traces)
         lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
         expected = int(lengths[0]) if length is None else length
         flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
@@ -106,6 +106,17 @@ class Lh5Source(PulseSource):
         last = np.cumsum(lengths) - 1
         at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
         return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
+
+    def _continued(self, traces: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Pulses padded with NaN, continued with their last value."""
+        if traces.dtype.kind != "f" or not np.isnan(traces[:, -1]).any():
+            return traces
+        n = traces.shape[1] - np.argmax(np.isfinite(traces[:, ::-1]), axis=1)
+        at = np.minimum(np.arange(traces.shape[1]), n[:, np.newaxis] - 1)
+        if not self._told:
+            log.info(f"{self._name}: pulses padded by NaN are continued with their last value")
+        self._told = True
+        return np.take_along_axis(traces, at, axis=1)
 
 
 def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
@@ -150,7 +161,7 @@ class Hdf5Source(PulseSource):
         with opened(options.path) as file:
             dataset = file[chosen.path]
             columns = columns_of(options.path, file[chosen.table or "/"])
-            layout = Layout.of_array("HDF5", chosen.path, dataset.shape, columns)
+            layout = Layout.of_array(options.path, "HDF5", chosen.path, dataset.shape, columns)
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
@@ -300,7 +311,8 @@ def _no_waveforms(path: Path, file: h5py.File) -> CpunetError:
     arrays: list[str] = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf":
+        traces = isinstance(item, h5py.Dataset) and item.ndim == 2 and item.shape[1] > 3
+        if traces and item.dtype.kind in "iuf":  # of three columns are positions
             arrays.append(name)
 
     file.visititems(look)
