@@ -70,7 +70,7 @@ def compare(height_mm: float, expected: tuple[float, ...]) -> None:
             seed=seed,
         )
         gammas += seen.n_primaries
-        hit += seen.hit_fraction * seen.n_primaries
+        hit += seen.spectrum.sum()
         kev = hits.energy_kev
         found += [(np.abs(kev - line) < 1).sum() for line in LINES_KEV]
     print(f"source {height_mm:.0f} mm above, of Geant4's: hit", end=" ")

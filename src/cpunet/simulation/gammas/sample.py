@@ -42,15 +42,6 @@ class GammaStatistics:
     n_primaries: int
     spectrum: npt.NDArray[np.int64]
 
-    @property
-    def hit_fraction(self) -> float:
-        """Fraction of the primaries that deposited energy in the crystal."""
-        return float(self.spectrum.sum() / self.n_primaries)
-
-    def fraction(self, low_kev: int, high_kev: int) -> float:
-        """Fraction of the primaries with an energy of `low_kev` to `high_kev` (whole keV)."""
-        return float(self.spectrum[low_kev:high_kev].sum() / self.n_primaries)
-
 
 def simulate_gammas(
     detector: Detector,
