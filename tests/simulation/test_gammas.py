@@ -237,24 +237,6 @@ def test_compton_mean_energy_is_that_of_klein_and_nishina() -> None:
     assert drawn == pytest.approx(np.sum(weight * share) / weight.sum(), rel=0.01)
 
 
-def test_tapers_bore_and_ditch_are_cut_out() -> None:
-    shape = CrystalShape.of(
-        crystal(
-            bore_bullet_radius=5,
-            outer_taper_length=35,
-            inner_taper_length=20,
-            taper_angle_deg=10,
-            ditch_depth=2,
-            ditch_thickness=3,
-        )
-    )
-    inside = {(0, 20): True, (0, 26.2): False, (4.5, 26.2): True, (4.5, 50): False}
-    inside |= {(12, 1): False, (12, 2.5): True, (15, 1): True, (40, 50): True, (40, 90): False}
-    inside |= {(8, 95): False, (9, 95): True, (10, 96.1): False, (10, -0.1): False}
-    for (r, z), truth in inside.items():
-        assert in_germanium(shape, r, 0.0, z) is truth, (r, z)
-
-
 def test_resolution_has_the_width_asked_for() -> None:
     energy = with_resolution(np.full(40_000, 2614.5), noise_kev2=1.0, fano_kev=0.002, seed=1)
     assert energy.std() * 2.3548 == pytest.approx(np.sqrt(1 + 0.002 * 2614.5), rel=0.02)

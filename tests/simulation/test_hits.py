@@ -36,13 +36,6 @@ def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject)
     assert both.n_events == hits.n_events
 
 
-def test_hits_can_be_left_out() -> None:
-    hits = hits_with([2, 0, 3])
-    kept = hits.where(np.array([False, False, True, False, True]))
-    np.testing.assert_array_equal(kept.offsets, [0, 0, 0, 2])
-    np.testing.assert_array_equal(kept.z_mm, hits.z_mm[[2, 4]])
-
-
 def test_order_of_rows_is_kept() -> None:
     hits = hits_with([1, 2, 3])
     np.testing.assert_array_equal(hits[np.array([2, 0])].event_number, [20, 0])

@@ -12,7 +12,6 @@ from cpunet.settings import Set, checked, key_values, names, read_text, read_val
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_metadata import (
     LIQUID_ARGON_K,
-    LONGEST_MM,
     crystal_and_slice,
     impurity_values,
     why_missing,
@@ -169,7 +168,7 @@ def holds_detector(path: str | Path) -> bool:
     place = Path(path)
     if str(path) in detector_names() or place.suffix.lower() in _MAPPINGS:
         return True
-    if not _is_file(place):
+    if not place.is_file():
         return False
     with place.open("rb") as file:
         return b"xtal_length" in file.read(_SIGGEN_BYTES)
@@ -186,7 +185,7 @@ def _legend(
         for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
         for suffix in _MAPPINGS
     ]
-    found = Path(crystal) if crystal else next(filter(_is_file, places), None)
+    found = Path(crystal) if crystal else next(filter(Path.is_file, places), None)
     hints = {field: why for field in Detector.model_fields if (why := why_missing(field))}
     hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
     if found is None:
@@ -196,19 +195,11 @@ def _legend(
     if content.get("impurity_curve") is None and crystal is None:
         return values, hints
     length = values["crystal_length"]
-    if not isinstance(length, int | float) or length > LONGEST_MM:
+    if not isinstance(length, int | float):
         return values, hints  # refused together with the rest of the geometry
     # the curve describes the whole crystal and replaces a line through a few points
     values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
     return values | impurity_values(content, str(found), slice_name, length), hints
-
-
-def _is_file(path: Path) -> bool:
-    """Whether there is such a file; False for names that no file can have."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
 
 
 def siggen_values(text: str, name: str) -> dict[str, Any]:

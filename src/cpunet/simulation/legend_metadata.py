@@ -105,7 +105,6 @@ MODELS = {
 }
 _ANOTHER = "correct it, or take another file of the crystal"
 _LARGEST_EXPONENT = 300
-LONGEST_MM = 1e6  # of any boule; squares of larger numbers may overflow
 
 
 def why_missing(field: str) -> str:
@@ -275,8 +274,6 @@ def impurity_values(
     b, c, n = (numbers.get(key, 0.0) for key in "bcn")
     place = f"slices.{slice_name}.detector_offset_in_mm"
     contact = _number_at(crystal, place, source)
-    if abs(contact) > LONGEST_MM:
-        raise CpunetError(f"{source}: {place} = {contact:g} is too large; {_ANOTHER}")
     scale = _number_at(crystal, "impurity_curve.corrections.scale", source, 1.0)
     offset = _number_at(crystal, "impurity_curve.corrections.offset", source, 0.0)
     # z of the boule is that of the contact minus the detector's z; 1e9 acceptors are -0.1 of
