@@ -170,17 +170,6 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
         open_pulses(path, table="chnid=1")
 
 
-def test_pulses_padded_by_nan_are_continued(tmp_path, caplog):
-    caplog.set_level("INFO", "cpunet")
-    values = np.array([[0, 1, 3, 4], [0, 5, np.nan, np.nan], [0, np.nan, 2, 7], [np.nan] * 4])
-    lh5.write(Table(col_dict={"waveform": waveform(values)}), "sim", tmp_path / "sim.lh5")
-    source = open_pulses(tmp_path / "sim.lh5")
-    found = np.concatenate([block.waveforms for block in source.blocks(2)])
-    expected = [[0, 1, 3, 4], [0, 5, 5, 5], [0, np.nan, 2, 7], [np.nan] * 4]
-    np.testing.assert_array_equal(found, expected)
-    assert sum("padded by NaN" in message for message in caplog.messages) == 1
-
-
 @pytest.mark.parametrize("suffix", ["h5", "npz"])
 def test_reversed_dimensions_are_named(tmp_path, suffix):
     path, energy = tmp_path / f"julia.{suffix}", kev()

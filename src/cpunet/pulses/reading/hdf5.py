@@ -44,7 +44,7 @@ class Lh5Source(PulseSource):
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
     def __init__(self, options: PulseFile, chosen: WaveformColumn, contact: str = "") -> None:
-        self._values, self._told, self._name = f"{chosen.path}/values", False, options.path.name
+        self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
             columns = columns_of(options.path, file[chosen.table or "/"])
             rows = _rows_of_contact(options.path, columns, contact)
@@ -91,7 +91,7 @@ class Lh5Source(PulseSource):
                     f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
                     f"{traces.shape}; give a file of traces"
                 )
-            return self._continued(traces)
+            return traces
         lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
         expected = int(lengths[0]) if length is None else length
         flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
@@ -107,17 +107,6 @@ class Lh5Source(PulseSource):
         last = np.cumsum(lengths) - 1
         at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
         return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
-
-    def _continued(self, traces: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Pulses padded with NaN, continued with their last value."""
-        if traces.dtype.kind != "f" or not np.isnan(traces[:, -1]).any():
-            return traces
-        n = traces.shape[1] - np.argmax(np.isfinite(traces[:, ::-1]), axis=1)
-        at = np.minimum(np.arange(traces.shape[1]), n[:, np.newaxis] - 1)
-        if not self._told:
-            log.info(f"{self._name}: pulses padded by NaN are continued with their last value")
-        self._told = True
-        return np.take_along_axis(traces, at, axis=1)
 
 
 def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
