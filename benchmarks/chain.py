@@ -25,9 +25,8 @@ from lgdo import Array, Table, VectorOfVectors
 from streaming import write_fast_run
 
 from cpunet.recipes import load_recipe
-from cpunet.simulation.energy_windows import energy_windows
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource
+from cpunet.simulation.hit_sources import GammaSource, energy_windows
 from cpunet.simulation.hits import Hits
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas import WantedLine, simulate_gammas
+from cpunet.simulation.gammas.sample import WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
 
 N_EVENTS = 3_000
@@ -70,7 +70,7 @@ def compare(height_mm: float, expected: tuple[float, ...]) -> None:
             seed=seed,
         )
         gammas += seen.n_primaries
-        hit += seen.hit_fraction * seen.n_primaries
+        hit += seen.spectrum.sum()
         kev = hits.energy_kev
         found += [(np.abs(kev - line) < 1).sum() for line in LINES_KEV]
     print(f"source {height_mm:.0f} mm above, of Geant4's: hit", end=" ")

@@ -14,9 +14,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource
+from cpunet.simulation.hit_sources import EnergyWindow, GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift
@@ -54,7 +53,7 @@ def _crossing(smooth: npt.NDArray[np.float64], level: float) -> npt.NDArray[np.f
 def main() -> None:
     detector = read_detector("icpc")
     settings = SimulationSettings(dt_ns=4, length_ns=2400)
-    source = GammaSource((Window("FEP", 2614.0, 2615.0),), (EVENTS,), 20.0, 5.0, 1)
+    source = GammaSource((EnergyWindow("FEP", 2614.0, 2615.0),), (EVENTS,), 20.0, 5.0, 1)
     hits = merge_hits(Hits.concatenate(list(source.open(detector).blocks)), detector, 0.05)
     same = SameHits(hits)
     first = {}

@@ -25,15 +25,15 @@ import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.legend.peak_currents import currents_about_peak, heights
-from cpunet.legend.realistic_library import read_library
+from cpunet.legend.current_library import read_library
+from cpunet.legend.currents import currents_about_peak, heights
 from cpunet.legend.templates import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.translation.translator import REN
@@ -58,7 +58,7 @@ def run(*words: object) -> None:
 
 def events_of(path: Path, detector: str) -> Hits:
     """Events above 600 keV: their hits merged, those in the lithium left out."""
-    hits = read_hits(path).hits
+    hits = read_hits(path)
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
     maps = drift_maps(compute_fields(read_detector(detector)), SETTINGS)
     places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)
@@ -72,7 +72,7 @@ def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
     translate = TemplateTranslator(REN.load(folder), 1.0)
     for first in range(0, hits.n_events, 500):
         waveforms = simulate_events(fields, hits[first : first + 500], SETTINGS).waveforms
-        found.append(heights(currents_about_peak(translate(waveforms)[0])[0]) / mode)
+        found.append(heights(currents_about_peak(translate(waveforms))[0]) / mode)
     return np.concatenate(found)
 
 
@@ -131,7 +131,7 @@ def main() -> None:
         ideal, whole = Path(folder) / "ideal.lh5", Path(folder) / "psl.lh5"
         run("library", "make", "--detector", given.detector, "--grid-mm", given.grid_mm,
             "--out", ideal)  # fmt: skip
-        words = ["library", "translate", given.run, ideal, "--format", "simflow"]
+        words = ["library", "translate", given.run, ideal]
         name = read_detector(given.detector).name
         words += ["--detector", name] if name else []
         run(*words, "--out", whole)

@@ -18,11 +18,11 @@ import numpy.typing as npt
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand_sides import Side, stand_sides
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_sources import EnergyWindow
 from cpunet.simulation.shifted import Shift
 
-FEP = Window("FEP", 2609.511, 2619.511)
+FEP = EnergyWindow("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")
 SITE_MM, LOST_KEV = 1.0, 0.5
 Values = npt.NDArray[np.float64]

@@ -18,8 +18,8 @@ import numpy as np
 import scipy.fft
 
 from cpunet.electronics.exponentials import Exponentials
+from cpunet.legend.currents import currents_about_peak, heights
 from cpunet.legend.lithium import LithiumLayer, arrived, delayed
-from cpunet.legend.peak_currents import currents_about_peak, heights
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector

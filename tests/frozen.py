@@ -63,7 +63,7 @@ LANES: list[dict[str, list[str]]] = [
         ],
         "library": [
             "library make --detector ppc --grid-mm 6 --out library.lh5",
-            "library translate matched library.lh5 --out behind.lh5",
+            "library translate matched library.lh5 --detector ppc --out behind.lh5",
         ],
         "network": [
             f"train --recipe paper {STAND.format('stand')} --out network"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import h5py
@@ -215,27 +214,21 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     return path
 
 
-def test_hits_are_compared_with_a_crystal(tmp_path):
-    """Hits of an upturned crystal that stands elsewhere; the remedy puts them inside."""
+def test_hits_are_compared_with_a_crystal(reference_data: Path, tmp_path):
+    """Hits of a crystal without the taper, and the same where it stands turned over."""
+    path = reference_data / "geant4" / "g4_h20mm.npz"
     crystal = read_detector("icpc")
-    rng = np.random.default_rng(3)
-    place = rng.uniform(-1, 1, (20000, 3)) * [40.4, 40.4, 48] + [0, 0, 48]
-    place = place[crystal.inside(np.hypot(place[:, 0], place[:, 1]), place[:, 2])]
-    moved = place * [1, -1, -1] + [25.0, -10.0, 200.0]
-    path = tmp_path / "hits.npz"
-    columns = dict(zip(("x_mm", "y_mm", "z_mm"), moved.T, strict=True))
-    offsets = np.arange(len(moved) + 1)
-    np.savez(path, **columns, edep_keV=np.full(len(moved), 100.0), offsets=offsets)
-    told = info(path, detector=crystal).values["detectors"][""]["crystal"]
-    assert told["outside_percent"] > 90
-    assert told["fits"]["flip_z"]
-    assert told["fits"]["origin_mm"] == pytest.approx([25, -10, 200], abs=0.5)
-    assert told["fits"]["inside_percent"] > 98
-    assert re.fullmatch(r"`origin` [\d. -]+ `flip_z`", told["fits"]["options"])
-    origin = tuple(told["fits"]["origin_mm"])
-    there = info(path, detector=crystal, frame=HitOptions(origin=origin, flip_z=True))
-    inside = there.values["detectors"][""]["crystal"]["inside_percent"]
-    assert inside == told["fits"]["inside_percent"]
+    right = info(path, detector=crystal).values["detectors"][""]["crystal"]
+    assert right["outside_percent"] == pytest.approx(10.5, abs=0.3)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in ("x_mm", "edep_keV", "offsets")}
+        arrays |= {"y_mm": -file["y_mm"] - 10, "z_mm": 200 - file["z_mm"]}
+    np.savez(tmp_path / "moved.npz", **arrays)
+    moved = info(tmp_path / "moved.npz", detector=crystal)
+    assert "100.00 % of the hits; check `origin`, `flip_z`" in str(moved)
+    given = HitOptions(origin=(0, -10, 200), flip_z=True)
+    told = info(tmp_path / "moved.npz", detector=crystal, frame=given).values["detectors"][""]
+    assert told["crystal"] == pytest.approx(right)
 
 
 def test_traces_that_are_no_numbers(tmp_path):
@@ -297,11 +290,11 @@ def test_the_command_line(tmp_path, capsys, monkeypatch):
         "ppc", "--set", "grid_mm=0.5", "--set=bias_V=2600"
     )
     hits = tmp_path / "hits.npz"
-    place = {name: [100.0, 101.0] for name in ("x_mm", "y_mm", "z_mm")}
+    place = {"x_mm": [100.0, 101.0], "y_mm": [100.0, 101.0], "z_mm": [-20.0, -21.0]}
     np.savez(hits, **place, edep_keV=[100.0, 200.0], offsets=np.array([0, 2]))
-    assert "100.00 % would be inside with --origin" in told(hits, "--detector", "icpc")
+    assert "100.00 % of the hits; check --origin, --flip-z" in told(hits, "--detector", "icpc")
     words = ("--origin", 100, 100, "-1.5", "--flip-z")
-    assert "inside   0.00 %" in told(hits, "--detector", "icpc", *words)
+    assert "outside  0.00 %" in told(hits, "--detector", "icpc", *words)
     table = tmp_path / "channels.h5"
     with h5py.File(table, "w") as made:
         for name in ("ch3", "ch7"):

@@ -16,7 +16,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 from cpunet.training.published import import_weights
 
 

@@ -72,10 +72,10 @@ if TYPE_CHECKING:
     from cpunet.electronics.stand import Stand, make_stand
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
+    from cpunet.legend.current_library import expand_library, merge_libraries, read_library
     from cpunet.legend.export import LegendParameters, export_legend
     from cpunet.legend.lithium import LithiumLayer, lithium_table
     from cpunet.legend.make_library import make_library
-    from cpunet.legend.realistic_library import expand_library, merge_libraries, read_library
     from cpunet.legend.translate_library import translate_library
     from cpunet.pulses.container import Pulses
     from cpunet.pulses.reading import open_pulses
@@ -118,7 +118,7 @@ _HOMES = {
         "lithium_table",
     ),
     "legend.make_library": ("make_library",),
-    "legend.realistic_library": (
+    "legend.current_library": (
         "expand_library",
         "merge_libraries",
         "read_library",

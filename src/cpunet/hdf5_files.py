@@ -9,6 +9,7 @@ from typing import Any
 
 import h5py
 import hdf5plugin  # noqa: F401 - provides the compression filters of LEGEND's files
+import numpy as np
 
 from cpunet.errors import CpunetError
 
@@ -57,8 +58,9 @@ def lh5_rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> Any:
 
 
 def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
-    """A text attribute, ``""`` if it is missing."""
+    """A text attribute, ``""`` if it is missing; some programs write it as an array of one."""
     value = item.attrs.get(name, "")
+    value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 

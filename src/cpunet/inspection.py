@@ -121,7 +121,7 @@ def info(
     read
         How a file of pulses is read.
     detector
-        Crystal of hits (icpc, bege, ppc or a file): how many are inside, the frame that fits.
+        Crystal of hits (icpc, bege, ppc or a file): how many lie outside.
     frame
         How a file of hits is read.
     settings
@@ -215,7 +215,7 @@ def _look(
     if Path(path).is_dir():
         return _folder(path)
     from cpunet.recipes import load_recipe
-    from cpunet.simulation.hit_readers import holds_hits
+    from cpunet.simulation.hit_files import holds_hits
 
     recipe = load_recipe("fast")
     if holds_hits(path):

@@ -189,10 +189,6 @@ MISTAKES = {
     "impossible value": Mistake(
         f"{TRAIN} --set training.steps=-1", r"fast: training.steps: .*"
     ),
-    "options that exclude each other": Mistake(
-        "library translate run sim.lh5 --out out --rings 2",
-        r".*--rings.*--format simflow; add it",
-    ),
     "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
     "option left out": Mistake("validate run --sim sim.lh5", r".*--data.*--help"),
     "export without its extra": Mistake(

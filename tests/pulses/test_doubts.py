@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+import h5py
 import lh5
 import numpy as np
 import pytest
@@ -144,9 +145,65 @@ def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, kind,
     assert any("2 to 4 samples are continued" in message for message in caplog.messages)
 
 
-def test_contacts_of_one_table_are_told_apart(tmp_path):
-    contacts = np.repeat([1, 2], N // 2)
-    columns = {"chnid": Array(contacts), "waveform": waveform(traces(kev()))}
+@pytest.mark.parametrize(("table", "n_first"), [("sim/chnid=2", 50), ("chnid=2", 3)])
+def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
+    path, energies, values = tmp_path / "sim.lh5", kev(), traces(kev())
+    contacts = np.repeat([1, 2], [n_first, N - n_first])
+    energy = Array(energies, attrs={"units": "keV"})
+    columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform(values)}
+    lh5.write(Table(col_dict=columns), "sim", path)
+    with pytest.raises(CpunetError, match=r"contacts 1, 2 .*`table` chnid=1"):
+        open_pulses(path)
+    with pytest.raises(CpunetError, match=r"no contact 3 .*; it holds 1, 2"):
+        open_pulses(path, table="chnid=3")
+    source = open_pulses(path, table=table)
+    assert source.n_pulses == N - n_first
+    for size in (7, N):
+        blocks = list(source.blocks(size))
+        found = np.concatenate([block.waveforms for block in blocks])
+        np.testing.assert_array_equal(found, values[n_first:])
+        kev_found = np.concatenate([block.energy_kev for block in blocks])
+        np.testing.assert_array_equal(kev_found, energies[n_first:])
+    with h5py.File(path, "a") as file:
+        file["sim/chnid"][...] = np.arange(N) % 2
+    with pytest.raises(CpunetError, match="the rows of contacts 0, 1 are mixed"):
+        open_pulses(path, table="chnid=1")
+
+
+@pytest.mark.parametrize("suffix", ["h5", "npz"])
+def test_reversed_dimensions_are_named(tmp_path, suffix):
+    path, energy = tmp_path / f"julia.{suffix}", kev()
+    arrays = {"waveform": traces(energy).T, "energy_kev": energy}
+    if suffix == "npz":
+        np.savez(path, **arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(arrays)
+    with pytest.raises(CpunetError, match=rf"julia.*\(1400, {N}\) .* reversed; .* transposed"):
+        open_pulses(path, dt_ns=16)
+
+
+def test_units_in_an_array_of_one(tmp_path):
+    columns = {
+        "energy": Array(kev(), attrs={"units": "MeV"}),
+        "waveform": waveform(traces(kev())),
+    }
     lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
-    with pytest.raises(CpunetError, match="contacts 1, 2"):
-        open_pulses(tmp_path / "sim.lh5")
+    with h5py.File(tmp_path / "sim.lh5", "a") as file:
+        file["sim/energy"].attrs["units"] = np.array(["MeV"], h5py.string_dtype())
+        file["sim/waveform/dt"].attrs["units"] = np.array([b"ns"])
+    pulses = open_pulses(tmp_path / "sim.lh5").read()
+    np.testing.assert_allclose(pulses.energy_kev, 1000 * kev())
+
+
+def test_arrays_that_could_be_traces_are_named(tmp_path):
+    with h5py.File(tmp_path / "hits.lh5", "w") as file:
+        file["mc/pos"] = np.zeros((50, 3))
+    with pytest.raises(CpunetError, match="no waveforms in it; it holds mc; give a file of"):
+        open_pulses(tmp_path / "hits.lh5")
+    with h5py.File(tmp_path / "dsp.lh5", "w") as file:
+        file["ch1/dsp/blsub"] = np.zeros((3, 50))
+    with pytest.raises(
+        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*`table`"
+    ):
+        open_pulses(tmp_path / "dsp.lh5")

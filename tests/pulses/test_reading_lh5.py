@@ -140,7 +140,8 @@ def test_several_tables_need_a_choice(file, raw):
         np.testing.assert_array_equal(values, raw + np.uint16(3))
 
 
-def test_of_several_columns_the_full_record_is_taken(file, raw):
+def test_of_several_columns_the_full_rate_is_taken_and_told(file, raw, caplog):
+    caplog.set_level("INFO", "cpunet")
     presummed = raw[:, ::4].astype(np.uint32)
     columns = {
         "waveform_presummed": waveform_table(presummed, 64.0),
@@ -148,6 +149,8 @@ def test_of_several_columns_the_full_record_is_taken(file, raw):
     }
     lh5.write(Table(col_dict=columns), "raw", file)
     assert open_pulses(file).describe()["table"] == "raw/waveform_windowed"
+    (told,) = caplog.messages
+    assert "waveform_windowed is read, at the full rate, not waveform_presummed" in told
     other = open_pulses(file, table="raw/waveform_presummed")
     assert (other.dt_ns, other.length) == (64.0, 10)
 

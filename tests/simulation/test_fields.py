@@ -86,11 +86,6 @@ def test_an_undepleted_detector_is_refused() -> None:
         compute_fields(read_detector("icpc", [*COARSE, "impurity_z0_1e10_per_cm3=-90"]))
 
 
-def test_a_grid_too_fine_is_refused() -> None:
-    with pytest.raises(CpunetError, match="grid_mm"):
-        compute_fields(read_detector("icpc", ["grid_mm=0.02"]))
-
-
 def test_solved_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG", "cpunet")
     detector = read_detector("icpc", COARSE)
@@ -130,11 +125,6 @@ def test_a_cache_that_cannot_be_written_is_none(
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CPUNET_CACHE", str(tmp_path / "file"))
     assert compute_fields(read_detector("icpc", COARSE)).depletion_V > 0
-
-
-def test_no_cache_leaves_nothing_behind(cache_folder: Path) -> None:
-    compute_fields(read_detector("icpc", COARSE), cache=False)
-    assert not cache_folder.exists()
 
 
 PARTS: dict[str, list[str]] = {

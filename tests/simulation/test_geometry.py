@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -56,6 +57,46 @@ def test_lithium_is_as_thick_as_said_on_a_taper(taper: str) -> None:
             r + depth * into_r * math.cos(angle),
             z + depth * into_z * math.sin(angle),
         )
+        assert (detector.inside(*at), detector.active(*at)) == (inside, active)
+
+
+CYLINDERS = {
+    "top_cylinder_length": 20, "top_cylinder_radius": 33, "bottom_cylinder_length": 25,
+    "bottom_cylinder_radius": 36, "bottom_transition_length": 6, "top_groove_depth": 9,
+    "top_groove_radius": 19, "outer_taper_length": 0,
+}  # fmt: skip
+
+
+def test_cylinders_and_a_groove_take_off_their_volumes() -> None:
+    r, z = (np.arange(n * 20) / 20 + 0.025 for n in (41, 96))
+    ring = 2 * math.pi * r[:, np.newaxis] * 0.05**2
+
+    def volume(detector: Detector) -> float:
+        return float((ring * detector.inside(*np.meshgrid(r, z, indexing="ij"))).sum())
+
+    radius = ICPC.crystal_radius
+    cone = math.pi * 6 * (radius**2 - (radius**2 + 36 * radius + 36**2) / 3)
+    expected = math.pi * (20 * (radius**2 - 33**2) + 25 * (radius**2 - 36**2)) + cone
+    expected += math.pi * 9 * (19**2 - ICPC.bore_radius**2)
+    less = volume(changed(outer_taper_length=0)) - volume(changed(**CYLINDERS))
+    assert less == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("place", "inwards"),
+    [
+        ((33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
+        ((38.0, 76.0), (0, -1)),  # step below it
+        ((36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
+        ((36 + 4.45 / 2, 28.0), (-6 / math.hypot(6, 4.45), 4.45 / math.hypot(6, 4.45))),
+        ((19.0, 92.0), (1, 0)),  # wall of the groove
+        ((12.0, 87.0), (0, -1)),  # its floor
+    ],
+)
+def test_lithium_is_as_thick_as_said_on_cylinders_and_a_groove(place, inwards) -> None:
+    detector = changed(**CYLINDERS)
+    for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
+        at = [x + depth * step for x, step in zip(place, inwards, strict=True)]
         assert (detector.inside(*at), detector.active(*at)) == (inside, active)
 
 
@@ -127,6 +168,10 @@ def test_impurities_follow_their_terms() -> None:
         ({"bottom_taper_length": 35}, "bottom_taper_length"),
         ({"top_bullet_radius": 2}, "top_bullet_radius"),
         ({"bottom_bullet_radius": 2, "bottom_taper_length": 2}, "bottom_bullet_radius"),
+        ({"bottom_transition_length": 3}, "bottom_cylinder_radius must be above 0"),
+        ({"top_groove_depth": 3}, "top_groove_radius"),
+        (CYLINDERS | {"bottom_cylinder_length": 75}, "cylinder_length exceed crystal_length"),
+        (CYLINDERS | {"top_groove_radius": 32}, "leaves no germanium at the top"),
         ({"impurity_gradient_1e10_per_cm4": 0.5}, "impurity"),
         ({"point_contact_radius": 0.15}, "grid_mm"),
         ({"crystal_length": -1}, "crystal_length"),

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.hits import Hits
+from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.hits import FARTHEST_MM, Hits
 
 
 def hits_with(counts: list[int], seed: int = 0) -> Hits:
@@ -35,28 +36,10 @@ def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject)
     assert both.n_events == hits.n_events
 
 
-def test_hits_can_be_left_out() -> None:
-    hits = hits_with([2, 0, 3])
-    kept = hits.where(np.array([False, False, True, False, True]))
-    np.testing.assert_array_equal(kept.offsets, [0, 0, 0, 2])
-    np.testing.assert_array_equal(kept.z_mm, hits.z_mm[[2, 4]])
-
-
 def test_order_of_rows_is_kept() -> None:
     hits = hits_with([1, 2, 3])
     np.testing.assert_array_equal(hits[np.array([2, 0])].event_number, [20, 0])
     np.testing.assert_array_equal(hits[1:].offsets, [0, 2, 5])
-
-
-@pytest.mark.parametrize("offsets", [[0, 2], [1, 3], [0, 5, 3], []])
-def test_offsets_that_do_not_fit_are_refused(offsets: list[int]) -> None:
-    with pytest.raises(CpunetError, match="offsets must rise"):
-        Hits.of(np.zeros((3, 3)), np.ones(3), offsets)
-
-
-def test_nothing_to_join_is_refused() -> None:
-    with pytest.raises(CpunetError, match="no sets of hits"):
-        Hits.concatenate([])
 
 
 def test_events_by_their_numbers() -> None:
@@ -69,3 +52,8 @@ def test_events_by_their_numbers() -> None:
     assert twice.of_events([7]).energy_kev.tolist() == [4]
     with pytest.raises(CpunetError, match="several events have the number 5"):
         twice.of_events([7, 5])
+
+
+def test_hits_at_the_edge_of_what_is_allowed_are_merged() -> None:
+    places = [[FARTHEST_MM, 0, 0], [-FARTHEST_MM, 0, 0]]
+    assert cluster_hits(Hits.of(places, [1.0, 1.0], [0, 2]), 0.05).n_events == 1

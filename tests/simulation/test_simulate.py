@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +20,14 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.settings import read_settings
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.energy_windows import Window, energy_windows
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import Transform, read_hits
-from cpunet.simulation.hit_sources import GammaSource, HitFile, OpenHits
+from cpunet.simulation.hit_files import read_hits
+from cpunet.simulation.hit_sources import (
+    GammaSource,
+    HitFile,
+    energy_windows,
+)
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
@@ -122,7 +124,7 @@ def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
 def test_kept_hits_read_back_as_they_were(ppc, source, tmp_path: Path):
     out, again = tmp_path / "sim.lh5", tmp_path / "again.lh5"
     simulate(out, detector=ppc, hits=source, settings_file=SETTINGS)
-    kept = read_hits(out).hits
+    kept = read_hits(out)
     assert np.array_equal(kept.position_mm, HITS[:2].position_mm)
     assert np.array_equal(kept.edep_kev, HITS[:2].edep_kev)
     assert np.array_equal(kept.offsets, HITS[:2].offsets)
@@ -191,20 +193,6 @@ def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
     assert first.energy_kev == pytest.approx(second.energy_kev)
 
 
-def test_only_events_in_the_windows_of_a_file(ppc, source, tmp_path: Path):
-    out = tmp_path / "sim.lh5"
-    summary = simulate(out, detector=ppc, hits=source, events="900-1100")
-    assert (summary.n_events, summary.lines) == (1, {"900-1100": 1})
-    with pytest.raises(CpunetError, match="no event in none"):
-        replace(source, windows=(Window("none", 1, 2),)).open(ppc)
-
-
-def test_hits_all_outside_say_where_they_are(ppc, source):
-    away = replace(source, transform=Transform((0, 0, -500)))
-    with pytest.raises(CpunetError, match=r"5 hits lie outside ppc .* z 520 to 800 mm; move"):
-        away.open(ppc)
-
-
 def test_hits_outside_are_told(ppc, source, tmp_path: Path, caplog):
     simulate(tmp_path / "sim.lh5", detector=ppc, hits=source, settings_file=SETTINGS)
     # one of five, at z = 300 mm
@@ -250,17 +238,6 @@ def test_no_event_with_a_signal(ppc, tmp_path: Path):
     assert not (tmp_path / "sim.lh5").exists()
 
 
-def test_an_interrupted_run_leaves_nothing(ppc, tmp_path: Path, monkeypatch):
-    def blocks() -> Iterator[Hits]:
-        yield HITS
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(GammaSource, "open", lambda *_: OpenHits(8, blocks()))
-    with pytest.raises(KeyboardInterrupt):
-        simulate(tmp_path / "sim.lh5", detector=ppc, events="FEP=8", settings_file=SETTINGS)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_diffusion_constant_is_kept_and_widens_the_edge(ppc, source, tmp_path: Path):
     out = tmp_path / "sim.lh5"
     steepest = {}
@@ -277,25 +254,6 @@ def test_the_diffusion_constant_is_kept_and_widens_the_edge(ppc, source, tmp_pat
         out, detector=ppc, hits=source, settings={"diffusion": False, "dt_ns": 1}, force=True
     )
     assert steepest["siggen"] < np.diff(next(open_pulses(out).blocks()).waveforms).max()
-
-
-def test_progress_reaches_the_number_of_events(ppc, source, tmp_path: Path, stages):
-    simulate(tmp_path / "sim.lh5", detector=ppc, hits=source, settings_file=SETTINGS)
-    assert stages["Simulating ppc"] == [4, 4]
-
-
-def test_settings_of_a_file_and_on_top(tmp_path: Path):
-    path = tmp_path / "settings.yaml"
-    path.write_text("dt_ns: 8\nlength_ns: 800\n")
-    settings = read_settings(SimulationSettings, path, {"length_ns": 1600})
-    assert (settings.dt_ns, settings.length_ns, settings.diffusion) == (8, 1600, True)
-
-
-def test_settings_in_json_indented_by_tabs(tmp_path: Path):
-    path = tmp_path / "settings.json"
-    path.write_text(json.dumps({"dt_ns": 8, "diffusion_constant": "siggen"}, indent="\t"))
-    settings = read_settings(SimulationSettings, path)
-    assert (settings.dt_ns, settings.diffusion_constant) == (8, "siggen")
 
 
 def test_the_diffusion_is_that_of_the_field_unless_told():

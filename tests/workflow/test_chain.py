@@ -18,7 +18,7 @@ import pytest
 import yaml
 from lgdo import Array, Scalar, Struct, Table, VectorOfVectors
 
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 
 pytest.importorskip("snakemake", reason="snakemake is not installed: pip install '.[workflow]'")
 
@@ -32,7 +32,7 @@ def write_steps(path: Path, sims: dict[str, Path], events: slice) -> dict[str, A
     """Hits of simulations as remage writes steps, each detector at a place of its own."""
     kept: dict[str, Any] = {}
     for name, sim in sims.items():
-        hits = read_hits(sim).hits[events]
+        hits = read_hits(sim)[events]
         kept[name] = hits
         origin = ORIGIN_M[name]
         steps = {
@@ -89,7 +89,6 @@ def configuration(metadata: Path) -> dict[str, Any]:
         "library": {
             "grid_mm": 8,
             "make": ["--angles=0,45"],
-            "translate": ["--format=currents"],
         },
         "events": {"hits": "stp/*.lh5"},
         "validate": {"baselines": False},
@@ -122,7 +121,7 @@ def test_two_detectors_end_to_end(reference_data, tmp_path):
         assert f'href="{name}/p03/report/report.html"' in page
         told = json.loads((folder / "run" / "calibration.json").read_text())
         assert "temperature_K" in {**told["parameters"], **told["fixed"]}
-        require_library(folder / "library" / "realistic.lh5", name)
+        require_library(folder / "library" / "current.lh5", name)
         for part, hits in given.items():
             require_parameters(folder / "events", name, part, hits[name])
     assert "Nothing to be done" in snakemake(tmp_path)

@@ -172,7 +172,7 @@ def whole_chain() -> dict[str, Any]:
     config["library"] = {
         "grid_mm": 2,
         "make": ["--angles=0"],
-        "translate": ["--format=currents"],
+        "translate": ["--low-rank=16"],
     }
     config["events"] = {"hits": "stp/*.lh5", "translate": ["--length=2000"], "tau_us": 400}
     del config["train"]["set"]
@@ -193,7 +193,7 @@ def test_a_dry_run_of_libraries_and_events(place):
     assert done.returncode == 0, done.stdout
     jobs = counts(done.stdout)
     assert jobs["ideal_library"] == 2  # of the detectors, for all periods
-    assert jobs["realistic_library"] == jobs["train"] == 3
+    assert jobs["current_library"] == jobs["train"] == 3
     assert jobs["event_pulses"] == 2 * 2
     assert jobs["event_raw"] == jobs["event_parameters"] == 3 * 2
     assert "calibrate" not in jobs
@@ -206,7 +206,7 @@ def test_a_dry_run_of_libraries_and_events(place):
     assert "--adc --length=2000 --out-table V01/raw --seed 1 --device cpu" in told
     assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in told
     assert "library make --detector=icpc --grid-mm 2 --angles=0 --out" in told
-    assert "'all results/V01/library/ideal.lh5' --format=currents --device cpu --out" in told
+    assert "'all results/V01/library/ideal.lh5' --low-rank=16 --device cpu --out" in told
 
 
 @pytest.mark.thorough

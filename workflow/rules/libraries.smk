@@ -6,9 +6,9 @@ IDEAL = (
     if CALIBRATED
     else f"{RESULTS}/{{detector}}/library/ideal.lh5"
 )
-REALISTIC = f"{RESULTS}/{{detector}}/{{period}}/library/realistic.lh5"
+CURRENT = f"{RESULTS}/{{detector}}/{{period}}/library/current.lh5"
 LIBRARIES = (
-    [REALISTIC.format(detector=d, period=p) for d, p in PAIRS] if "library" in config else []
+    [CURRENT.format(detector=d, period=p) for d, p in PAIRS] if "library" in config else []
 )
 
 
@@ -57,16 +57,16 @@ rule ideal_library:
         " --out {output:q} --force > {log:q} 2>&1"
 
 
-rule realistic_library:
+rule current_library:
     input:
         run=TRAINED,
         library=IDEAL,
     output:
-        REALISTIC,
+        CURRENT,
     log:
-        f"{RESULTS}/{{detector}}/{{period}}/logs/realistic_library.log",
+        f"{RESULTS}/{{detector}}/{{period}}/logs/current_library.log",
     benchmark:
-        f"{RESULTS}/{{detector}}/{{period}}/benchmarks/realistic_library.tsv"
+        f"{RESULTS}/{{detector}}/{{period}}/benchmarks/current_library.tsv"
     threads: 2
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,

@@ -25,11 +25,10 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, read_settings, require_seed
-from cpunet.simulation.energy_windows import wanted_events
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
-from cpunet.simulation.hit_readers.hit_table import hit_columns
+from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
+from cpunet.simulation.hit_sources import wanted_events
 from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings, split_overrides
 from cpunet.simulation.shifted import Shift

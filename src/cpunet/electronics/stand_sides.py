@@ -15,11 +15,10 @@ from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.energy_windows import Window
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_sources import GammaSource
+from cpunet.simulation.hit_sources import EnergyWindow, GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
@@ -98,7 +97,7 @@ class Side:
 def stand_sides(
     electronics: Electronics,
     detector: Detector,
-    events: Mapping[Window, int],
+    events: Mapping[EnergyWindow, int],
     *,
     shift: Shift | None = None,
     settings: SimulationSettings | None = None,
@@ -152,7 +151,7 @@ def stand_sides(
     return sim, data, readout_seed
 
 
-def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[Window, ...]) -> Labels:
+def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[EnergyWindow, ...]) -> Labels:
     """Labels by energy window: 0 DEP, 1 SEP, 2 FEP, 3 other; collected energies in keV."""
     labels = np.full(len(energy_kev), OTHER)
     for window in windows:

@@ -22,12 +22,13 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.legend.equivalent import Equivalent, ae_ratios, current_delay_ns
 from cpunet.legend.equivalent import equivalent_kernel as fitted_kernel
-from cpunet.legend.ideal_library import (
+from cpunet.legend.library_files import (
     IdealLibrary,
     chosen_libraries,
     known_detector,
+    n_not_ending,
+    require_charge,
 )
-from cpunet.legend.library_file import n_not_ending, require_charge
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json

@@ -21,7 +21,7 @@ import scipy.linalg
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.legend.library_arrays import put_column
+from cpunet.legend.library_files import put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.legend.library_arrays import put_column
+from cpunet.legend.library_files import put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
@@ -29,7 +29,7 @@ ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
 @dataclass(frozen=True)
-class Library:
+class MadeLibrary:
     """A library of charge pulses that was made.
 
     Parameters
@@ -65,7 +65,7 @@ def make_library(
     settings: Set = (),
     settings_file: str | Path | SimulationSettings | None = None,
     force: bool = False,
-) -> Library:
+) -> MadeLibrary:
     """Simulate the charge pulse of every place in a detector.
 
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
@@ -95,7 +95,7 @@ def make_library(
 
     Returns
     -------
-    Library
+    MadeLibrary
         The file, with numbers of its templates.
 
     Raises
@@ -120,7 +120,7 @@ def make_library(
     sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS} if settings_file is None else {}
     wanted = read_settings(SimulationSettings, settings_file, sampling | of_settings)
     counts = _write(detector, out, wanted, grid_mm, angles_deg)
-    return Library(out, **counts)
+    return MadeLibrary(out, **counts)
 
 
 def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:

@@ -1,86 +1,58 @@
-"""Translate the templates of pulse-shape libraries."""
+"""Translate libraries of ideal charge pulses to current libraries, as LEGEND reads them.
+
+The layout is that of LEGEND's production (legend-simflow): per detector a ``struct{r, z, dt,
+t0, waveform_000_deg, drift_time_000_deg, ...}`` of currents in units of the most frequent A/E.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
+import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.legend.library_arrays import Arrays, add_t0, charge_arrays, current_arrays
-from cpunet.legend.library_file import (
-    WAVEFORM,
-    libraries,
-    n_not_ending,
-    n_templates,
-    require_charge,
-    sampling_period_ns,
+from cpunet.legend.current_library import TOLD, NewLibrary, describe
+from cpunet.legend.currents import (
+    LENGTH,
+    MAX_TEMPLATES,
+    RINGS,
+    Floats,
+    Loss,
+    components,
+    continued,
+    currents_about_peak,
+    heights,
+    most_frequent,
+    padded_axis,
+    with_rings,
 )
-from cpunet.legend.production import in_words, translate_for_production
-from cpunet.legend.ring_padding import RINGS
-from cpunet.legend.templates import BEFORE_NS, TemplateTranslator, linearity
+from cpunet.legend.library_files import (
+    PERIOD_NS,
+    IdealLibrary,
+    chosen_libraries,
+    known_detector,
+    n_not_ending,
+    require_charge,
+    require_complete,
+)
+from cpunet.legend.templates import TemplateTranslator
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
-from cpunet.pulses.container import FloatArray
-from cpunet.pulses.preparation import Rejection
-from cpunet.pulses.reading.source import BLOCK_BYTES
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
 from cpunet.translation.translator import REN
 
-TEMPLATES_AT_A_TIME = 1024
-KEPT = 256  # templates to measure the linearity with
-
-
-@dataclass
-class _Tally:
-    """Counts of the templates by outcome, and a sample of one length with its translator."""
-
-    currents: bool
-    counts: Counter[str] = field(default_factory=Counter)
-    not_ending: int = 0
-    kept: list[FloatArray] = field(default_factory=list)
-    translate: TemplateTranslator | None = None
-
-    def add(
-        self,
-        templates: npt.NDArray[np.floating],
-        codes: npt.NDArray[np.uint8],
-        translate: TemplateTranslator,
-        seed: int,
-    ) -> None:
-        outside = np.isnan(templates).all(axis=1)
-        unknown, accepted = codes == Rejection.NAN, codes == Rejection.ACCEPTED
-        self.counts["templates"] += len(codes)
-        self.counts["outside"] += int(outside.sum())
-        self.counts["damaged"] += int((unknown & ~outside).sum())
-        for code in codes[~(unknown | accepted)]:
-            self.counts[Rejection(int(code)).label] += 1
-        good = np.flatnonzero(accepted & templates.any(axis=1))
-        self.counts["translated"] += int(accepted.sum())
-        # the maximum of a current is that of positive charge; charge may have either sign
-        rising = templates[good] if self.currents else np.abs(templates[good])
-        self.not_ending += n_not_ending(rising)
-        self.counts["moving"] += len(good)
-        if len(good):
-            few = np.random.default_rng(seed).permutation(good)[:8]
-            self._keep(np.asarray(templates[few], np.float32), translate)
-
-    def _keep(self, few: FloatArray, translate: TemplateTranslator) -> None:
-        if self.translate is not None:
-            before = self.translate.dt_ns, self.kept[-1].shape[1]
-            if before != (translate.dt_ns, few.shape[1]):  # no sums of these with those
-                self.kept = []
-        self.kept.append(few)
-        self.translate = translate
+ROWS = 16  # rows of r translated at a time
+STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
 @dataclass(frozen=True)
@@ -92,28 +64,17 @@ class TranslatedLibrary:
     path
         The file.
     numbers
-        Of charge and currents ``libraries`` (their paths), ``templates``, ``translated``,
-        ``outside`` (all NaN), ``rejections`` (counts by reason) and ``linearity`` (see
-        `cpunet.legend.templates.Linearity`).  For production, by name of the library, see
-        `cpunet.legend.production.translate_for_production`.
+        By name of the library: ``templates`` (grid points times angles), ``translated``,
+        ``padded``, ``healed`` (filled grid points inside the crystal that had no template),
+        ``mode_per_ns`` (A/E by which currents are divided), and ``loss`` of the components.
     """
 
     path: Path
     numbers: dict[str, Any]
 
     def __str__(self) -> str:
-        if "libraries" not in self.numbers:
-            return "\n".join(
-                f"{self.path}: {name}: {in_words(one)}" for name, one in self.numbers.items()
-            )
-        told, apart = self.numbers, self.numbers["linearity"]
-        rejected = "".join(f", {n} {reason}" for reason, n in told["rejections"].items())
-        return (
-            f"{self.path}: {told['translated']} of {told['templates']} templates translated; "
-            f"{told['outside']} outside{rejected}\n"
-            f"sums of {apart['events']} events: sample by sample within {apart['largest']:.1e} "
-            f"of the highest, current amplitude within {apart['current_amplitude']:.1e} of "
-            "itself"
+        return "\n".join(
+            f"{self.path}: {name}: {_in_words(one)}" for name, one in self.numbers.items()
         )
 
 
@@ -122,40 +83,39 @@ def translate_library(
     library: str | Path,
     out: str | Path,
     *,
-    format: Literal["charge", "currents", "simflow"] = "charge",
     detector: Sequence[str] = (),
     rings: int = RINGS,
     low_rank: int | None = None,
     force: bool = False,
 ) -> TranslatedLibrary:
-    """Translate every template of a library without noise.
+    """Translate every template of a library without noise, to currents for LEGEND's production.
 
     A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
     charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
     `cpunet.make_library` make them; a file may hold several, at any depth.  Files are
     streamed.
 
+    Each template is translated, differentiated, averaged three times over 48 ns and shifted so
+    that its maximum is at sample 1,000 of 4,001.  All are divided by the mode of A/E of the
+    library and written as float32.  ``drift_time_*_deg`` are the times of the maxima minus
+    that of a step of charge at time 0.  The grid is padded around the crystal: currents there
+    are means of their neighbours, and drift times are extrapolated linearly.
+
     Parameters
     ----------
     run
-        A trained run or its folder.
+        A trained run with a readout chain, or its folder.
     library
         LH5 file of one library or more.
     out
         LH5 file to write.
-    format
-        charge: all else is copied unchanged; a missing ``t0``, without which reboost cannot
-        read a library, becomes 0, templates with NaN stay.  currents: for
-        `reboost.hpge.psd.maximum_current`, in 1/ns, averaged as for the current amplitude,
-        with the maximum at time 0 (``t0`` is negative); ``drift_time_*_deg`` become the times
-        of the maxima.  simflow: currents as LEGEND's production reads them.
     detector
-        With simflow: library of the file to translate (repeatable); by default that of the
-        detector that the run was trained with, or all if it is unknown.
+        Library of the file to translate (repeatable); by default that of the detector that
+        the run was trained with, or all if it is unknown.
     rings
-        With simflow: rings of nodes beyond the crystal; 3 as production.
+        Rings of nodes beyond the crystal; 3 as production.
     low_rank
-        With simflow: number of components in place of whole templates.
+        Number of components in place of whole templates, see `cpunet.read_library`.
     force
         Replace an existing file.
 
@@ -167,103 +127,205 @@ def translate_library(
     Raises
     ------
     CpunetError
-        If the file contains no library of charge templates, or the run cannot translate it.
+        If the file contains no library of charge templates, it is damaged, of another
+        detector or sampling period, or the run has a network.
 
     Examples
     --------
     cpunet library translate run psl.lh5 --out psl_ren.lh5
-    cpunet library translate run psl.lh5 --out psl_simflow.lh5 --format simflow
     """
-    if format != "simflow" and (low_rank is not None or detector or rings != RINGS):
-        raise CpunetError(
-            "`low_rank`, `rings` and `detector` are those of the `format` simflow; add it"
-        )
+    if not 0 <= rings <= 100:
+        raise CpunetError(f"`rings` {rings}: give 0 to 100 rings of padding")
+    if low_rank is not None and not 1 <= low_rank <= 1000:
+        raise CpunetError(f"`low_rank` {low_rank}: give 1 to 1000 components")
     run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
-    ren = REN.of(run, resolve_device("auto"))
-    if format == "simflow":
-        numbers = translate_for_production(
-            run, ren, source, out, detectors=detector, rings=rings, rank=low_rank
-        )
-    else:
-        numbers = _templates(ren, source, out, currents=format == "currents")
+    translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
+    numbers: dict[str, Any] = {}
+    with opened(source) as given:
+        names = chosen_libraries(given, source, detector, known_detector(run))
+        ideal = [IdealLibrary.of(given, name, source) for name in names]
+        made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
+        with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+            for one in ideal:
+                looked = _look(translate, one, given[one.path], source)
+                group = made.h5.require_group(one.path)
+                job = _Writing(looked, one, rings, low_rank)
+                numbers[one.path] = job.write(given[one.path], group, made_from)
     return TranslatedLibrary(out, numbers)
 
 
-def _templates(ren: REN, source: Path, out: Path, *, currents: bool) -> dict[str, Any]:
-    tally = _Tally(currents)
-    with opened(source) as given:
-        paths = libraries(given, source)
-        total = sum(n_templates(given, path, source) for path in paths)
-    with opened(source) as given, written_aside(out) as aside:
-        with FileInTheMaking(aside, out) as made, stage("Templates", total) as bar:
-            _copy(given, made.h5, _Job(ren, tally, source, bar))
-        counts = tally.counts
-        require_charge(str(source), counts["templates"], counts["moving"], tally.not_ending)
-        assert tally.translate is not None
-        apart = linearity(tally.translate, np.concatenate(tally.kept)[-KEPT:])
-    numbers = {"templates", "translated", "outside", "moving"}
-    return {
-        "libraries": paths,
-        "templates": counts["templates"],
-        "translated": counts["translated"],
-        "outside": counts["outside"],
-        "rejections": {k: n for k, n in counts.items() if k not in numbers and n},
-        "linearity": asdict(apart),
-    }
-
-
-@dataclass(frozen=True)
-class _Job:
-    ren: REN
-    tally: _Tally
-    source: Path
-    bar: Stage
-
-
-def _copy(given: h5py.Group, made: h5py.Group, job: _Job) -> None:
-    """Copy a group and everything in it, and translate the templates of libraries."""
-    made.attrs.update(given.attrs)
-    angles = {name.removeprefix("waveform_") for name in filter(WAVEFORM.fullmatch, given)}
-    replaced = {f"waveform_{angle}" for angle in angles}
-    currents = job.tally.currents
-    if currents and angles:
-        replaced |= {"t0"} | {f"drift_time_{angle}" for angle in angles}
-    for name, item in given.items():
-        if isinstance(item, h5py.Group):
-            _copy(item, made.create_group(name), job)
-        elif name not in replaced:
-            given.copy(name, made)
-    if not angles:
-        return
-    dt_ns = sampling_period_ns(given, f"{job.source}: {given.name.strip('/') or '/'}")
-    translate = TemplateTranslator(job.ren, dt_ns)
-    for angle in sorted(angles):
-        item = given[f"waveform_{angle}"]
-        arrays = (
-            current_arrays(item, made, angle, dt_ns)
-            if currents
-            else charge_arrays(item, made, angle)
+def _in_words(numbers: Mapping[str, Any]) -> str:
+    """Numbers of a library as text."""
+    healed = f", {numbers['healed']} of them within it" if numbers["healed"] else ""
+    text = (
+        f"{numbers['translated']} of {numbers['templates']} templates translated, "
+        f"{numbers['padded']} added about the crystal{healed}; A/E is most often "
+        f"{numbers['mode_per_ns']:.4g}/ns"
+    )
+    if loss := numbers.get("loss"):
+        text += (
+            f"\n{numbers['rank']} components: samples within {loss['largest']:.1e} of the "
+            f"most frequent A/E (RMS {loss['rms']:.1e}), A/E within "
+            f"{loss['a_over_e_percent']:.2g} % (RMS {loss['a_over_e_rms_percent']:.2g} %)"
         )
-        _translate(item, arrays, translate, job)
-    if "t0" not in made:
-        add_t0(given["dt"], made, dt_ns, BEFORE_NS if currents else 0.0)
-        made.attrs["datatype"] = f"struct{{{','.join(made)}}}"
+    return text
 
 
-def _translate(
-    given: h5py.Dataset, made: Arrays, translate: TemplateTranslator, job: _Job
-) -> None:
-    n_r, n_z, n_samples = given.shape
-    step = max(TEMPLATES_AT_A_TIME // n_z, given.chunks[0] if given.chunks else 1)
-    step = min(step, max(1, BLOCK_BYTES // (4 * n_z * n_samples)))
-    for first in range(0, n_r, step):
-        rows = slice(first, min(first + step, n_r))
-        templates = given[rows].reshape(-1, n_samples)
-        results, codes = translate(templates)
-        # templates with NaN are outside the crystal and remain unchanged
-        unknown = codes == Rejection.NAN
-        results[unknown] = templates[unknown]
-        made.put(rows, results, translate.dt_ns)
-        job.tally.add(templates, codes, translate, seed=first)
-        job.bar.update(len(templates))
+@dataclass(eq=False)
+class _Looked:
+    """Results of a first pass over all templates of a library, and their translator."""
+
+    translate: TemplateTranslator
+    delay_ns: float
+    mode: float
+    kept: Floats
+    inside: dict[str, npt.NDArray[np.bool_]] = field(default_factory=dict)
+
+
+def _look(
+    translate: TemplateTranslator, library: IdealLibrary, given: h5py.Group, source: Path
+) -> _Looked:
+    """First pass over all templates, to find the mode of A/E before any is written."""
+    step = np.zeros((1, STEP_LENGTH), np.float32)
+    step[:, STEP_SAMPLE:] = 1
+    _, delay = currents_about_peak(translate(step))
+    rng = np.random.default_rng(0)
+    share = min(1.0, 2 * MAX_TEMPLATES / max(library.n_templates, 1))
+    amplitudes, kept, inside = [], [], {}
+    moving = not_ending = 0
+    with stage(f"A/E of {library.path}", library.n_templates) as bar:
+        for angle in library.angles:
+            mask = np.zeros((len(library.r_mm), len(library.z_mm)), bool)
+            for first, block in _blocks(given[f"waveform_{angle}"], library, source):
+                there = ~np.isnan(block[:, :, 0])
+                templates = block[there]
+                currents, times = currents_about_peak(translate(templates))
+                good = np.isfinite(times)
+                there[there] = good
+                mask[first : first + len(block)] = there
+                moving += int(good.sum())
+                not_ending += n_not_ending(templates[good])
+                amplitudes.append(heights(currents[good]))
+                kept.append(currents[good][rng.random(int(good.sum())) < share])
+                bar.update(block.shape[0] * block.shape[1])
+            inside[angle] = mask
+    require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
+    require_complete(inside, library, source)
+    mode = most_frequent(np.concatenate(amplitudes))
+    some = np.concatenate(kept)
+    if len(some) > MAX_TEMPLATES:
+        some = some[np.sort(rng.choice(len(some), MAX_TEMPLATES, replace=False))]
+    return _Looked(
+        translate, float(delay[0]) - STEP_SAMPLE, mode, some / np.float32(mode), inside
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Writing:
+    """Second pass, which writes one library."""
+
+    looked: _Looked
+    library: IdealLibrary
+    rings: int
+    rank: int | None
+
+    def write(
+        self, given: h5py.Group, group: h5py.Group, made_from: dict[str, str]
+    ) -> dict[str, Any]:
+        looked, library = self.looked, self.library
+        r_mm = padded_axis(library.r_mm, 0, self.rings)  # none at negative radii
+        z_mm = padded_axis(library.z_mm, self.rings, self.rings)
+        basis = None if self.rank is None else components(looked.kept, self.rank)
+        made = NewLibrary.begin(group, r_mm, z_mm, PERIOD_NS, basis)
+        padded = healed = 0
+        loss = Loss()
+        for angle in library.angles:
+            values, drift_times = made.arrays(angle)
+            mask = looked.inside[angle]
+            times = np.full((len(r_mm), len(z_mm)), np.nan)
+            with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
+                for rows, currents, when in self._rows(given[f"waveform_{angle}"], bar):
+                    values[rows] = made.stored(currents, loss)
+                    times[rows] = when
+            times = continued(times, self.rings)
+            drift_times[...] = times
+            padded += int(np.isfinite(times).sum() - mask.sum())
+            inner = np.isfinite(times[: len(mask), self.rings :][:, : mask.shape[1]])
+            healed += int((inner & ~mask & enclosed(mask)).sum())
+        numbers: dict[str, Any] = {
+            "templates": library.n_templates,
+            "translated": sum(int(mask.sum()) for mask in looked.inside.values()),
+            "padded": padded,
+            "healed": healed,
+            "mode_per_ns": looked.mode,
+            "delay_ns": looked.delay_ns,
+        }
+        if basis is not None:
+            numbers["rank"] = len(basis)
+            numbers["loss"] = loss.told()
+        content = {"cpunet": cpunet.__version__, "rings": self.rings} | made_from | numbers
+        group.attrs[TOLD] = json.dumps(content)
+        describe(group)
+        return numbers
+
+    def _rows(
+        self, given: h5py.Dataset, bar: Stage
+    ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
+        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
+        n_r, n_z, _ = given.shape
+        rings, looked = self.rings, self.looked
+        for first in range(0, n_r + rings, ROWS):
+            last = min(first + ROWS, n_r + rings)
+            # a padded grid point depends only on rows at most `rings` away
+            low, high = max(0, first - rings), min(last + rings, n_r)
+            shape = (last + rings - low, n_z + 2 * rings)
+            currents = np.full((*shape, LENGTH), np.nan, np.float32)
+            times = np.full(shape, np.nan)
+            if high > low:
+                charge = _charge(given[low:high])
+                there = ~np.isnan(charge[:, :, 0])
+                of_these, when = currents_about_peak(looked.translate(charge[there]))
+                inner = (slice(0, high - low), slice(rings, rings + n_z))
+                currents[inner][there] = of_these / np.float32(looked.mode)
+                times[inner][there] = when - looked.delay_ns
+            own = slice(first - low, last - low)
+            yield slice(first, last), with_rings(currents, rings)[own], times[own]
+            bar.update(last - first)
+
+
+def _blocks(
+    given: h5py.Dataset, library: IdealLibrary, source: Path
+) -> Iterator[tuple[int, Floats]]:
+    """Rows of charge templates; raise an error if only a part of a template is NaN."""
+    for first in range(0, given.shape[0], ROWS):
+        values = np.asarray(given[first : first + ROWS], np.float32)
+        bad = np.isnan(values)
+        part = bad.any(axis=2) & ~bad.all(axis=2)
+        if part.any():
+            i, j = np.argwhere(part)[0]
+            raise CpunetError(
+                f"{source}: {given.name}: {int(part.sum())} templates hold NaN among their "
+                f"samples, the first at r {library.r_mm[first + i]:g}, z "
+                f"{library.z_mm[j]:g} mm; simulate the library again, with longer records if "
+                "charge was late"
+            )
+        yield first, _charge(values)
+
+
+def _charge(values: npt.NDArray[Any]) -> Floats:
+    """Templates as float32; those of only zeros become NaN."""
+    charge = np.array(values, np.float32)
+    charge[~charge.any(axis=2)] = np.nan
+    return charge
+
+
+def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Mask of grid points between others on all four sides, at any distance."""
+    sides = [
+        np.logical_or.accumulate(np.flip(mask, axis) if back else mask, axis)
+        for axis in (0, 1)
+        for back in (False, True)
+    ]
+    below, above, left, right = sides
+    return np.asarray(below & np.flip(above, 0) & left & np.flip(right, 1))

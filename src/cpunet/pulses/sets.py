@@ -28,7 +28,7 @@ Select = Callable[[FloatColumn], npt.NDArray[np.bool_]]
 PeakNames = Callable[[FloatColumn], npt.NDArray[np.str_]]
 
 _REMEDIES = {
-    Rejection.NAN: "check how the file was written",
+    Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
     Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
     Rejection.SATURATED: "select lower energies or another channel",
     Rejection.WINDOW_OUTSIDE_RECORD: (

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import platformdirs
 
 from cpunet.errors import CpunetError
@@ -36,32 +34,12 @@ def load(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
     """
     try:
         kept = read_arrays(cache_file(key))
-        axes = {name: kept[name] for name in _OF_GRID}
+        grid = Grid(step_mm=step_mm, **{name: kept[name] for name in _OF_GRID})
         nodes = {name: kept[name] for name in _OF_NODES}
         capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
-        # a detector that no bias depletes has an infinite depletion voltage
-        known = np.isfinite(capacitance) and depletion >= 0
-        if not (known and _belong_together(axes, nodes)):
-            return None
     except (CpunetError, LookupError):
         return None  # solved again and overwritten
-    grid = Grid(step_mm=step_mm, **axes)
     return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion
-
-
-def _belong_together(
-    axes: dict[str, npt.NDArray[Any]], nodes: dict[str, npt.NDArray[Any]]
-) -> bool:
-    """Whether all arrays match one grid and are finite, as the compiled loops require."""
-    n_r, n_z = len(axes["r_mm"]), len(axes["z_mm"])
-    shapes = {"r_mm": (n_r,), "z_mm": (n_z,), "region": (n_r, n_z)}
-    shapes |= {"r_steps": (n_r - 1, n_z), "z_steps": (n_r, n_z - 1)}
-    return all(
-        values.shape == shapes.get(name, (n_r, n_z))
-        and values.dtype.kind == ("i" if name == "region" else "f")
-        and np.isfinite(values).all()
-        for name, values in (axes | nodes).items()
-    )
 
 
 def store(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:

@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterable
 from itertools import chain
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -38,8 +38,10 @@ class Detector(Config):
 
     Features whose size is 0 are absent. Without a ``wrap_around_radius`` the lithium contact
     ends where the outer wall meets z = 0. ``taper_angle_deg`` applies to the outer taper and,
-    unless ``inner_taper_angle_deg`` is given, to that of the bore. ``vacuum_gap`` is the
-    distance of a grounded plane below z = 0.
+    unless ``inner_taper_angle_deg`` is given, to that of the bore. A cylinder at the top or at
+    the bottom is narrower than the crystal; the bottom one widens to it over a transition. A
+    groove at the top has the axis in its middle, as the bore. ``vacuum_gap`` is the distance of
+    a grounded plane below z = 0.
 
     The net impurity in 1e10/cm3 is negative for p-type germanium. It is
 
@@ -77,6 +79,13 @@ class Detector(Config):
     outer_taper_length: Millimetres = 0.0
     inner_taper_length: Millimetres = 0.0
     bottom_taper_length: Millimetres = 0.0
+    top_cylinder_length: Millimetres = 0.0
+    top_cylinder_radius: Millimetres = 0.0
+    bottom_cylinder_length: Millimetres = 0.0
+    bottom_cylinder_radius: Millimetres = 0.0
+    bottom_transition_length: Millimetres = 0.0
+    top_groove_depth: Millimetres = 0.0
+    top_groove_radius: Millimetres = 0.0
     taper_angle_deg: Angle = 0.0
     inner_taper_angle_deg: Angle | None = None
     bottom_taper_angle_deg: Angle = 45.0
@@ -108,11 +117,21 @@ class Detector(Config):
     def _problems_of_shape(self) -> Iterable[str]:
         length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
         top_radius = radius - self.outer_taper_length * math.tan(self.taper_angles_rad[0])
+        top_radius -= self.narrower("top")
         bore_mouth = self.bore_radius + self.inner_taper_length * math.tan(
             self.taper_angles_rad[1]
         )
+        bore_mouth = max(bore_mouth, self.top_groove_radius)
         bottom_radius = radius - self.bottom_taper_length * math.tan(self.taper_angles_rad[2])
+        bottom_radius -= self.narrower("bottom")
         ditch_inner = self.wrap_around_radius - self.ditch_thickness
+        sides: tuple[Literal["top", "bottom"], ...] = ("top", "bottom")
+        for side in sides:
+            depth = self.narrower(side)
+            if depth and getattr(self, f"{side}_bullet_radius"):
+                yield f"{side}_bullet_radius and {side}_cylinder_radius cannot both be given"
+            if not 0 <= depth < radius:
+                yield f"{side}_cylinder_radius must be above 0 and at most crystal_radius"
         if 2 * li >= min(length, radius):
             yield "li_thickness leaves nothing of the crystal"
         if self.outer_taper_length + self.bottom_taper_length > length:
@@ -146,8 +165,13 @@ class Detector(Config):
             yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
         if self.point_contact_radius >= bottom_radius - max(li, self.bottom_bullet_radius):
             yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
-        if self.ditch_depth + self.bore_length + li >= length:
+        if self.ditch_depth + max(self.bore_length, self.top_groove_depth) + li >= length:
             yield "ditch_depth reaches the bore (bore_length) or the top"
+        if (self.top_groove_depth > 0) != (self.top_groove_radius > 0):
+            yield "top_groove_depth and top_groove_radius must both be given, or both be 0"
+        narrow = self.bottom_cylinder_length + self.bottom_transition_length
+        if narrow + self.top_cylinder_length > length:
+            yield "bottom_cylinder_length and top_cylinder_length exceed crystal_length"
         if self.grid_mm > self.point_contact_radius / 2:
             yield "grid_mm does not resolve point_contact_radius; at most half of it"
 
@@ -282,11 +306,35 @@ class Detector(Config):
         into_top = z - (self.crystal_length - self.outer_taper_length)
         into_bottom = self.bottom_taper_length - z
         straight = np.full_like(z, self.crystal_radius - shift)
+        if depth := self.narrower("top"):
+            beyond = self.crystal_length - self.top_cylinder_length - z
+            straight -= self._step(depth, beyond, 0.0, shift)
+        if depth := self.narrower("bottom"):
+            beyond = z - self.bottom_cylinder_length
+            straight -= self._step(depth, beyond, self.bottom_transition_length, shift)
         if self.outer_taper_length:
             straight -= self._taper(into_top, top, shift)
         if self.bottom_taper_length:
             straight -= self._taper(into_bottom, bottom, shift)
         return straight
+
+    def narrower(self, side: Literal["top", "bottom"]) -> float:
+        """Radius of the crystal less that of the cylinder at an end, if there is one, in mm."""
+        if side == "top":
+            there, radius = self.top_cylinder_length > 0, self.top_cylinder_radius
+        else:
+            there = self.bottom_cylinder_length + self.bottom_transition_length > 0
+            radius = self.bottom_cylinder_radius
+        return self.crystal_radius - radius if there else 0.0
+
+    @staticmethod
+    def _step(depth: float, beyond: FloatArray, length: float, shift: float) -> FloatArray:
+        """Reduction in radius by a narrower end, `beyond` it, of walls moved in by `shift`."""
+        if not length:  # its lithium, moved along the axis, lies in the wider part
+            return np.where(beyond > shift, 0.0, depth)
+        slope = depth / length
+        extra = shift * (math.hypot(1, slope) - 1)
+        return np.clip(depth - slope * beyond + extra, 0, depth)
 
     def _taper(self, depth: FloatArray, angle: float, shift: float) -> FloatArray:
         """Reduction in radius by a taper, at `depth` into it, of a wall moved by `shift`."""
@@ -298,8 +346,12 @@ class Detector(Config):
 
     def _bore(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
         """Whether a point lies in the bore with its walls moved outwards by `shift`."""
+        groove = (z >= self.crystal_length - self.top_groove_depth - shift) & (
+            r <= self.top_groove_radius + shift
+        )
+        groove &= self.top_groove_depth > 0
         if not self.bore_length:
-            return np.zeros(np.broadcast(r, z).shape, bool)
+            return np.asarray(groove)
         end, bullet = self.crystal_length - self.bore_length, self.bore_bullet_radius
         radius = np.full_like(z, self.bore_radius + shift)
         if self.inner_taper_length:
@@ -308,4 +360,5 @@ class Detector(Config):
         across, along = r - (self.bore_radius - bullet), end + bullet - z
         corner = (across > 0) & (along > 0)
         rounded = np.hypot(across, along) <= bullet + shift
-        return np.asarray((z >= end - shift) & (r <= radius) & (~corner | rounded))
+        bore = (z >= end - shift) & (r <= radius) & (~corner | rounded)
+        return np.asarray(bore | groove)

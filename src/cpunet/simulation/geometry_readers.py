@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Set, checked, key_values, names, read_text, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.legend_crystal import LONGEST_MM, impurity_values
 from cpunet.simulation.legend_metadata import (
     LIQUID_ARGON_K,
     crystal_and_slice,
+    impurity_values,
     why_missing,
 )
 from cpunet.simulation.legend_metadata import detector_values as legend_values
-from cpunet.simulation.siggen_config import detector_values as siggen_values
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +24,61 @@ _FOLDER = Path(__file__).parent / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
 _SIGGEN_BYTES = 1 << 16
 _Z0 = "impurity_z0_1e10_per_cm3"
+
+_SIGGEN_FIELDS = {
+    "xtal_length": "crystal_length",
+    "xtal_radius": "crystal_radius",
+    "top_bullet_radius": "top_bullet_radius",
+    "bottom_bullet_radius": "bottom_bullet_radius",
+    "pc_length": "point_contact_length",
+    "pc_radius": "point_contact_radius",
+    "bottom_taper_length": "bottom_taper_length",
+    "wrap_around_radius": "wrap_around_radius",
+    "ditch_depth": "ditch_depth",
+    "ditch_thickness": "ditch_thickness",
+    "hole_length": "bore_length",
+    "hole_radius": "bore_radius",
+    "hole_bullet_radius": "bore_bullet_radius",
+    "outer_taper_length": "outer_taper_length",
+    "inner_taper_length": "inner_taper_length",
+    "taper_angle": "taper_angle_deg",
+    "Li_thickness": "li_thickness",
+    "vacuum_gap": "vacuum_gap",
+    "impurity_z0": "impurity_z0_1e10_per_cm3",
+    "impurity_gradient": "impurity_gradient_1e10_per_cm4",
+    "impurity_quadratic": "impurity_quadratic_1e10_per_cm3",
+    "impurity_surface": "surface_charge_1e10_per_cm2",
+    "impurity_radial_add": "impurity_radial_add_1e10_per_cm3",
+    "impurity_radial_mult": "impurity_radial_mult",
+    "impurity_rpower": "impurity_radial_power",
+    "xtal_HV": "bias_V",
+    "xtal_temp": "temperature_K",
+    "xtal_grid": "grid_mm",
+}
+# alternative or neutral values, evaluated below
+_DERIVED = ("hole_length_gap", "outer_taper_width", "inner_taper_width", "bulletize_PC")
+# of siggen's version in three dimensions
+_OFFSETS = ("pc_offset_", "hole_offset_")
+_LEAST_POWER = 0.1
+# settings of the drift, and names of the program's files
+_NOT_OF_THE_DETECTOR = (
+    "drift_name",
+    "field_name",
+    "wp_name",
+    "preamp_tau",
+    "time_steps_calc",
+    "step_time_calc",
+    "step_time_out",
+    "charge_cloud_size",
+    "use_diffusion",
+    "energy",
+    "verbosity",
+    "verbosity_level",
+    "max_iterations",
+    "write_field",
+    "write_WP",
+    "surface_drift_vel_factor",
+)
 
 # reasons why a file does not give a field
 _Hints = dict[str, str]
@@ -113,7 +168,7 @@ def holds_detector(path: str | Path) -> bool:
     place = Path(path)
     if str(path) in detector_names() or place.suffix.lower() in _MAPPINGS:
         return True
-    if not _is_file(place):
+    if not place.is_file():
         return False
     with place.open("rb") as file:
         return b"xtal_length" in file.read(_SIGGEN_BYTES)
@@ -130,7 +185,7 @@ def _legend(
         for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
         for suffix in _MAPPINGS
     ]
-    found = Path(crystal) if crystal else next(filter(_is_file, places), None)
+    found = Path(crystal) if crystal else next(filter(Path.is_file, places), None)
     hints = {field: why for field in Detector.model_fields if (why := why_missing(field))}
     hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
     if found is None:
@@ -140,16 +195,94 @@ def _legend(
     if content.get("impurity_curve") is None and crystal is None:
         return values, hints
     length = values["crystal_length"]
-    if not isinstance(length, int | float) or length > LONGEST_MM:
+    if not isinstance(length, int | float):
         return values, hints  # refused together with the rest of the geometry
     # the curve describes the whole crystal and replaces a line through a few points
     values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
     return values | impurity_values(content, str(found), slice_name, length), hints
 
 
-def _is_file(path: Path) -> bool:
-    """Whether there is such a file; False for names that no file can have."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
+def siggen_values(text: str, name: str) -> dict[str, Any]:
+    r"""Fields of `Detector` from the content `text` of siggen's configuration file `name`.
+
+    It is read as siggen does: a key stands at the beginning of its line (others are comments),
+    the last line of a key counts, a ``_diam`` is twice the ``_radius``, and sizes that do not
+    fit in each other are cut.
+
+    Raises
+    ------
+    CpunetError
+        If a key is unknown or has no number, or an offset makes the detector asymmetric.
+
+    Examples
+    --------
+    >>> siggen_values("xtal_length 96.0  # mm\nxtal_HV 4000\n", "V.config")
+    {'crystal_length': 96.0, 'bias_V': 4000.0}
+    """
+    values: dict[str, float] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line[0] in " \t#" or line.split()[0] in _NOT_OF_THE_DETECTOR:
+            continue
+        words = line.split("#")[0].split()
+        key = words[0].replace("_diam", "_radius")
+        key = "bottom_taper_length" if key == "taper_length" else key
+        if key not in (*_SIGGEN_FIELDS, *_DERIVED) and not key.startswith(_OFFSETS):
+            raise CpunetError(
+                f"detector {name}: line {number}: unknown key {words[0]}; "
+                "neither siggen nor fieldgen has it"
+            )
+        try:
+            values[key] = float(words[1]) / (2 if key != words[0] else 1)
+        except (IndexError, ValueError) as error:
+            raise CpunetError(
+                f"detector {name}: line {number}: {words[0]} has no number; give one"
+            ) from error
+        if key.startswith(_OFFSETS) and values.pop(key):
+            raise CpunetError(
+                f"detector {name}: line {number}: {key} is not 0; only axially symmetric "
+                "detectors are simulated"
+            )
+        if key == "hole_length_gap":
+            values["hole_length"] = values.get("xtal_length", math.nan) - values[key]
+    if values.get("bulletize_PC"):
+        raise CpunetError(
+            f"detector {name}: rounded point contacts are not simulated; set bulletize_PC to 0"
+        )
+    _cut(values, name)
+    fields = {
+        _SIGGEN_FIELDS[key]: value for key, value in values.items() if key in _SIGGEN_FIELDS
+    }
+    # widths count only without an angle
+    if not values.get("taper_angle"):
+        for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
+            width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
+            if length:
+                fields[angle] = math.degrees(math.atan(width / length))
+    # siggen keeps the radius and the rounding of a hole that does not exist
+    if not fields.get("bore_length"):
+        fields = {k: v for k, v in fields.items() if not k.startswith("bore_")}
+    # without a power, fieldgen has no radial terms
+    if not values.get("impurity_rpower", 0.0) > _LEAST_POWER:
+        fields = {k: v for k, v in fields.items() if not k.startswith("impurity_radial")}
+    return fields
+
+
+def _cut(values: dict[str, float], name: str) -> None:
+    """Cut sizes that do not fit in each other, as siggen does, with a word."""
+    around, ditch = values.get("wrap_around_radius", 0.0), values.get("ditch_thickness", 0.0)
+    most = {
+        "hole_bullet_radius": ("hole_radius", values.get("hole_radius", math.inf)),
+        "inner_taper_length": ("hole_length", values.get("hole_length", math.inf)),
+    }
+    if around and ditch and values.get("ditch_depth"):
+        inside = around - ditch
+        most["pc_radius"] = ("wrap_around_radius - ditch_thickness", inside)
+        if values.get("pc_radius") == 0:
+            values["pc_radius"] = inside
+    for key, (limit, size) in most.items():
+        if values.get(key, 0.0) > size:
+            log.info(f"detector {name}: {key} is {size:g} mm, as in siggen: at most {limit}")
+            values[key] = size
+    flat = values.get("xtal_radius", math.inf) - values.get("bottom_taper_length", 0.0)
+    if around >= flat and not values.get("ditch_depth"):
+        values["wrap_around_radius"] = 0.0  # no wrap-around: lithium ends at the wall

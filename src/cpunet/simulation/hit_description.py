@@ -1,8 +1,9 @@
-"""What is in a file of hits, and whether they lie in the crystal: else in which frame."""
+"""What is in a file of hits, and whether they lie in the crystal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_frame import describe_frame
-from cpunet.simulation.hit_readers import Transform, hit_detectors, read_hits
+from cpunet.simulation.hit_files import hit_detectors, read_hits
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.tables import counted, span
+
+# More hits outside the crystal are those of another frame, or of another detector.
+_MISPLACED_PERCENT = 1.0
 
 
 def describe_hits(
@@ -44,36 +47,40 @@ def describe_hits(
         ``path``, and ``detectors``: by name (``""`` if the file names none) ``events``,
         ``hits``, ``energy_kev`` (lowest and highest of an event), ``x_mm``, ``y_mm``,
         ``z_mm``, ``r_mm`` (lowest and highest, in the frame of the file less a known
-        origin), ``peaks`` and, with `crystal`, ``crystal``
-        (result of `describe_frame`); or the reason why the hits cannot be read.
+        origin), ``peaks`` and, with `crystal`, ``crystal``: its ``name``, ``radius_mm`` and
+        ``length_mm``, and ``outside_percent`` of the hits; or the reason why they cannot be
+        read.
     """
     chosen = options.hits_detector
     names: list[str | None] = [*hit_detectors(path)] if chosen is None else [chosen]
 
     def of_detector(name: str | None) -> dict[str, Any] | str:
         try:
-            hits = read_hits(
-                path,
-                detector=name,
-                length_unit=options.length_unit,
-                energy_unit=options.energy_unit,
-                time_window_us=options.time_window_us,
-            ).hits
+            as_in_file = replace(options, hits_detector=name, origin=(0, 0, 0), flip_z=False)
+            hits = read_hits(path, as_in_file)
         except CpunetError as error:
             return str(error).removeprefix(f"{path}: ")
-        told = _summary(hits, peaks)
+        summary = _summary(hits, peaks)
         if crystal is None:
-            return told
-        frame = Transform(options.origin, options.flip_z)
-        return told | {"crystal": describe_frame(hits, crystal, frame)}
+            return summary
+        x, y, z = options.to_crystal(hits.position_mm).T
+        outside = ~crystal.inside(np.hypot(x, y), z)
+        return summary | {
+            "crystal": {
+                "name": crystal.name,
+                "radius_mm": crystal.crystal_radius,
+                "length_mm": crystal.crystal_length,
+                "outside_percent": 100 * float(outside.mean()),
+            }
+        }
 
     detectors = {name or "": of_detector(name) for name in names or [None]}
     return {"path": str(path), "detectors": detectors}
 
 
 def _summary(hits: Hits, peaks: Mapping[str, PeakConfig]) -> dict[str, Any]:
-    found, counts = np.unique(label_peaks(hits.energy_kev, peaks), return_counts=True)
-    counted = dict(zip(map(str, found), counts.tolist(), strict=True))
+    names, counts = np.unique(label_peaks(hits.energy_kev, peaks), return_counts=True)
+    counted = dict(zip(map(str, names), counts.tolist(), strict=True))
     return {
         "events": hits.n_events,
         "hits": len(hits.edep_kev),
@@ -88,43 +95,32 @@ def _ends(values: npt.NDArray[np.floating[Any]]) -> list[float]:
     return [float(values.min()), float(values.max())]
 
 
-def hits_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
+def hits_in_words(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Names and texts for the result of `describe_hits`."""
-    lines = [("file", str(told["path"]))]
-    for name, one in told["detectors"].items():
+    lines = [("file", str(found["path"]))]
+    for name, one in found["detectors"].items():
         if name:
             lines.append(("detector", name))
         lines += [("hits", one)] if isinstance(one, str) else _hits_of(one)
     return lines
 
 
-def _hits_of(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    extents = ", ".join(f"{axis} {span(told[f'{axis}_mm'], 2)}" for axis in "xyzr")
+def _hits_of(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    extents = ", ".join(f"{axis} {span(found[f'{axis}_mm'], 2)}" for axis in "xyzr")
     lines = [
-        ("hits", f"{told['hits']} of {told['events']} events"),
-        ("energy", f"{span(told['energy_kev'])} keV an event"),
-        ("lines", counted(told["peaks"])),
+        ("hits", f"{found['hits']} of {found['events']} events"),
+        ("energy", f"{span(found['energy_kev'])} keV an event"),
+        ("lines", counted(found["peaks"])),
         ("extents", f"{extents} mm"),
     ]
-    crystal = told.get("crystal")
+    crystal = found.get("crystal")
     if crystal:
         size = f"radius {crystal['radius_mm']:g} mm, z 0 to {crystal['length_mm']:g} mm"
+        outside = crystal["outside_percent"]
+        misplaced = outside > _MISPLACED_PERCENT
+        remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
         lines += [
             ("crystal", f"{crystal['name']}, {size}"),
-            (
-                "inside",
-                f"{crystal['inside_percent']:.2f} % of the hits, outside "
-                f"{crystal['outside_percent']:.2f} %",
-            ),
-            ("frame", _frame(crystal)),
+            ("outside", f"{outside:.2f} % of the hits{remedy}"),
         ]
     return [(n, t) for n, t in lines if t]
-
-
-def _frame(crystal: Mapping[str, Any]) -> str:
-    fits = crystal.get("fits")
-    if fits:
-        return f"{fits['inside_percent']:.2f} % would be inside with {fits['options']}"
-    if crystal["outside_percent"] < 1:
-        return "that of the crystal"
-    return "no other fits; these hits are of another detector, or of other dimensions"

@@ -1,24 +1,28 @@
-"""Sources of hits, read block by block: a file or the gamma Monte Carlo."""
+"""Sources of hits in windows of energy, block by block: a file or the gamma Monte Carlo."""
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.energy_windows import Window
-from cpunet.simulation.gammas import GammaStatistics, WantedLine, simulate_gammas
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes.schema import PeakConfig
+from cpunet.simulation.gammas.sample import GammaStatistics, WantedLine, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_readers import TIME_WINDOW_US, Transform, hit_parts
-from cpunet.simulation.hit_readers.steps import require_some
-from cpunet.simulation.hits import Hits
+from cpunet.simulation.hit_files import hit_parts
+from cpunet.simulation.hit_steps import require_some
+from cpunet.simulation.hits import LATE_NS, HitOptions, Hits
+
+log = logging.getLogger(__name__)
 
 BLOCK_EVENTS = 2000
 # Events per round of the Monte Carlo, and maximum number of gammas per event; the rarest
@@ -30,24 +34,114 @@ _MAX_WORKERS = 8
 # Shares of hits outside the crystal: up to the first, rounding at its surface can be the
 # reason; above the second, the hits are not those of this detector.
 _STRAY, _MISPLACED = 1e-3, 0.9
+MAX_EVENTS = 1_000_000_000  # of a window; simulate more in several files
+
+
+class EnergyWindow(NamedTuple):
+    """Energies (keV) from `low_kev` to `high_kev`, both included, under a name."""
+
+    name: str
+    low_kev: float
+    high_kev: float
+
+
+def energy_windows(
+    text: str, peaks: Mapping[str, PeakConfig], half_width_kev: float
+) -> list[EnergyWindow]:
+    """EnergyWindows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
+
+    Parameters
+    ----------
+    text
+        Names and ranges, separated by commas.
+    peaks
+        Known gamma lines.
+    half_width_kev
+        Half-width of the windows around the lines.
+
+    Raises
+    ------
+    CpunetError
+        If a part is neither a known line nor a range, or the half-width is not above 0.
+
+    Examples
+    --------
+    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
+    >>> [tuple(window) for window in energy_windows("FEP,1500-1580", lines, 0.5)]
+    [('FEP', 2614.0, 2615.0), ('1500-1580', 1500.0, 1580.0)]
+    """
+    if not half_width_kev > 0:
+        raise CpunetError(f"window_kev {half_width_kev}: give a half-width above 0")
+    windows = []
+    for name in (part.strip() for part in text.split(",")):
+        chosen = parse_selection(name, peaks)
+        if chosen.chosen:
+            line = peaks[name].energy_kev
+            windows.append(EnergyWindow(name, line - half_width_kev, line + half_width_kev))
+        else:
+            windows.append(EnergyWindow(name, *chosen.ranges_kev[0]))
+    return windows
+
+
+def wanted_events(
+    events: str | Mapping[str, int], peaks: Mapping[str, PeakConfig], half_width_kev: float
+) -> dict[EnergyWindow, int]:
+    """EnergyWindows and the events wanted in each.
+
+    Parameters
+    ----------
+    events
+        ``"FEP=4000,1500-1580=300"``, the same as a mapping, or a number for each of `peaks`.
+    peaks, half_width_kev
+        See `energy_windows`.
+
+    Raises
+    ------
+    CpunetError
+        If a number or a line cannot be understood, or a line is named twice.
+
+    Examples
+    --------
+    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
+    >>> list(wanted_events("FEP=10,1500-1580=5", lines, 0.5).values())
+    [10, 5]
+    """
+    if isinstance(events, str):
+        pairs = [part.partition("=")[::2] for part in events.split(",")]
+        if "=" not in events:
+            pairs = [(name, events) for name in peaks]
+    else:
+        pairs = [(name, str(number)) for name, number in events.items()]
+    names = [name.strip() for name, _ in pairs]
+    if len(set(names)) < len(names):
+        raise CpunetError(f"`events` {events}: names a peak twice; give each once")
+    windows = energy_windows(",".join(names), peaks, half_width_kev)
+    return dict(zip(windows, (_count(number) for _, number in pairs), strict=True))
+
+
+def _count(text: str) -> int:
+    # underscores and signs, which int() takes, are more likely slips
+    if not text.strip().isdecimal():
+        raise CpunetError(
+            f"`events`: {text[:60]!r} is no number of events; give N or FEP=N,DEP=M"
+        )
+    if len(text.strip()) > 30 or int(text) > MAX_EVENTS:
+        raise CpunetError(f"`events`: {text[:60]!r} are too many; at most {MAX_EVENTS}")
+    return int(text)
 
 
 @dataclass(frozen=True)
 class HitFile:
-    """Hits of a file, see `cpunet.simulation.hit_readers.read_hits`.
+    """Hits of a file, see `cpunet.simulation.hit_files.read_hits`.
 
     With `windows`, only events with a deposited energy in one of them are used.  `placed` hits
     are those of a simulation: they have been checked against the crystal and merged.
     """
 
     path: Path
-    table: str | None = None
-    transform: Transform = field(default_factory=Transform)
-    length_unit: str | None = None
-    energy_unit: str | None = None
-    windows: tuple[Window, ...] = ()
+    options: HitOptions = field(default_factory=HitOptions)
+    windows: tuple[EnergyWindow, ...] = ()
     placed: bool = False
-    time_window_us: float = TIME_WINDOW_US
 
     def open(self, detector: Detector) -> OpenHits:
         """Read the file.
@@ -58,40 +152,37 @@ class HitFile:
             If the hits cannot be read, no event is in a window, or nearly all hits are outside
             the crystal.
         """
-        parts = hit_parts(
-            self.path,
-            detector=self.table,
-            transform=self.transform,
-            length_unit=self.length_unit,
-            energy_unit=self.energy_unit,
-            time_window_us=self.time_window_us,
-        )
+        parts = hit_parts(self.path, self.options)
 
-        def chosen() -> Iterator[Hits]:
-            for hits in parts():
-                within = _in_windows(hits.energy_kev, self.windows) if self.windows else None
-                yield hits if within is None else hits[within]
+        def chosen(hits: Hits) -> Hits:
+            return hits[_in_windows(hits.energy_kev, self.windows)] if self.windows else hits
 
-        n_events, astray = 0, _Astray(detector)
-        for hits in chosen():
-            n_events += hits.n_events
+        n_events, n_late, astray = 0, 0, _Astray(detector)
+        for part in parts():
+            hits = chosen(part)
+            n_events, n_late = n_events + hits.n_events, n_late + part.n_late
             if not self.placed:
                 astray.add(hits)
+        if n_late:
+            log.warning(
+                f"{self.path}: {n_late} events have deposits more than {LATE_NS:g} ns after "
+                "their first, simulated as if at once; a shorter `time_window_us` parts them"
+            )
         if not n_events and self.windows:
             names = ", ".join(window.name for window in self.windows)
             raise CpunetError(f"{self.path}: no event in {names}; widen window_kev")
         require_some(self.path, n_events)
-        warning = "" if self.placed else astray.told(self.path)
-        return OpenHits(n_events, _regrouped(chosen(), BLOCK_EVENTS), warning)
+        warning = "" if self.placed else astray.warning(self.path)
+        return OpenHits(n_events, _regrouped(map(chosen, parts()), BLOCK_EVENTS), warning)
 
     def provenance(self) -> dict[str, Any]:
         """Provenance of the hits, for the output."""
         return {
             "file": str(self.path),
-            "table": self.table,
-            "origin_mm": list(self.transform.origin_mm),
-            "flip_z": self.transform.flip_z,
-            "time_window_us": self.time_window_us,
+            "table": self.options.hits_detector,
+            "origin_mm": list(self.options.origin),
+            "flip_z": self.options.flip_z,
+            "time_window_us": self.options.time_window_us,
             "windows_kev": _by_name(self.windows),
         }
 
@@ -103,24 +194,24 @@ class _Astray:
     detector: Detector
     outside: int = 0
     total: int = 0
-    spans: dict[str, tuple[float, float]] = field(default_factory=dict)
+    low_mm: Any = np.inf
+    high_mm: Any = -np.inf
 
     def add(self, hits: Hits) -> None:
         """Count the hits of a part."""
-        inside = self.detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
-        self.outside += int((~inside).sum())
-        self.total += len(inside)
-        for axis, values in zip("xyz", (hits.x_mm, hits.y_mm, hits.z_mm), strict=True):
-            if len(values):
-                low, high = self.spans.get(axis, (np.inf, -np.inf))
-                self.spans[axis] = min(low, values.min()), max(high, values.max())
+        place = hits.position_mm
+        self.outside += int((~self.detector.inside(np.hypot(*place.T[:2]), hits.z_mm)).sum())
+        self.total += len(place)
+        self.low_mm = np.minimum(self.low_mm, place.min(axis=0, initial=np.inf))
+        self.high_mm = np.maximum(self.high_mm, place.max(axis=0, initial=-np.inf))
 
-    def told(self, path: Path) -> str:
+    def warning(self, path: Path) -> str:
         """Return a warning, or an empty text; raise an error if nearly all hits are outside."""
         n, total, detector = self.outside, self.total, self.detector
         if n <= _STRAY * total:
             return ""
-        spans = (f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in self.spans.items())
+        ends = zip("xyz", self.low_mm, self.high_mm, strict=True)
+        spans = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends)
         share = f"all {total}" if n == total else f"{n} of {total} ({n / total:.1%})"
         text = (
             f"{path}: {share} hits lie outside {detector.name} "
@@ -156,7 +247,7 @@ class GammaSource:
     `cpunet.simulation.gammas.simulate_gammas`.
     """
 
-    windows: tuple[Window, ...]
+    windows: tuple[EnergyWindow, ...]
     events: tuple[int, ...]
     height_mm: float
     radius_mm: float
@@ -238,11 +329,11 @@ class OpenHits:
 HitSource = HitFile | GammaSource
 
 
-def _in_windows(energy_kev: Any, windows: tuple[Window, ...]) -> Any:
+def _in_windows(energy_kev: Any, windows: tuple[EnergyWindow, ...]) -> Any:
     # sums of deposits are rounded, in some formats to float32; windows are wider than that
     inside = [(energy_kev >= w.low_kev) & (energy_kev <= w.high_kev) for w in windows]
     return np.logical_or.reduce(inside)
 
 
-def _by_name(windows: tuple[Window, ...]) -> dict[str, tuple[float, float]]:
+def _by_name(windows: tuple[EnergyWindow, ...]) -> dict[str, tuple[float, float]]:
     return {window.name: (window.low_kev, window.high_kev) for window in windows}

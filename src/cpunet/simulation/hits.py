@@ -16,6 +16,8 @@ IntArray = npt.NDArray[np.int64]
 # Larger than any laboratory and any event. Compiled loops convert positions into indices and
 # would overflow beyond.
 FARTHEST_MM, MAX_KEV = 1e7, 1e9
+# Deposits of an event are simulated at once; later ones would change the edge of its pulse.
+LATE_NS = 50.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class HitOptions:
     energy_unit
         Unit of energies, if the file names none: keV, MeV, eV or GeV.
     time_window_us
-        Hits of an event number that come later than this are another event.
+        Hits of an event number that come later than this are another event; remage's interval
+        by default.
     """
 
     hits_detector: str | None = None
@@ -44,6 +47,16 @@ class HitOptions:
     length_unit: str | None = None
     energy_unit: str | None = None
     time_window_us: float = 10.0
+
+    def to_crystal(self, position_mm: FloatArray) -> FloatArray:
+        """Positions of shape ``(n, 3)`` in mm, from the frame of the file to the crystal's.
+
+        `origin` is subtracted. With `flip_z`, z (and y, so that the frame remains right-handed)
+        are then mirrored.
+        """
+        moved = position_mm - np.asarray(self.origin)
+        mirror = np.array([1.0, -1.0, -1.0]) if self.flip_z else np.ones(3)
+        return np.asarray(moved * mirror, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +76,14 @@ class Hits:
         Int64 array of ``n_events + 1``, from 0 to the number of hits.
     event_number
         Event numbers of the source.
+    n_late
+        Number of events with a deposit more than `LATE_NS` after their first, where a file
+        tells the times.
 
     Raises
     ------
     CpunetError
-        If the lengths disagree, the offsets decrease, or a hit lies beyond `FARTHEST_MM`.
+        If a hit lies beyond `FARTHEST_MM`.
 
     Examples
     --------
@@ -84,26 +100,15 @@ class Hits:
     edep_kev: FloatArray
     offsets: IntArray
     event_number: IntArray
+    n_late: int = 0
 
     def __post_init__(self) -> None:
-        n = len(self.edep_kev)
-        for name in ("x_mm", "y_mm", "z_mm", "edep_kev"):
-            if getattr(self, name).shape != (n,):
-                raise CpunetError(f"hits: {name} does not have one value per hit ({n})")
         for values in (self.x_mm, self.y_mm, self.z_mm):
             if np.any(np.abs(values) > FARTHEST_MM):
                 raise CpunetError(
                     f"hits: one lies {np.nanmax(np.abs(values)):g} mm away; check the units "
                     "and the origin"
                 )
-        ends_fit = len(self.offsets) > 0 and self.offsets[0] == 0 and self.offsets[-1] == n
-        if not ends_fit or np.any(np.diff(self.offsets) < 0):
-            raise CpunetError(f"hits: offsets must rise from 0 to the number of hits, {n}")
-        if self.event_number.shape != (len(self.offsets) - 1,):
-            raise CpunetError(
-                f"hits: {len(self.event_number)} event numbers for "
-                f"{len(self.offsets) - 1} events"
-            )
 
     @classmethod
     def of(
@@ -208,8 +213,6 @@ class Hits:
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:
         """Concatenate several sets, keeping the order of events."""
-        if not sets:
-            raise CpunetError("no sets of hits to join")
         counts = [np.diff(s.offsets) for s in sets]
         return cls.of(
             np.concatenate([s.position_mm for s in sets]),

@@ -1,7 +1,20 @@
-"""LEGEND metadata of germanium detectors (``hardware/detectors/germanium/diodes``)."""
+r"""LEGEND metadata of germanium detectors: diodes, and the crystals they were cut from.
+
+The ``impurity_curve`` of a crystal describes the boule from which detectors were cut. As
+LegendDataManagement.jl reads it for SolidStateDetectors.jl (its boule impurity densities), it
+gives the net acceptors in 1e9/cm3 as a function of the distance :math:`z` from the seed end of
+the boule in mm,
+
+.. math:: N(z) = a + b z + c z^2 + n\, e^{(z - l)/m}.
+
+With ``corrections`` this becomes ``scale`` times the curve plus ``offset`` (1e9/cm3). The
+``detector_offset_in_mm`` of a slice is the position of its point contact. From there the axis
+of the detector runs back to the seed end.
+"""
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Mapping
 from typing import Any
@@ -30,6 +43,13 @@ _GEOMETRY = {
     "bulletization.top_radius_in_mm": "top_bullet_radius",
     "bulletization.bottom_radius_in_mm": "bottom_bullet_radius",
     "bulletization.borehole_radius_in_mm": "bore_bullet_radius",
+    "extra.topgroove.radius_in_mm": "top_groove_radius",
+    "extra.topgroove.depth_in_mm": "top_groove_depth",
+    "extra.top_cylinder.radius_in_mm": "top_cylinder_radius",
+    "extra.top_cylinder.height_in_mm": "top_cylinder_length",
+    "extra.bottom_cylinder.radius_in_mm": "bottom_cylinder_radius",
+    "extra.bottom_cylinder.height_in_mm": "bottom_cylinder_length",
+    "extra.bottom_cylinder.transition_in_mm": "bottom_transition_length",
     "bulletization.pp-contact_radius_in_mm": "",
     "bulletization.contact_radius_in_mm": "",
 }
@@ -54,13 +74,16 @@ _MEASURED = {
         "characterization.manufacturer.dl_thickness_in_mm",
     ),
 }
-# shapes of `geometry.extra`, and what they do to the crystal unless they are neutral
-_EXTRA = {
-    "crack": "cuts off a side; only axially symmetric crystals are simulated",
-    "topgroove": "is not simulated",
-    "top_cylinder": "is not simulated",
-    "bottom_cylinder": "is not simulated",
-}
+# Shapes that change nothing where their radius is another one, or they have no size.
+_EXTRA = (
+    ("top_groove", "bore_radius", ("top_groove_depth",)),
+    ("top_cylinder", "crystal_radius", ("top_cylinder_length",)),
+    (
+        "bottom_cylinder",
+        "crystal_radius",
+        ("bottom_cylinder_length", "bottom_transition_length"),
+    ),
+)
 # of the argon around LEGEND's detectors
 LIQUID_ARGON_K = 87.0
 _NOT_SIMULATED = {"coax": "semi-coaxial detectors collect on their bore"}
@@ -72,6 +95,16 @@ _IMPCC = (
     "dist_from_contact_in_mm at different distances; correct it, or remove it and put the "
     "crystal's file into ../crystals"
 )
+# parameters of each model of the impurity curve
+MODELS = {
+    "constant_boule": ("value",),
+    "linear_boule": ("a", "b"),
+    "parabolic_boule": ("a", "b", "c"),
+    "linear_exponential_boule": ("a", "b", "n", "l", "m"),
+    "parabolic_exponential_boule": ("a", "b", "c", "n", "l", "m"),
+}
+_ANOTHER = "correct it, or take another file of the crystal"
+_LARGEST_EXPONENT = 300
 
 
 def why_missing(field: str) -> str:
@@ -91,7 +124,7 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     ------
     CpunetError
         If the geometry has an unknown key (for example, one without its unit), lacks one, or
-        has an ``extra`` shape that changes the crystal.
+        has a crack, which is not symmetric.
     """
     kind = diode.get("type")
     if kind is not None and kind not in _SIMULATED:
@@ -104,10 +137,15 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     for key in _REQUIRED:
         if key not in geometry:
             raise CpunetError(f"detector {name}: no geometry.{key}; add it to the file")
-    _refuse_extra(diode["geometry"], name)
+    extra = diode["geometry"].get("extra") or {}
+    if _at(extra, "crack") and _at(extra, "crack.width_in_mm") != 0:
+        raise CpunetError(
+            f"detector {name}: geometry.extra.crack cuts off a side; only axially symmetric "
+            "crystals are simulated; remove it to simulate the crystal without it"
+        )
     values: dict[str, Any] = {"name": str(diode["name"])} if "name" in diode else {}
     for key, value in geometry.items():
-        if key.partition(".")[0] == "extra":
+        if key == "extra" or key.startswith("extra.crack"):
             continue
         if key not in _GEOMETRY:
             raise CpunetError(
@@ -116,6 +154,10 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             )
         if field := _GEOMETRY[key]:
             values[field] = value
+    for shape, same, sizes in _EXTRA:
+        none = not any(values.get(size) for size in sizes)
+        if none or values.get(f"{shape}_radius") == values.get(same, 0):
+            values = {k: v for k, v in values.items() if k not in (f"{shape}_radius", *sizes)}
     outer, inner = (geometry.get(f"groove.radius_in_mm.{x}", 0) for x in ("outer", "inner"))
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = _number(outer, name) - _number(inner, name)
@@ -130,32 +172,6 @@ def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
     """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
     diode_name = str(diode.get("name", name))
     return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
-
-
-def _refuse_extra(geometry: Mapping[str, Any], name: str) -> None:
-    """Refuse the shapes of ``geometry.extra``, but for those that change nothing."""
-    shapes = geometry.get("extra") or {}
-    for shape in shapes:
-        if shape not in _EXTRA:
-            raise CpunetError(
-                f"detector {name}: geometry.extra.{shape} is an unknown shape; remove it"
-            )
-        radius, height, transition, depth, width = (
-            _at(shapes, f"{shape}.{size}_in_mm")
-            for size in ("radius", "height", "transition", "depth", "width")
-        )
-        as_crystal = radius == geometry["radius_in_mm"]
-        neutral = {
-            "crack": width == 0,
-            "topgroove": depth == 0 or radius == (_at(geometry, "borehole.radius_in_mm") or 0),
-            "top_cylinder": height == 0 or as_crystal,
-            "bottom_cylinder": (height == 0 and not transition) or as_crystal,
-        }
-        if not neutral[shape]:
-            raise CpunetError(
-                f"detector {name}: geometry.extra.{shape} {_EXTRA[shape]}; remove it to "
-                "simulate the crystal without it"
-            )
 
 
 def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
@@ -207,3 +223,94 @@ def _number(value: Any, name: str) -> float:
         raise CpunetError(
             f"detector {name}: geometry.groove.radius_in_mm has no numbers; give both"
         ) from error
+
+
+def impurity_values(
+    crystal: Mapping[str, Any], source: str, slice_name: str, length_mm: float
+) -> dict[str, float]:
+    """Impurity fields of `Detector` for one slice of a crystal.
+
+    Parameters
+    ----------
+    crystal
+        Content of the file of the crystal.
+    source
+        Name of the file for error messages.
+    slice_name
+        Slice from which the detector was cut, one of ``slices``, such as ``"A"``.
+    length_mm
+        Length of the detector along the axis in mm.
+
+    Raises
+    ------
+    CpunetError
+        If the curve, a parameter or the slice is missing or unknown.
+
+    Examples
+    --------
+    A constant 10 x 1e9/cm3 net acceptors are -1e10/cm3.
+
+    >>> crystal = {
+    ...     "impurity_curve": {"model": "constant_boule", "parameters": {"value": 10.0}},
+    ...     "slices": {"A": {"detector_offset_in_mm": 5.0}},
+    ... }
+    >>> impurity_values(crystal, "V99000.yaml", "A", 90.0)["impurity_z0_1e10_per_cm3"]
+    -1.0
+    """
+    curve = crystal.get("impurity_curve")
+    if not isinstance(curve, Mapping):
+        raise CpunetError(f"{source}: no impurity_curve; {_ANOTHER}")
+    model = curve.get("model")
+    if not isinstance(model, str) or model not in MODELS:
+        raise CpunetError(
+            f"{source}: impurity_curve.model {model!r} is not known; there are "
+            f"{', '.join(MODELS)}; {_ANOTHER}"
+        )
+    numbers = {
+        key: _number_at(crystal, f"impurity_curve.parameters.{key}", source)
+        for key in MODELS[model]
+    }
+    a = numbers.get("value", numbers.get("a", 0.0))
+    b, c, n = (numbers.get(key, 0.0) for key in "bcn")
+    place = f"slices.{slice_name}.detector_offset_in_mm"
+    contact = _number_at(crystal, place, source)
+    scale = _number_at(crystal, "impurity_curve.corrections.scale", source, 1.0)
+    offset = _number_at(crystal, "impurity_curve.corrections.offset", source, 0.0)
+    # z of the boule is that of the contact minus the detector's z; 1e9 acceptors are -0.1 of
+    # our unit, and the scale does not apply to the offset
+    unit = -0.1 * scale
+    values = {
+        "impurity_z0_1e10_per_cm3": unit * (a + b * contact + c * contact**2) - 0.1 * offset,
+        # z^2 = L z - (L / 2)^2 (1 - (2 z / L - 1)^2), z in mm here and in cm there
+        "impurity_gradient_1e10_per_cm4": 10 * unit * (c * length_mm - b - 2 * c * contact),
+        "impurity_quadratic_1e10_per_cm3": -unit * c * length_mm**2 / 4,
+    }
+    if n:
+        begin, decay = numbers["l"], numbers["m"]
+        exponents = [(z - begin) / decay for z in (contact, contact - length_mm) if decay]
+        if not exponents or max(exponents) > _LARGEST_EXPONENT:
+            raise CpunetError(
+                f"{source}: impurity_curve.parameters.m = {decay:g} gives no finite "
+                f"exp((z - l) / m); {_ANOTHER}"
+            )
+        if amplitude := unit * n * math.exp(exponents[0]):  # 0 if it underflows
+            values["impurity_exponential_1e10_per_cm3"] = amplitude
+            values["impurity_exponential_length_mm"] = decay
+    return values
+
+
+def _number_at(
+    values: Mapping[str, Any], place: str, source: str, default: float | None = None
+) -> float:
+    """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
+    found: Any = values
+    for key in place.split("."):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    if found is None and default is not None:
+        return default
+    if found is None:
+        raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
+    number = isinstance(found, int | float) and not isinstance(found, bool)
+    if not number or not math.isfinite(found):
+        raise CpunetError(f"{source}: {place} = {found!r} is no number; {_ANOTHER}")
+    return float(found)

@@ -114,7 +114,7 @@ def hit_signals(
     Raises
     ------
     CpunetError
-        If a coordinate or an energy is not finite, or their numbers differ.
+        If a coordinate or an energy is not finite.
 
     References
     ----------
@@ -162,10 +162,7 @@ def hit_table(
     x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike, edep_kev: npt.ArrayLike
 ) -> FloatArray:
     """Hits as rows x, y, z (mm), energy (keV); see `hit_signals` for invalid input."""
-    try:
-        columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
-    except ValueError as error:
-        raise CpunetError("hits: x, y, z and energy differ in number; give one each") from error
+    columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
     table = np.ascontiguousarray(np.stack(columns, axis=-1), dtype=np.float64).reshape(-1, 4)
     near = (np.abs(table[:, :3]) <= FARTHEST_MM).all(1)  # NaN is not
     bad = np.flatnonzero(~(near & np.isfinite(table[:, 3])))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +22,20 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, read_settings, require_seed
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.energy_windows import Window, energy_windows, wanted_events
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
-from cpunet.simulation.gammas import with_resolution
+from cpunet.simulation.gammas.sample import with_resolution
 from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import Transform
-from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
-from cpunet.simulation.hit_readers.hit_table import hit_columns
-from cpunet.simulation.hit_sources import GammaSource, HitFile, HitSource
+from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
+from cpunet.simulation.hit_sources import (
+    EnergyWindow,
+    GammaSource,
+    HitFile,
+    HitSource,
+    energy_windows,
+    wanted_events,
+)
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings, split_overrides
@@ -52,7 +55,7 @@ class Simulation:
 
     Hits are counted as merged, energies are in keV. ``lines`` counts, by window, the pulses
     whose collected energy is still in it; ``not_collected`` the hits whose charge was not all
-    collected within the record; ``seconds`` is the time spent on each step.
+    collected within the record.
     """
 
     path: Path
@@ -71,7 +74,6 @@ class Simulation:
     trapped_kev: float = 0.0
     events_with_loss: int = 0
     lines: Counter[str] = field(default_factory=Counter)
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def pulses(self) -> PulseFile:
@@ -87,8 +89,6 @@ class Simulation:
         return f"<Simulation {self.path}: {self.n_written} pulses of {self.detector.name}>"
 
     def __str__(self) -> str:
-        seconds = sum(self.seconds.values())
-        spent = ", ".join(f"{name} {s:.1f}" for name, s in self.seconds.items())
         lines = ", ".join(f"{n} {name}" for name, n in self.lines.items())
         told = [
             f"{self.n_written} of {self.n_events} events written ({lines} by collected "
@@ -103,8 +103,7 @@ class Simulation:
             told.append(f"{self.not_collected} hits not collected in full; raise length_ns")
         if self.trapped_kev:
             told.append(f"{self.trapped_kev / self.energy_kev:.2%} of the energy trapped")
-        speed = f"{self.n_events / seconds:.0f} events/s, {seconds:.1f} s"
-        told.append(f"{self.mode} pulses, {speed}: {spent}")
+        told.append(f"{self.mode} pulses")
         return "\n".join(f"{self.path}: {line}" for line in told)
 
 
@@ -177,7 +176,7 @@ def simulate(
     windows = tuple(energy_windows(",".join(peaks), peaks, physics.window_kev))
     source: HitSource
     if hits is not None:
-        source = hits if isinstance(hits, HitFile) else _hit_file(hits, frame)
+        source = hits if isinstance(hits, HitFile) else HitFile(Path(hits), frame)
         if events is not None:
             names = events if isinstance(events, str) else ",".join(events)
             windows = tuple(energy_windows(names, peaks, physics.window_kev))
@@ -197,70 +196,47 @@ def simulate(
     return simulation
 
 
-def _hit_file(path: str | Path, frame: HitOptions) -> HitFile:
-    return HitFile(
-        Path(path),
-        frame.hits_detector,
-        Transform(frame.origin, frame.flip_z),
-        frame.length_unit,
-        frame.energy_unit,
-        time_window_us=frame.time_window_us,
-    )
-
-
 def _simulate(
     simulation: Simulation,
     source: HitSource,
-    windows: tuple[Window, ...],
+    windows: tuple[EnergyWindow, ...],
     writer: PulseWriter,
     resolution: Resolution | None,
     seed: int,
 ) -> None:
     """Write the pulses, and count them."""
     detector, settings = simulation.detector, simulation.settings
-    clock = _Clock()
     if resolution is not None:
         _smeared(np.zeros(0), resolution, seed)  # wrong ones are told before any work
     opened = source.open(detector)
-    clock.lap("reading")
     if opened.warning:
         log.warning(opened.warning)
     with stage(f"Fields of {detector.name}"):
         fields = compute_fields(detector)
-    clock.lap("fields")
     merged = isinstance(source, HitFile) and source.placed
     blocks = _merged(
         opened.blocks, detector, 0.0 if merged else settings.cluster_mm, simulation
     )
     first = next(blocks)
-    clock.lap("first hits")
-    mode = _mode(settings, len(first.edep_kev) / len(first) * opened.n_events)
+    mode = settings.mode
+    if mode == "auto":
+        expected_hits = len(first.edep_kev) / len(first) * opened.n_events
+        mode = "library" if expected_hits >= LIBRARY_FROM_HITS else "exact"
     simulation.mode = mode
     library = build_library(fields, settings) if mode == "library" else None
-    clock.lap("library")
     with writer, stage(f"Simulating {detector.name}", opened.n_events) as bar:
         for block in chain([first], blocks):
-            clock.lap("waiting for hits")
             events = simulate_events(fields, block, settings, mode, library)
-            clock.lap("pulses")
             _count(simulation, block, events, windows)
             _append(writer, block, events, settings, resolution, seed)
-            clock.lap("writing")
             bar.update(len(block))
         if not writer.n_pulses:
             raise CpunetError(
                 f"{simulation.path}: none of {simulation.n_events} events gives a signal: "
                 f"their hits lie outside {detector.name} or in its contacts; check their frame"
             )
-        simulation.seconds = clock.seconds
         made = _made(simulation, source, resolution, seed) | {"depletion_V": fields.depletion_V}
         writer.annotate({"simulation": json.dumps(made)})
-
-
-def _mode(settings: SimulationSettings, expected_hits: float) -> Literal["exact", "library"]:
-    if settings.mode != "auto":
-        return settings.mode
-    return "library" if expected_hits >= LIBRARY_FROM_HITS else "exact"
 
 
 def _smeared(energy_kev: Any, resolution: Resolution, seed: int) -> Any:
@@ -277,9 +253,8 @@ def _merged(
 
 
 def _count(
-    simulation: Simulation, hits: Hits, events: EventPulses, windows: tuple[Window, ...]
+    simulation: Simulation, hits: Hits, events: EventPulses, windows: tuple[EnergyWindow, ...]
 ) -> None:
-    """Count a block of events."""
     """Count a block of events."""
     r = np.hypot(hits.x_mm, hits.y_mm)
     inside = simulation.detector.inside(r, hits.z_mm)
@@ -340,17 +315,3 @@ def _made(
         "events": simulation.n_events,
         "events_without_signal": simulation.without_signal,
     }
-
-
-class _Clock:
-    """Time spent on each step, in seconds."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """Add the time since the last lap, or the start, to that of a step."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now

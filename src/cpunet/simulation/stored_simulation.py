@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_readers import read_hits
-from cpunet.simulation.hit_readers.hit_table import TABLE as HIT_TABLE
+from cpunet.simulation.hit_files import HIT_TABLE, read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 
@@ -23,7 +21,7 @@ _PULSES = "geds/sim"
 
 @dataclass(frozen=True, eq=False)
 class StoredSimulation:
-    """Physics and hits of the pulses in a file of ``cpunet simulate`` or ``cpunet stand``.
+    """Physics and hits of the pulses in a file of ``cpunet simulate`` or of a test stand.
 
     Parameters
     ----------
@@ -50,11 +48,20 @@ class StoredSimulation:
             a pulse.
         """
         file = Path(path)
-        made, numbers = _record(file)
+        with opened(file) as content:
+            text = content[_PULSES].attrs.get("simulation") if _PULSES in content else None
+            if text is None or HIT_TABLE not in content:
+                raise CpunetError(
+                    f"{file}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
+                    "an output of cpunet simulate or of a test stand"
+                )
+            column = content.get(f"{_PULSES}/event_number")
+            numbers = np.asarray(column[()]) if is_column(column) else np.empty(0)
         try:
+            made = json.loads(text)
             detector = Detector.model_validate(made["detector"])
             settings = SimulationSettings.model_validate(made["settings"])
-        except (KeyError, TypeError, ValidationError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CpunetError(
                 f"{file}: what {_PULSES} tells of its simulation cannot be used by this "
                 "version; simulate it again"
@@ -63,7 +70,7 @@ class StoredSimulation:
             raise CpunetError(
                 f"{file}: several pulses have the same event_number; simulate them again"
             )
-        hits = read_hits(file).hits.of_events(numbers)
+        hits = read_hits(file).of_events(numbers)
         missing = np.diff(hits.offsets) == 0
         if missing.any():
             raise CpunetError(
@@ -71,26 +78,3 @@ class StoredSimulation:
                 "simulate it again"
             )
         return cls(detector, settings, hits)
-
-
-def _record(path: Path) -> tuple[dict[str, Any], Any]:
-    """Provenance of the pulses, and their event numbers."""
-    with opened(path) as file:
-        text = file[_PULSES].attrs.get("simulation") if _PULSES in file else None
-        if text is None or HIT_TABLE not in file:
-            raise CpunetError(
-                f"{path}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
-                "an output of cpunet simulate or cpunet stand"
-            )
-        column = file.get(f"{_PULSES}/event_number")
-        numbers = np.asarray(column[()]) if is_column(column) else np.empty(0)
-    try:
-        made = json.loads(text)
-        if not isinstance(made, dict) or numbers.dtype.kind not in "iu":
-            raise TypeError
-    except (TypeError, ValueError, RecursionError) as error:
-        raise CpunetError(
-            f"{path}: what {_PULSES} tells of its simulation is damaged; is the file "
-            "truncated? simulate it again"
-        ) from error
-    return made, numbers.astype(np.int64)

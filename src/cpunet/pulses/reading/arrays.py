@@ -73,7 +73,9 @@ class ArraySource(PulseSource):
             for name, values in arrays.items()
             if values.ndim <= 1 and values.dtype.kind in "iufb"
         }
-        super().__init__(options, Layout.of_array("NumPy", name, self._values.shape, columns))
+        super().__init__(
+            options, Layout.of_array(options.path, "NumPy", name, self._values.shape, columns)
+        )
 
     def _traces(self, size: int) -> Iterator[Traces]:
         for start in range(0, len(self._values), size):
@@ -91,7 +93,7 @@ class MemorySource(PulseSource):
             "dt_ns": MemoryColumn(np.array(pulses.dt_ns)),
         }
         shape = pulses.waveforms.shape
-        super().__init__(options, Layout.of_array("memory", "", shape, columns))
+        super().__init__(options, Layout.of_array(options.path, "memory", "", shape, columns))
 
     def _traces(self, size: int) -> Iterator[Traces]:
         for start in range(0, len(self._in_memory), size):

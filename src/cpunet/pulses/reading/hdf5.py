@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, lh5_rows, opened, text_attribute
+from cpunet.hdf5_files import lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.energies import shortened
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.reading.hdf5_columns import Hdf5Column, columns_of
 from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 
@@ -32,19 +33,26 @@ def open_hdf5(options: PulseFile) -> PulseSource:
     with opened(options.path) as file:
         if is_majorana(file):
             return MajoranaSource(options)
-        chosen = choose_waveforms(options.path, file, options.table)
-    return Lh5Source(options, chosen) if chosen.is_lh5 else Hdf5Source(options, chosen)
+        table, _, contact = (options.table or "").partition(f"{_CONTACT}=")
+        chosen = choose_waveforms(options.path, file, table)
+    if chosen.is_lh5:
+        return Lh5Source(options, chosen, contact)
+    return Hdf5Source(options, chosen)
 
 
 class Lh5Source(PulseSource):
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
-    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
+    def __init__(self, options: PulseFile, chosen: WaveformColumn, contact: str = "") -> None:
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
-            n_pulses = _n_rows(file[self._values])
             columns = columns_of(options.path, file[chosen.table or "/"])
-            _require_one_contact(options.path, columns)
+            rows = _rows_of_contact(options.path, columns, contact)
+            self._first, n_pulses = rows or (0, _n_rows(file[self._values]))
+            period = columns_of(options.path, file[chosen.path]).get("dt")
+            if rows is not None:
+                columns = {name: column.part(*rows) for name, column in columns.items()}
+                period = period.part(*rows) if period is not None else None
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
             shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
             if shortest < longest and first.dtype.kind == "f":
@@ -59,19 +67,21 @@ class Lh5Source(PulseSource):
                 length=longest,
                 columns=columns,
                 period_name=f"{chosen.path}/dt",
-                period=columns_of(options.path, file[chosen.path]).get("dt"),
+                period=period,
             )
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
         with opened(self.path) as file:
-            for start in range(0, self.n_pulses or 0, size):
-                yield Traces(self._rows(file, start, size, self.length))
+            n_pulses = self.n_pulses or 0
+            for start in range(0, n_pulses, size):
+                n = min(size, n_pulses - start)
+                yield Traces(self._rows(file, start, n, self.length))
 
     def _rows(
         self, file: h5py.File, start: int, size: int, length: int | None
     ) -> npt.NDArray[Any]:
-        item = file[self._values]
+        item, start = file[self._values], self._first + start
         plain = isinstance(item, h5py.Dataset)
         values = item[start : start + size] if plain else lh5_rows(item, start, size)
         if not hasattr(values, "cumulative_length"):
@@ -107,16 +117,30 @@ def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
     return (int(lengths.min()), int(lengths.max())) if len(lengths) else None
 
 
-def _require_one_contact(path: Path, columns: dict[str, Hdf5Column]) -> None:
-    """Refuse a table with the pulses of several contacts, one after another."""
+def _rows_of_contact(
+    path: Path, columns: dict[str, Hdf5Column], contact: str
+) -> tuple[int, int] | None:
+    """First row and number of rows of a contact, where a table holds several one by one."""
     column = columns.get(_CONTACT)
-    contacts = np.unique(column.read(0, len(column))) if column is not None else ()
-    if len(contacts) > 1:
-        names = ", ".join(map(str, contacts))
+    values = column.read(0, len(column)) if column is not None else np.empty(0)
+    contacts = [str(one) for one in np.unique(values)]
+    if contact and contact not in contacts:
+        held = ", ".join(contacts) or "none"
+        raise CpunetError(f"{path}: no contact {contact} (column {_CONTACT}); it holds {held}")
+    if len(contacts) < 2:
+        return None
+    if not contact:
         raise CpunetError(
-            f"{path}: holds the pulses of contacts {names} (column {_CONTACT})",
-            "give a file with the rows of one contact, the one that is read out",
+            f"{path}: holds the pulses of contacts {', '.join(contacts)} (column {_CONTACT})",
+            f"choose the one that is read out with `table` chnid={contacts[0]}",
         )
+    rows = np.flatnonzero(values == type(values[0])(contact))
+    if len(rows) <= rows[-1] - rows[0]:
+        raise CpunetError(
+            f"{path}: the rows of contacts {', '.join(contacts)} are mixed",
+            "write those of a contact one after another",
+        )
+    return int(rows[0]), len(rows)
 
 
 class Hdf5Source(PulseSource):
@@ -127,7 +151,7 @@ class Hdf5Source(PulseSource):
         with opened(options.path) as file:
             dataset = file[chosen.path]
             columns = columns_of(options.path, file[chosen.table or "/"])
-            layout = Layout.of_array("HDF5", chosen.path, dataset.shape, columns)
+            layout = Layout.of_array(options.path, "HDF5", chosen.path, dataset.shape, columns)
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
@@ -137,78 +161,11 @@ class Hdf5Source(PulseSource):
                 yield Traces(dataset[start : start + size])
 
 
-@dataclass(frozen=True)
-class Hdf5Column:
-    """Dataset of an HDF5 file with one value per event; the file is open only while reading.
-
-    Parameters
-    ----------
-    path, dataset
-        File, and path of the dataset in it.
-    units
-        The attribute ``units``, empty if there is none.
-    size
-        Number of values.
-    constant
-        Whether it is a scalar, which applies to all events.
-    """
-
-    path: Path
-    dataset: str
-    units: str
-    size: int
-    constant: bool
-
-    def __len__(self) -> int:
-        return self.size
-
-    def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events `start` to `stop` - 1, shape ``(stop - start,)``."""
-        with opened(self.path) as file:
-            if self.constant:
-                return np.full(stop - start, file[self.dataset][()])
-            return np.asarray(file[self.dataset][start:stop])
-
-
 def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
     """Number of traces; a group holds them encoded, or as vectors of their own lengths."""
     if isinstance(values, h5py.Group):
         values = values.get("encoded_data", values).get("cumulative_length")
     return int(values.shape[0]) if values is not None and values.ndim else 0
-
-
-def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:
-    """Columns of a group: its numeric datasets of one dimension, and its scalars."""
-    members = {name: group.get(name) for name in group}
-    return {name: _column(path, m) for name, m in members.items() if is_column(m)}
-
-
-def columns_beside(path: Path, name: str) -> dict[str, Hdf5Column]:
-    """Columns of the group in which a column of an HDF5 file stands."""
-    with opened(path) as file:
-        return columns_of(path, file[name].parent)
-
-
-def column_of(path: Path, name: str) -> Hdf5Column:
-    """Return a column of an HDF5 file by its path in the file.
-
-    Raises
-    ------
-    CpunetError
-        If there is no such file or column; the message lists the other columns of the group.
-    """
-    with opened(path) as file:
-        found = file.get(name)
-        if is_column(found):
-            return _column(path, found)
-        parent = file.get(name.strip("/").rpartition("/")[0] or "/")
-        known = list(columns_of(path, parent)) if isinstance(parent, h5py.Group) else list(file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(known)}")
-
-
-def _column(path: Path, dataset: h5py.Dataset) -> Hdf5Column:
-    units = text_attribute(dataset, "units")
-    return Hdf5Column(path, dataset.name, units, dataset.size, dataset.ndim == 0)
 
 
 @dataclass(frozen=True)
@@ -270,7 +227,8 @@ def _no_waveforms(path: Path, file: h5py.File) -> CpunetError:
     arrays: list[str] = []
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf":
+        traces = isinstance(item, h5py.Dataset) and item.ndim == 2 and item.shape[1] > 3
+        if traces and item.dtype.kind in "iuf":  # of three columns are positions
             arrays.append(name)
 
     file.visititems(look)
@@ -304,6 +262,8 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
     by_name = {column.name: column for column in found}
     for name in _PREFERRED:
         if name in by_name:
+            others = ", ".join(sorted(by_name.keys() - {name}))
+            log.info(f"{path.name}: {name} is read, at the full rate, not {others} (`table`)")
             return by_name[name]
     raise CpunetError(
         f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "

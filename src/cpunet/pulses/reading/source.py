@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -61,9 +62,28 @@ class Layout:
 
     @classmethod
     def of_array(
-        cls, format: str, name: str, shape: tuple[int, ...], columns: Mapping[str, Column]
+        cls,
+        path: Path,
+        format: str,
+        name: str,
+        shape: tuple[int, ...],
+        columns: Mapping[str, Column],
     ) -> Layout:
-        """Layout of an array of shape ``(pulses, samples)`` and the columns beside it."""
+        """Layout of an array of shape ``(pulses, samples)`` and the columns beside it.
+
+        Raises
+        ------
+        CpunetError
+            If the columns have a value for each of its samples: Julia and MATLAB write arrays
+            with their dimensions reversed.
+        """
+        sizes = {len(column) for column in columns.values() if not column.constant}
+        if shape[1] in sizes and shape[0] not in sizes:
+            raise CpunetError(
+                f"{path}: traces of shape {shape} beside columns of {shape[1]}: their "
+                "dimensions are reversed",
+                "write them transposed, with the pulses first",
+            )
         period_name = "dt_ns" if "dt_ns" in columns else "dt"
         period = columns.get(period_name)
         return cls(format, name, shape[0], shape[1], columns, period_name, period)

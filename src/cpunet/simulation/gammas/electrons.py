@@ -9,7 +9,7 @@ import numpy as np
 from cpunet.kernels import kernel
 from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, Array, ElectronTable
 from cpunet.simulation.gammas.processes import (
-    Direction,
+    UnitVector,
     annihilation_energy,
     forward,
     isotropic,
@@ -30,7 +30,13 @@ def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> 
 
 @kernel(error_model="numpy")
 def put_photon(
-    stack: Array, n: int, x: float, y: float, z: float, direction: Direction, energy: float
+    stack: Array,
+    n: int,
+    x: float,
+    y: float,
+    z: float,
+    direction: UnitVector,
+    energy: float,
 ) -> int:
     """Push a photon onto the stack of pending photons; return the new height."""
     row = stack[n]
@@ -52,11 +58,17 @@ def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float)
     if z - reach < shape.bottom_bullet:
         narrowing = max(narrowing, shape.bottom_bullet)
     below = max(shape.bottom_taper_end - z + reach, 0.0) * shape.bottom_taper_slope
+    if z + reach > shape.top_step_start:
+        narrowing += shape.top_step
+    if z - reach < shape.bottom_step_end + shape.bottom_transition:
+        below += shape.bottom_step
     if r + reach > shape.radius - narrowing - below:
         return False
     widest = shape.bore_radius
     widest += (shape.length - shape.inner_taper_start) * shape.inner_taper_slope
-    return z + reach < shape.bore_end or r - reach > widest
+    if z + reach > shape.groove_start:
+        widest = max(widest, shape.groove_radius)
+    return z + reach < min(shape.bore_end, shape.groove_start) or r - reach > widest
 
 
 @kernel(error_model="numpy")
@@ -73,7 +85,7 @@ def slow_down(
     shape: CrystalShape,
     table: ElectronTable,
     position: tuple[float, float, float],
-    direction: Direction,
+    direction: UnitVector,
     kinetic: float,
     positron: bool,
     hits: Array,
@@ -139,7 +151,7 @@ def slow_down(
     n_hits = record(hits, n_hits, x, y, z, kinetic)
     if positron:
         first = isotropic(rng)
-        second = Direction(-first.x, -first.y, -first.z)
+        second = UnitVector(-first.x, -first.y, -first.z)
         n_stack = put_photon(stack, n_stack, x, y, z, first, ELECTRON_MASS)
         n_stack = put_photon(stack, n_stack, x, y, z, second, ELECTRON_MASS)
     return n_hits, n_stack

@@ -15,7 +15,7 @@ from cpunet.kernels import kernel
 from cpunet.simulation.gammas.germanium import ELECTRON_MASS
 
 
-class Direction(NamedTuple):
+class UnitVector(NamedTuple):
     """A unit vector."""
 
     x: float
@@ -24,23 +24,23 @@ class Direction(NamedTuple):
 
 
 @kernel(error_model="numpy")
-def isotropic(rng: np.random.Generator) -> Direction:
+def isotropic(rng: np.random.Generator) -> UnitVector:
     """Draw an isotropic direction."""
     cosine = 2.0 * rng.random() - 1.0
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     azimuth = 2.0 * math.pi * rng.random()
-    return Direction(sine * math.cos(azimuth), sine * math.sin(azimuth), cosine)
+    return UnitVector(sine * math.cos(azimuth), sine * math.sin(azimuth), cosine)
 
 
 @kernel(error_model="numpy")
-def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
+def turned(axis: UnitVector, cosine: float, azimuth: float) -> UnitVector:
     """Direction at a polar angle and an azimuth (rad) relative to an axis."""
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
     across = math.sqrt(axis.x * axis.x + axis.y * axis.y)
     if across < 1e-9:
-        return Direction(a, b, cosine if axis.z > 0 else -cosine)
-    return Direction(
+        return UnitVector(a, b, cosine if axis.z > 0 else -cosine)
+    return UnitVector(
         (a * axis.x * axis.z - b * axis.y) / across + axis.x * cosine,
         (a * axis.y * axis.z + b * axis.x) / across + axis.y * cosine,
         -a * across + axis.z * cosine,
@@ -48,7 +48,7 @@ def turned(axis: Direction, cosine: float, azimuth: float) -> Direction:
 
 
 @kernel(error_model="numpy")
-def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direction:
+def forward(axis: UnitVector, kinetic: float, rng: np.random.Generator) -> UnitVector:
     """Draw a direction that is isotropic in the rest frame of an electron along the axis.
 
     This is a common approximation of the angles of photoelectrons, pairs and bremsstrahlung.
@@ -62,7 +62,7 @@ def forward(axis: Direction, kinetic: float, rng: np.random.Generator) -> Direct
 
 
 @kernel(error_model="numpy")
-def remainder(total: float, axis: Direction, part: float, direction: Direction) -> Direction:
+def remainder(total: float, axis: UnitVector, part: float, direction: UnitVector) -> UnitVector:
     """Direction of the remaining momentum after a part is removed from one along `axis`."""
     x = total * axis.x - part * direction.x
     y = total * axis.y - part * direction.y
@@ -70,7 +70,7 @@ def remainder(total: float, axis: Direction, part: float, direction: Direction) 
     size = math.sqrt(x * x + y * y + z * z)
     if size == 0.0:
         return axis
-    return Direction(x / size, y / size, z / size)
+    return UnitVector(x / size, y / size, z / size)
 
 
 @kernel(error_model="numpy")

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.shape import CrystalShape
-from cpunet.simulation.gammas.transport import MAX_HITS, Source, simulate_block
+from cpunet.simulation.gammas.transport import MAX_HITS, SourceDisc, simulate_block
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 
@@ -41,15 +41,6 @@ class GammaStatistics:
 
     n_primaries: int
     spectrum: npt.NDArray[np.int64]
-
-    @property
-    def hit_fraction(self) -> float:
-        """Fraction of the primaries that deposited energy in the crystal."""
-        return float(self.spectrum.sum() / self.n_primaries)
-
-    def fraction(self, low_kev: int, high_kev: int) -> float:
-        """Fraction of the primaries with an energy of `low_kev` to `high_kev` (whole keV)."""
-        return float(self.spectrum[low_kev:high_kev].sum() / self.n_primaries)
 
 
 def simulate_gammas(
@@ -101,14 +92,21 @@ def simulate_gammas(
     Raises
     ------
     CpunetError
-        If the source is not above the crystal, a window is empty or beyond the line, or
-        `n_primaries` gammas do not yield the requested events.
+        If a window is empty or beyond the line, or `n_primaries` gammas do not yield the
+        requested events.
     """
-    _check(source_height_mm, source_radius_mm, n_primaries, energy_kev, wanted)
+    for name, line in (wanted or {}).items():
+        if not line.low_kev < line.high_kev or line.low_kev > energy_kev:
+            raise CpunetError(
+                f"{name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
+                f"the {energy_kev} keV line; give another"
+            )
     shape = CrystalShape.of(detector)
     reach = shape.radius + source_radius_mm
     cosine = source_height_mm / math.hypot(source_height_mm, reach)
-    source = Source(energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine)
+    source = SourceDisc(
+        energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine
+    )
     lines = list((wanted or {}).values())
     # the sum of deposits equals the energy of the line only up to rounding
     low = np.array([line.low_kev / 1e3 - 1e-9 for line in lines])
@@ -137,32 +135,6 @@ def simulate_gammas(
         short = ", ".join(f"{n} of {name}" for name, n in zip(names, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
     return Hits.concatenate(blocks), GammaStatistics(done, spectrum)
-
-
-def _check(
-    height: float,
-    radius: float,
-    n_primaries: int,
-    energy_kev: float,
-    wanted: Mapping[str, WantedLine] | None,
-) -> None:
-    if not (height > 0 and radius >= 0 and math.isfinite(height + radius)):
-        raise CpunetError(
-            f"a source of radius {radius} mm at {height} mm is not above the crystal; "
-            "give a height above 0 and a radius of at least 0"
-        )
-    if n_primaries < 1:
-        raise CpunetError(f"{n_primaries} gammas asked for; give at least 1")
-    if not 50 <= energy_kev <= 2700:
-        raise CpunetError(f"gammas of {energy_kev} keV; the tables hold 50 to 2700 keV")
-    for name, line in (wanted or {}).items():
-        if not (0 <= line.low_kev < line.high_kev and line.low_kev <= energy_kev):
-            raise CpunetError(
-                f"{name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
-                f"the {energy_kev} keV line"
-            )
-        if line.events < 0:
-            raise CpunetError(f"{name}: {line.events} events wanted; give at least 0")
 
 
 def with_resolution(

@@ -31,6 +31,13 @@ class CrystalShape(NamedTuple):
     ditch_inner: float
     ditch_outer: float
     ditch_depth: float
+    top_step: float
+    top_step_start: float
+    bottom_step: float
+    bottom_step_end: float
+    bottom_transition: float
+    groove_radius: float
+    groove_start: float
 
     @classmethod
     def of(cls, detector: Detector) -> CrystalShape:
@@ -55,6 +62,13 @@ class CrystalShape(NamedTuple):
             ditch_inner=float(ditch_inner),
             ditch_outer=float(ditch_outer),
             ditch_depth=float(ditch_depth),
+            top_step=float(detector.narrower("top")),
+            top_step_start=float(length - detector.top_cylinder_length),
+            bottom_step=float(detector.narrower("bottom")),
+            bottom_step_end=float(detector.bottom_cylinder_length),
+            bottom_transition=float(detector.bottom_transition_length),
+            groove_radius=float(detector.top_groove_radius),
+            groove_start=float(length - detector.top_groove_depth),
         )
 
 
@@ -79,6 +93,13 @@ def _outer_wall(shape: CrystalShape, z: float) -> float:
     wall = shape.radius
     wall -= max(z - shape.outer_taper_start, 0.0) * shape.outer_taper_slope
     wall -= max(shape.bottom_taper_end - z, 0.0) * shape.bottom_taper_slope
+    if z > shape.top_step_start:
+        wall -= shape.top_step
+    beyond = z - shape.bottom_step_end
+    if beyond < 0.0:
+        wall -= shape.bottom_step
+    elif beyond < shape.bottom_transition:
+        wall -= shape.bottom_step * (1.0 - beyond / shape.bottom_transition)
     if into_top > 0.0:
         wall -= _rounded_off(shape.top_bullet, into_top)
     if into_bottom > 0.0:
@@ -94,6 +115,8 @@ def _rounded_off(bullet: float, depth: float) -> float:
 
 @kernel(error_model="numpy")
 def _in_bore(shape: CrystalShape, r: float, z: float) -> bool:
+    if z > shape.groove_start and r < shape.groove_radius:
+        return True
     above = z - shape.bore_end
     if above <= 0.0:
         return False

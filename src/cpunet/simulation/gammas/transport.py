@@ -19,7 +19,7 @@ from cpunet.simulation.gammas.germanium import (
     PhotonTable,
 )
 from cpunet.simulation.gammas.processes import (
-    Direction,
+    UnitVector,
     compton_energy,
     forward,
     pair_share,
@@ -35,7 +35,7 @@ MAX_HITS = 2000
 """Maximum number of hits per event; Tl-208 gives about 200."""
 
 
-class Source(NamedTuple):
+class SourceDisc(NamedTuple):
     """A disc above the crystal that emits into the cone around the top of the crystal."""
 
     energy: float
@@ -65,7 +65,7 @@ def follow_photons(
     while n_stack > 0:
         n_stack -= 1
         x, y, z = stack[n_stack, 0], stack[n_stack, 1], stack[n_stack, 2]
-        direction = Direction(stack[n_stack, 3], stack[n_stack, 4], stack[n_stack, 5])
+        direction = UnitVector(stack[n_stack, 3], stack[n_stack, 4], stack[n_stack, 5])
         energy = stack[n_stack, 6]
         while True:
             if energy < PHOTON_CUT:
@@ -120,13 +120,15 @@ def follow_photons(
 
 
 @kernel(error_model="numpy")
-def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Generator) -> int:
+def emit(
+    shape: CrystalShape, source: SourceDisc, stack: Array, rng: np.random.Generator
+) -> int:
     """Place a photon where it meets the cylinder of the crystal; return 0 if it misses."""
     r = source.radius * math.sqrt(rng.random())
     around = 2.0 * math.pi * rng.random()
     x, y, z = r * math.cos(around), r * math.sin(around), shape.length + source.height
     cosine = source.least_cosine + (1.0 - source.least_cosine) * rng.random()
-    down = turned(Direction(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
+    down = turned(UnitVector(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
     way = way_to_cylinder(shape.radius, shape.length, x, y, z, down.x, down.y, down.z)
     if way < 0.0:
         return 0
@@ -140,7 +142,7 @@ def emit(shape: CrystalShape, source: Source, stack: Array, rng: np.random.Gener
 @kernel(error_model="numpy")
 def simulate_block(
     shape: CrystalShape,
-    source: Source,
+    source: SourceDisc,
     photons: PhotonTable,
     electrons: ElectronTable,
     n_primaries: int,

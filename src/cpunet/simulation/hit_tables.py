@@ -1,9 +1,10 @@
-"""Tables of steps in HDF5: remage's ``stp`` tables and the ntuples of Geant4 and g4simple."""
+"""Tables of steps: remage's ``stp`` tables, and the ntuples of Geant4 and g4simple."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -15,19 +16,21 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
-from cpunet.simulation.hit_readers.columns import (
+from cpunet.simulation.hit_steps import (
     NEEDED,
     ReadColumn,
+    Steps,
     choose,
     detectors_there,
     of_detector,
     roles,
     steps_of,
+    unit_factor,
 )
-from cpunet.simulation.hit_readers.steps import Steps, Units
+from cpunet.simulation.hits import HitOptions
 
 NTUPLES, STEPS = "default_ntuples", "stp"
-_G4SIMPLE = f"{NTUPLES}/g4sntuple"
+_G4SIMPLE, _G4SIMPLE_TITLE = f"{NTUPLES}/g4sntuple", "steps data"
 _ALL = slice(0, sys.maxsize)
 ROWS = 5_000  # rows per part: of the order of 10 MB of steps
 
@@ -56,34 +59,35 @@ def table_of(path: Path, detector: str | None) -> Table:
     return there[choose(path, list(there), detector) or ""]
 
 
-def read_table(path: Path, table: Table, units: Units, rows: slice = _ALL) -> Steps:
+def read_table(path: Path, table: Table, options: HitOptions, rows: slice = _ALL) -> Steps:
     """Read the steps of one detector, relative to its origin if the file tells it.
 
     Columns are arrays with a row per step, or vectors with a row per hit. g4simple's are in
     MeV, mm and ns, those of other tables in the units of their attributes or names.
     """
     if table.name == _G4SIMPLE:
-        units = Units(units.length or "mm", units.energy or "MeV")
+        options = in_g4simples_units(options)
     with opened(path) as file:
         columns = _columns(path, file[table.name], rows)
-        steps = steps_of(path, columns, units)
+        steps = steps_of(path, columns, options)
         if table.label is not None:
             steps = of_detector(path, steps, columns, table.label)
         name = table.label or table.name.rpartition("/")[2]
-        return steps.moved(-_origin(path, file, name, units))
+        return steps.moved(-_origin(path, file, name))
 
 
-def parts_of(path: Path, table: Table, size: int = ROWS) -> list[slice] | None:
+def parts_of(path: Path, table: Table, size: int = ROWS) -> tuple[list[slice], int] | None:
     """Divide the rows of a table into parts of at least `size` rows that split no event.
 
     Returns
     -------
-    list of slice or None
-        None if several detectors share the table, or the rows of an event are not adjacent, as
-        in files merged from several threads.
+    tuple or None
+        The parts and the largest event number; None if several detectors share the table, or
+        the rows of an event are not adjacent, as in files merged from several threads.
     """
     with opened(path) as file:
-        numbers = None if table.label else _row_numbers(_events(file[table.name]))
+        group = file[table.name]
+        numbers = None if table.label else _row_numbers(group[roles(group)["event"][0]])
     if numbers is None:
         return None
     starts = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
@@ -93,14 +97,7 @@ def parts_of(path: Path, table: Table, size: int = ROWS) -> list[slice] | None:
     while cuts[-1] < len(numbers):
         after = np.searchsorted(starts, cuts[-1] + size)
         cuts.append(int(starts[after]) if after < len(starts) else len(numbers))
-    return [slice(a, b) for a, b in pairwise(cuts)]
-
-
-def largest_number(path: Path, table: Table) -> int:
-    """The largest event number of a table that can be read in parts."""
-    with opened(path) as file:
-        numbers = _row_numbers(_events(file[table.name]))
-    return -1 if numbers is None else int(numbers.max())
+    return [slice(a, b) for a, b in pairwise(cuts)], int(numbers.max(initial=-1))
 
 
 def holds_tables(file: h5py.File) -> bool:
@@ -123,10 +120,6 @@ def detectors_of(path: Path) -> dict[str, Table]:
                 else:
                     found[str(name)] = Table(place, None)
     return found
-
-
-def _events(table: h5py.Group) -> Any:
-    return table[roles(table)["event"][0]]
 
 
 def _columns(path: Path, table: h5py.Group, rows: slice) -> Mapping[str, ReadColumn]:
@@ -188,7 +181,7 @@ def _row_numbers(item: Any) -> npt.NDArray[Any] | None:
     return np.asarray(item[()]) if is_column(item) and item.ndim == 1 else None
 
 
-def _origin(path: Path, file: h5py.File, name: str, units: Units) -> npt.NDArray[np.float64]:
+def _origin(path: Path, file: h5py.File, name: str) -> npt.NDArray[np.float64]:
     """Origin of a detector in mm; zero if it is not in the file."""
     origin = np.zeros(3)
     if f"detector_origins/{name}" not in file:
@@ -200,5 +193,80 @@ def _origin(path: Path, file: h5py.File, name: str, units: Units) -> npt.NDArray
             raise CpunetError(f"{path}: {where} is no number; write the file again")
         # an origin may lack a unit; all lengths of remage are in m
         unit = text_attribute(number, "units") or "m"
-        origin[i] = number[()].item() * units.factor("x", path, where, unit)
+        origin[i] = number[()].item() * unit_factor(HitOptions(), "x", path, where, unit)
     return origin
+
+
+def in_g4simples_units(options: HitOptions) -> HitOptions:
+    """Options for columns in g4simple's MeV and mm unless others are given."""
+    length, energy = options.length_unit or "mm", options.energy_unit or "MeV"
+    return replace(options, length_unit=length, energy_unit=energy)
+
+
+def read_csv(path: Path, options: HitOptions) -> Steps:
+    """Read the steps of a CSV ntuple.
+
+    A column name may end with a unit, in brackets or after ``_in_``. Without it, files of
+    g4simple (recognised by their title) are in MeV and mm. For all other files the unit must
+    be given. Times are in ns, Geant4's unit, unless their name tells another.
+    """
+    title, columns = _csv_columns(path)
+    if title == _G4SIMPLE_TITLE:
+        options = in_g4simples_units(options)
+    steps = steps_of(path, columns, options)
+    return of_detector(path, steps, columns, options.hits_detector)
+
+
+def csv_detectors(path: Path) -> list[str]:
+    """Detectors with deposits, by their number or name; empty if no column tells them."""
+    return detectors_there(_csv_columns(path)[1])
+
+
+def _csv_columns(path: Path) -> tuple[str, Mapping[str, ReadColumn]]:
+    """Title of the file, and its columns."""
+    title, names = _header(path)
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        body = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    if not body:
+        raise CpunetError(f"{path}: holds no steps; simulate again")
+    if (n := body[0].count(",") + 1) != len(names):
+        raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
+    cells: npt.NDArray[Any]
+    try:
+        cells = np.loadtxt(body, delimiter=",", ndmin=2)
+    except ValueError:  # names of volumes and processes among the numbers
+        rows = [line.split(",") for line in body]
+        if any(len(row) != len(names) for row in rows):
+            raise CpunetError(
+                f"{path}: a line is not {len(names)} values; is it cut off?"
+            ) from None
+        cells = np.array(rows)
+
+    def reader(at: int) -> ReadColumn:
+        return lambda: (_numbers(cells[:, at]), "")
+
+    return title, {name: reader(at) for at, name in enumerate(names)}
+
+
+def _header(path: Path) -> tuple[str, list[str]]:
+    title, columns = "", []
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if not line.startswith("#"):
+                break
+            key, _, value = line[1:].strip().partition(" ")
+            if key == "title":
+                title = value
+            elif key == "column":
+                columns.append(value.partition(" ")[2])
+            elif key == "separator" and value != "44":
+                raise CpunetError(f"{path}: columns are not separated by commas; export again")
+    return title, columns
+
+
+def _numbers(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Values as numbers, unless one is text."""
+    try:
+        return values.astype(float)
+    except ValueError:
+        return values

@@ -1,4 +1,8 @@
-"""Write, read and merge realistic libraries, and expand components to templates."""
+"""Write, read and merge current libraries, and expand components to templates.
+
+A current library holds what reboost reads: the currents of single sites, in units of the most
+frequent A/E.
+"""
 
 from __future__ import annotations
 
@@ -11,52 +15,21 @@ from typing import Any, Self
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
-from cpunet.legend.library_arrays import put_column
-from cpunet.legend.library_file import number
-from cpunet.legend.low_rank import Loss
-from cpunet.legend.peak_currents import LENGTH, PEAK
+from cpunet.legend.currents import LENGTH, PEAK, Floats, Loss, Values
+from cpunet.legend.library_files import put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 
-Floats = npt.NDArray[np.float32]
-Values = npt.NDArray[np.float64]
-
 TOLD = "cpunet"  # attribute of a library: JSON of how it was made
 _COMPONENTS = "components"
-_PACKED: Mapping[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 @dataclass(frozen=True, eq=False)
-class AngleArrays:
-    """Datasets for currents and drift times of one azimuth."""
-
-    values: h5py.Dataset
-    times: h5py.Dataset
-    basis: Floats | None
-
-    def put(self, rows: slice, currents: Floats, loss: Loss) -> None:
-        """Write rows of r: currents (rows, z, samples), as templates or as coefficients."""
-        if self.basis is None:
-            self.values[rows] = currents
-            return
-        there = ~np.isnan(currents[:, :, 0])
-        coefficients = np.full((*there.shape, len(self.basis)), np.nan, np.float32)
-        coefficients[there] = currents[there] @ self.basis.T
-        loss.add(currents[there], coefficients[there], self.basis)
-        self.values[rows] = coefficients
-
-    def put_times(self, times_ns: Floats | Values) -> None:
-        """Write the drift times of all grid points."""
-        self.times[...] = times_ns
-
-
-@dataclass(frozen=True, eq=False)
-class Made:
-    """A realistic library that is being written."""
+class NewLibrary:
+    """A current library that is being written: of whole templates, or of components."""
 
     group: h5py.Group
     basis: Floats | None
@@ -74,19 +47,35 @@ class Made:
             put_column(group, _COMPONENTS, basis, "")
         return cls(group, basis)
 
-    def angle(self, angle: str) -> AngleArrays:
-        """Arrays of one azimuth, such as ``"000_deg"``."""
+    def arrays(self, angle: str) -> tuple[h5py.Dataset, h5py.Dataset]:
+        """Datasets of one azimuth, such as ``"000_deg"``: currents and drift times in ns."""
         shape = (len(self.group["r"]), len(self.group["z"]))
         name, length = f"waveform_{angle}", LENGTH
         if self.basis is not None:
             name, length = f"coefficients_{angle}", len(self.basis)
         values = self.group.create_dataset(
-            name, (*shape, length), np.float32, chunks=(1, shape[1], length), **_PACKED
+            name,
+            (*shape, length),
+            np.float32,
+            chunks=(1, shape[1], length),
+            compression="gzip",
+            compression_opts=1,
+            shuffle=True,
         )
         values.attrs.update({"datatype": "array<3>{real}", "units": ""})
         times = self.group.create_dataset(f"drift_time_{angle}", shape, np.float32)
         times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
-        return AngleArrays(values, times, self.basis)
+        return values, times
+
+    def stored(self, currents: Floats, loss: Loss) -> Floats:
+        """What stands for currents (rows, z, samples): these, or their coefficients."""
+        if self.basis is None:
+            return currents
+        there = ~np.isnan(currents[:, :, 0])
+        coefficients = np.full((*there.shape, len(self.basis)), np.nan, np.float32)
+        coefficients[there] = currents[there] @ self.basis.T
+        loss.add(currents[there], coefficients[there], self.basis)
+        return coefficients
 
 
 def describe(group: h5py.Group) -> None:
@@ -97,7 +86,7 @@ def describe(group: h5py.Group) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class RealisticLibrary:
+class CurrentLibrary:
     """Currents of a detector, in units of its most frequent A/E.
 
     Attributes
@@ -161,13 +150,13 @@ class RealisticLibrary:
         return utils.HPGePulseShapeLibrary(currents, mm, mm, ns, self.r_mm, self.z_mm, times)
 
 
-def read_library(path: Path | str, detector: str | None = None) -> RealisticLibrary:
-    """Read a realistic library, of whole templates or of components.
+def read_library(path: Path | str, detector: str | None = None) -> CurrentLibrary:
+    """Read a current library, of whole templates or of components.
 
     Parameters
     ----------
     path
-        LH5 file that `cpunet library translate --format simflow` or `merge_libraries` made.
+        LH5 file that `cpunet library translate` or `merge_libraries` made.
     detector
         Name of the library; can be left out if the file has only one.
 
@@ -178,7 +167,7 @@ def read_library(path: Path | str, detector: str | None = None) -> RealisticLibr
     """
     path = Path(path)
     with opened(path) as file:
-        names = realistic_libraries(file)
+        names = current_libraries(file)
         if detector is None and len(names) == 1:
             detector = names[0]
         if detector not in names:
@@ -188,7 +177,7 @@ def read_library(path: Path | str, detector: str | None = None) -> RealisticLibr
         return _read(file[detector], detector)
 
 
-def _read(group: h5py.Group, detector: str) -> RealisticLibrary:
+def _read(group: h5py.Group, detector: str) -> CurrentLibrary:
     basis = group.get(_COMPONENTS)
     prefix = "waveform_" if basis is None else "coefficients_"
     arrays = {int(n.split("_")[1]): n for n in group if n.startswith(prefix)}
@@ -196,12 +185,12 @@ def _read(group: h5py.Group, detector: str) -> RealisticLibrary:
         told = json.loads(text_attribute(group, TOLD) or "{}")
     except ValueError:
         told = {}
-    return RealisticLibrary(
+    return CurrentLibrary(
         detector,
         np.asarray(group["r"][()], np.float64),
         np.asarray(group["z"][()], np.float64),
-        number(group["dt"]),
-        number(group["t0"]),
+        group["dt"][()].item(),
+        group["t0"][()].item(),
         {angle: group[n.replace(prefix, "drift_time_")][()] for angle, n in arrays.items()},
         told if isinstance(told, dict) else {},
         {angle: group[name][()] for angle, name in arrays.items()},
@@ -209,19 +198,19 @@ def _read(group: h5py.Group, detector: str) -> RealisticLibrary:
     )
 
 
-def realistic_libraries(file: h5py.File) -> list[str]:
-    """Paths of groups that are realistic libraries."""
+def current_libraries(file: h5py.File) -> list[str]:
+    """Paths of groups that are current libraries."""
     found: list[str] = []
 
     def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Group) and _is_realistic(item):
+        if isinstance(item, h5py.Group) and _is_current_library(item):
             found.append(name)
 
     file.visititems(visit)
     return sorted(found)
 
 
-def _is_realistic(group: h5py.Group) -> bool:
+def _is_current_library(group: h5py.Group) -> bool:
     axes, numbers = ([group.get(n) for n in names] for names in (("r", "z"), ("dt", "t0")))
     if not all(is_column(item) and item.ndim == 1 for item in axes):
         return False
@@ -241,7 +230,7 @@ def _is_realistic(group: h5py.Group) -> bool:
 def merge_libraries(
     sources: Sequence[str | Path], out: str | Path, *, force: bool = False
 ) -> list[str]:
-    """Copy realistic libraries of several detectors into one file, as in production.
+    """Copy current libraries of several detectors into one file, as in production.
 
     Parameters
     ----------
@@ -260,7 +249,7 @@ def merge_libraries(
     Raises
     ------
     CpunetError
-        If a file contains no realistic library, two libraries belong to one detector, or their
+        If a file contains no current library, two libraries belong to one detector, or their
         time axes differ.
     """
     paths, out = [*map(Path, sources)], Path(out)
@@ -269,11 +258,10 @@ def merge_libraries(
     with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
         for path in paths:
             with opened(path) as file:
-                names = realistic_libraries(file)
+                names = current_libraries(file)
                 if not names:
                     raise CpunetError(
-                        f"{path}: no realistic library; make it with `cpunet library "
-                        "translate --format simflow`"
+                        f"{path}: no current library; make it with `cpunet library translate`"
                     )
                 for name in names:
                     axis = _time_axis(file[name])
@@ -296,7 +284,7 @@ def _time_axis(group: h5py.Group) -> tuple[float, float, int]:
     """Period, first time and number of samples."""
     waveforms = (name for name in group if name.startswith("waveform_"))
     array = _COMPONENTS if _COMPONENTS in group else next(waveforms)
-    return number(group["dt"]), number(group["t0"]), int(group[array].shape[-1])
+    return group["dt"][()].item(), group["t0"][()].item(), int(group[array].shape[-1])
 
 
 def _require_new(
@@ -337,7 +325,7 @@ def expand_library(source: str | Path, out: str | Path, *, force: bool = False) 
     source, out = Path(source), Path(out)
     refuse_existing(out, source, force=force)
     with opened(source) as file:
-        names = realistic_libraries(file)
+        names = current_libraries(file)
         if not any(_COMPONENTS in file[name] for name in names):
             raise CpunetError(
                 f"{source}: no library of components; make one with `low_rank`, or use the "
@@ -352,12 +340,11 @@ def expand_library(source: str | Path, out: str | Path, *, force: bool = False) 
     return names
 
 
-def _write_whole(library: RealisticLibrary, group: h5py.Group) -> None:
+def _write_whole(library: CurrentLibrary, group: h5py.Group) -> None:
     """Write the templates of a library of components."""
-    made = Made.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
-    for angle, times in library.drift_time_ns.items():
-        whole = made.angle(f"{angle:03d}_deg")
-        whole.put(slice(0, len(times)), library.currents(angle), Loss())
-        whole.put_times(times)
+    made = NewLibrary.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
+    for angle, drift_times in library.drift_time_ns.items():
+        values, times = made.arrays(f"{angle:03d}_deg")
+        values[...], times[...] = library.currents(angle), drift_times
     group.attrs[TOLD] = json.dumps(library.told)
     describe(group)

@@ -1,8 +1,9 @@
-"""Choose and check the libraries of a file to be translated for production."""
+"""Pulse-shape libraries in files: the ideal ones to be translated, found and checked."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,14 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened, text_attribute
-from cpunet.legend.library_file import (
-    WAVEFORM,
-    libraries,
-    n_templates,
-    sampling_period_ns,
-)
-from cpunet.legend.ring_padding import padded_axis
+from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.pulses.reading.energies import TIME_UNITS
 from cpunet.settings import read_values
 from cpunet.training.run import Run
 
@@ -29,20 +24,23 @@ PERIOD_NS = 1.0
 PULSES = "geds/sim"  # table of `cpunet simulate` with its provenance
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
+WAVEFORM = re.compile(r"waveform_\d{3}_deg")
+# Templates of charge end near their maximum; templates of current do not.
+_MIN_END = 0.5
 
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class IdealLibrary:
-    """Location of the templates of a detector in a file.
+    """Templates of charge of a detector in a file, sampled every nanosecond.
 
     Attributes
     ----------
     path
         Path of the group, the detector's name.
-    r_mm, z_mm, dt_ns
-        Grid points and sampling period.
+    r_mm, z_mm
+        Grid points.
     angles
         Azimuths such as ``"000_deg"``, ascending.
     """
@@ -50,7 +48,6 @@ class IdealLibrary:
     path: str
     r_mm: Values
     z_mm: Values
-    dt_ns: float
     angles: tuple[str, ...]
 
     @classmethod
@@ -60,7 +57,8 @@ class IdealLibrary:
         Raises
         ------
         CpunetError
-            If the axes are not valid, or the templates are not sampled every nanosecond.
+            If the library does not follow the schema, or its templates are not sampled every
+            nanosecond.
         """
         where = f"{source}: {path or '/'}"
         if not path:
@@ -68,31 +66,41 @@ class IdealLibrary:
                 f"{source}: the library stands at the top of the file; production finds it "
                 "under the detector's name: write it into a group of this name"
             )
-        n_templates(file, path, source)
         group = file[path]
-        dt_ns = sampling_period_ns(group, where)
+        if missing := sorted({"r", "z", "dt"} - set(group)):
+            raise CpunetError(
+                f"{where}: no {missing[0]} beside the waveforms; complete the library"
+            )
+        r_mm, z_mm = (_axis(group[name], where, name) for name in ("r", "z"))
+        dt, units = group["dt"], text_attribute(group["dt"], "units")
+        dt_ns = TIME_UNITS.get(units, np.nan) * dt[()].item() if is_column(dt) else np.nan
         if not np.isclose(dt_ns, PERIOD_NS):
             raise CpunetError(
-                f"{where}: sampled every {dt_ns:g} ns, production reads templates of 1 ns; "
-                "make the library with a period of 1 ns (`cpunet library translate` without "
-                "`format` simflow takes any)"
+                f"{where}: sampled every {dt_ns:g} ns (dt in {str(units)!r}), production reads "
+                "templates of 1 ns; make the library with a period of 1 ns"
             )
         names = sorted(filter(WAVEFORM.fullmatch, group))
+        for name in names:
+            values = group[name]
+            numbers = isinstance(values, h5py.Dataset) and values.dtype.kind in "iuf"
+            shape: tuple[int, ...] = values.shape if numbers else ()
+            if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 2:
+                raise CpunetError(
+                    f"{where}/{name}: shape {shape} beside r and z of {len(r_mm)} and "
+                    f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
+                )
         angles = tuple(name.removeprefix("waveform_") for name in names)
-        r_mm, z_mm = (_axis(group[name], where, name) for name in ("r", "z"))
-        return cls(path, r_mm, z_mm, dt_ns, angles)
+        return cls(path, r_mm, z_mm, angles)
 
     @property
     def n_templates(self) -> int:
         """Number of grid points times angles."""
         return len(self.r_mm) * len(self.z_mm) * len(self.angles)
 
-    def padded_axes(self, rings: int) -> tuple[Values, Values]:
-        """Axes with padding on all sides except at negative radii."""
-        return padded_axis(self.r_mm, 0, rings), padded_axis(self.z_mm, rings, rings)
-
 
 def _axis(column: h5py.Dataset, where: str, name: str) -> Values:
+    if not is_column(column) or column.ndim != 1:
+        raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
     units = text_attribute(column, "units")
     if units not in MM_PER_UNIT:
         raise CpunetError(
@@ -128,9 +136,23 @@ def chosen_libraries(
     Raises
     ------
     CpunetError
-        If a named library is missing, or none belongs to the detector of the run.
+        If there is no library, a named one is missing, or none belongs to the detector of the
+        run.
     """
-    there = libraries(file, source)
+    found: set[str] = set()
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        group, _, last = name.rpartition("/")
+        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
+            found.add(group)
+
+    file.visititems(visit)
+    if not found:
+        raise CpunetError(
+            f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
+            "struct{r, z, dt, t0, waveform_000_deg}"
+        )
+    there = sorted(found)
     held = ", ".join(path or "/" for path in there)
     for name in wanted:
         if name not in there:
@@ -196,3 +218,39 @@ def require_complete(
                     f"others, the first at {name} {axis[missing[0]]:g} mm; simulate these "
                     "places again"
                 )
+
+
+def n_not_ending(templates: npt.NDArray[np.floating]) -> int:
+    """Number of templates that end below half of their height, as those of current do."""
+    return int((templates[:, -1] < _MIN_END * np.abs(templates).max(axis=1)).sum())
+
+
+def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
+    """Raise an error if none of `n` templates has a signal, or most are no charge pulses.
+
+    Parameters
+    ----------
+    where
+        File, and library in it, for the message.
+    n, moving, not_ending
+        Numbers of templates, of those with a translated signal, and among these of those
+        that end low (`n_not_ending`).
+    """
+    if not moving:
+        raise CpunetError(
+            f"{where}: none of {n} templates can be translated; are they charge pulses?"
+        )
+    if 2 * not_ending > moving:
+        raise CpunetError(
+            f"{where}: {not_ending} of {moving} templates end below half of their maximum: "
+            "these are currents, of negative sign, or behind electronics already; give the "
+            "library of charge pulses"
+        )
+
+
+def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
+    """Store a number or an array with LH5 attributes."""
+    group[name] = values
+    dimensions = group[name].ndim
+    kind = f"array<{dimensions}>{{real}}" if dimensions else "real"
+    group[name].attrs.update({"datatype": kind, "units": units})

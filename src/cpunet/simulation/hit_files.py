@@ -6,54 +6,44 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened
+from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.simulation.hit_readers.csv_ntuple import csv_detectors, read_csv
-from cpunet.simulation.hit_readers.hit_table import TABLE, read_hit_table
-from cpunet.simulation.hit_readers.steps import (
-    ReadHits,
+from cpunet.simulation.hit_steps import (
     Steps,
-    Transform,
-    Units,
     require_physics,
     require_some,
     to_hits,
+    unit_factor,
     whole_numbers,
 )
-from cpunet.simulation.hit_readers.tables import (
+from cpunet.simulation.hit_tables import (
     NTUPLES,
     STEPS,
+    csv_detectors,
     detectors_of,
     holds_tables,
-    largest_number,
     parts_of,
+    read_csv,
     read_table,
     table_of,
 )
-from cpunet.simulation.hits import Hits
+from cpunet.simulation.hits import HitOptions, Hits
 
+HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
+_EVENTS = "geds/sim/event_number"
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
-_AS_IN_THE_FILE = Transform()
-# The interval after which charge is another event: that of remage
-TIME_WINDOW_US = 10.0
 _NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")  # arrays of an NPZ
 
 
-def read_hits(
-    path: Path | str,
-    *,
-    detector: str | None = None,
-    transform: Transform = _AS_IN_THE_FILE,
-    length_unit: str | None = None,
-    energy_unit: str | None = None,
-    time_window_us: float = TIME_WINDOW_US,
-) -> ReadHits:
+def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
     """Read the energy deposits of one detector.
 
     Formats: the hits stored with simulated pulses (``geds/hits``), remage LH5 (``stp``
@@ -71,17 +61,10 @@ def read_hits(
     ----------
     path
         Path of the file.
-    detector
-        Detector to read, one of `hit_detectors`: the name of the table, or the number or name
-        in the column that tells detectors apart (``det_uid``, ``volID``, ``detector``…). Not
-        needed if there is only one.
-    transform
-        Transformation from the frame of the file to that of the crystal (z = 0 at the point
-        contact).
-    length_unit, energy_unit
-        Units of columns that name none. An unknown or missing unit is an error.
-    time_window_us
-        Longest interval in us between deposits of an event; that of remage by default.
+    options
+        How it is read; `hits_detector` is one of `hit_detectors`: the name of the table, or
+        the number or name in the column that tells detectors apart (``det_uid``, ``volID``,
+        ``detector``…). An unknown or missing unit is an error.
 
     Raises
     ------
@@ -90,21 +73,14 @@ def read_hits(
         detector, contains no energy deposit, or has energies of another unit.
     """
     file = Path(path)
-    steps = _steps(file, detector, Units(length_unit, energy_unit))
-    found = to_hits(file, steps, transform, time_window_us)
-    require_some(file, found.hits.n_events)
-    require_physics(file, found.hits.energy_kev)
-    return found
+    hits = to_hits(file, _steps(file, options), options)
+    require_some(file, hits.n_events)
+    require_physics(file, hits.energy_kev)
+    return hits
 
 
 def hit_parts(
-    path: Path | str,
-    *,
-    detector: str | None = None,
-    transform: Transform = _AS_IN_THE_FILE,
-    length_unit: str | None = None,
-    energy_unit: str | None = None,
-    time_window_us: float = TIME_WINDOW_US,
+    path: Path | str, options: HitOptions = HitOptions()
 ) -> Callable[[], Iterator[Hits]]:
     """Like `read_hits`, but in parts if possible, so that memory does not grow with the file.
 
@@ -117,25 +93,17 @@ def hit_parts(
         Returns an iterator over the parts, from the first one, each time it is called.
     """
     file = Path(path)
-    table = table_of(file, detector) if _has_tables(file) else None
-    parts = parts_of(file, table) if table else None
-    if table is None or parts is None or len(parts) < 2:
-        whole = read_hits(
-            file,
-            detector=detector,
-            transform=transform,
-            length_unit=length_unit,
-            energy_unit=energy_unit,
-            time_window_us=time_window_us,
-        ).hits
+    table = table_of(file, options.hits_detector) if _has_tables(file) else None
+    divided = parts_of(file, table) if table else None
+    if table is None or divided is None or len(divided[0]) < 2:
+        whole = read_hits(file, options)
         return lambda: iter([whole])
-    units, largest = Units(length_unit, energy_unit), largest_number(file, table)
+    parts, largest = divided
 
     def read() -> Iterator[Hits]:
         free, energies = largest + 1, []
         for rows in parts:
-            steps = read_table(file, table, units, rows)
-            hits = to_hits(file, steps, transform, time_window_us, free).hits
+            hits = to_hits(file, read_table(file, table, options, rows), options, free)
             free += int((hits.event_number >= free).sum())
             energies.append(hits.energy_kev)
             yield hits
@@ -185,37 +153,39 @@ def _has_tables(path: Path) -> bool:
         return holds_tables(file)
 
 
-def _steps(path: Path, detector: str | None, units: Units) -> Steps:
+def _steps(path: Path, options: HitOptions) -> Steps:
+    detector = options.hits_detector
     try:
         with path.open("rb") as stream:
             start = stream.read(len(_CSV_MAGIC))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    if start.startswith(_HDF5_MAGIC):
-        return _hdf5(path, detector, units)
-    if start.startswith(_ZIP_MAGIC):
-        _without_detectors(path, detector)
-        return _npz(path)
     if start.startswith(_CSV_MAGIC):
-        return read_csv(path, detector, units)
-    raise CpunetError(
-        f"{path}: no known format of hits; expected remage LH5, g4simple HDF5, "
-        "Geant4 CSV or NPZ"
-    )
-
-
-def _hdf5(path: Path, detector: str | None, units: Units) -> Steps:
-    with opened(path) as file:
-        is_kept = TABLE in file
-    if _has_tables(path):
-        return read_table(path, table_of(path, detector), units)
-    if is_kept:
-        _without_detectors(path, detector)
-        return read_hit_table(path, units)
-    raise CpunetError(
-        f"{path}: HDF5 without hits; expected {STEPS} (remage), {TABLE} (cpunet simulate) or "
-        f"{NTUPLES} (Geant4, g4simple)"
-    )
+        return read_csv(path, options)
+    if start.startswith(_HDF5_MAGIC):
+        with opened(path) as file:
+            has_tables, is_kept = holds_tables(file), HIT_TABLE in file
+        if has_tables:
+            return read_table(path, table_of(path, detector), options)
+        read = _read_hit_table
+        if not is_kept:
+            raise CpunetError(
+                f"{path}: HDF5 without hits; expected {STEPS} (remage), {HIT_TABLE} (cpunet "
+                f"simulate) or {NTUPLES} (Geant4, g4simple)"
+            )
+    elif start.startswith(_ZIP_MAGIC):
+        read = _npz
+    else:
+        raise CpunetError(
+            f"{path}: no known format of hits; expected remage LH5, g4simple HDF5, "
+            "Geant4 CSV or NPZ"
+        )
+    if detector is not None:
+        raise CpunetError(
+            f"{path}: its hits name no detector to pick {detector} by; leave "
+            "`hits_detector` out"
+        )
+    return read(path)
 
 
 def _npz(path: Path) -> Steps:
@@ -240,10 +210,54 @@ def _npz(path: Path) -> Steps:
     return Steps(event, np.stack([x, y, z], axis=1), edep)
 
 
-def _without_detectors(path: Path, detector: str | None) -> None:
-    """Refuse the choice of a detector if all hits belong to a single one."""
-    if detector is not None:
+def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
+    """Columns of the table as name → (values, units), in the order of the events.
+
+    Examples
+    --------
+    >>> hits = Hits.of([[0, 0, 10], [5, 0, 12]], [1000, 592.5], [0, 2], [7])
+    >>> columns = hit_columns(hits)
+    >>> list(columns), columns["event_number"][0]
+    (['event_number', 'x', 'y', 'z', 'edep'], array([7, 7]))
+    """
+    return {
+        "event_number": (np.repeat(hits.event_number, np.diff(hits.offsets)), ""),
+        "x": (hits.x_mm, "mm"),
+        "y": (hits.y_mm, "mm"),
+        "z": (hits.z_mm, "mm"),
+        "edep": (hits.edep_kev, "keV"),
+    }
+
+
+def _read_hit_table(path: Path) -> Steps:
+    """Read the steps of the table, in the frame of the crystal in which they were written.
+
+    Raises
+    ------
+    CpunetError
+        If the table cannot be read, lacks a column or a unit, has columns of different
+        lengths, or has no hits for an event whose pulse is in the file.
+    """
+    values, named = {}, {}
+    with opened(path) as file:
+        for name in ("event_number", *"xyz", "edep"):
+            column = file.get(f"{HIT_TABLE}/{name}")
+            if not is_column(column):
+                raise CpunetError(f"{path}: no numbers in {HIT_TABLE}/{name}; write it again")
+            values[name] = np.asarray(column[()])
+            named[name] = text_attribute(column, "units")
+        pulses = file.get(_EVENTS)
+        events = np.asarray(pulses[()]) if is_column(pulses) else np.empty(0, np.int64)
+    if len({column.shape for column in values.values()}) != 1:
+        raise CpunetError(f"{path}: columns of {HIT_TABLE} differ in length; is it truncated?")
+    number = whole_numbers(path, f"{HIT_TABLE}/event_number", values["event_number"])
+    without = ~np.isin(events, number)
+    if without.any():
         raise CpunetError(
-            f"{path}: its hits name no detector to pick {detector} by; leave "
-            "`hits_detector` out"
+            f"{path}: {HIT_TABLE} has no hit of event {events[without][0]}; simulate it again"
         )
+    x, y, z, energy = (
+        values[name] * unit_factor(HitOptions(), name, path, f"{HIT_TABLE}/{name}", named[name])
+        for name in ("x", "y", "z", "edep")
+    )
+    return Steps(number, np.stack([x, y, z], axis=1), energy)

@@ -1,4 +1,4 @@
-"""Realistic libraries: layout, rings, components, and A/E of Geant4 events by reboost."""
+"""Current libraries: layout, rings, components, and A/E of Geant4 events by reboost."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from lgdo import Array, Scalar, Struct
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.legend.ideal_library import chosen_libraries, known_detector
-from cpunet.legend.make_library import make_library
-from cpunet.legend.peak_currents import (
+from cpunet.legend.current_library import expand_library, merge_libraries, read_library
+from cpunet.legend.currents import (
     PEAK,
+    continued,
     currents_about_peak,
     heights,
     most_frequent,
+    with_rings,
 )
-from cpunet.legend.production import enclosed
-from cpunet.legend.realistic_library import expand_library, merge_libraries, read_library
-from cpunet.legend.ring_padding import continued, with_rings
+from cpunet.legend.library_files import chosen_libraries, known_detector
+from cpunet.legend.make_library import make_library
 from cpunet.legend.templates import TemplateTranslator
-from cpunet.legend.translate_library import translate_library
+from cpunet.legend.translate_library import enclosed, translate_library
 from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.clustering import cluster_hits
@@ -35,7 +35,7 @@ from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_readers import read_hits
+from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run, SideInfo
@@ -43,6 +43,7 @@ from cpunet.translation.translator import REN
 from synthetic import write_run
 
 R, Z = np.arange(6.0), np.arange(8.0)
+WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
 
 
@@ -79,6 +80,7 @@ def write(path: Path, waveforms: np.ndarray, name: str = "V01", **more: object) 
         "waveform_000_deg": Array(waveforms, attrs={"units": ""}),
         "waveform_045_deg": Array(waveforms, attrs={"units": ""}),
     } | more
+    library = {key: value for key, value in library.items() if value is not None}
     lh5.write(Struct(library), name, str(path), wo_mode="of")
     return path
 
@@ -144,7 +146,7 @@ def test_rings_go_on_from_the_crystal() -> None:
 
 
 def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Path) -> None:
-    told = translate_library(chain, ideal, tmp_path / "psl.lh5", format="simflow").numbers
+    told = translate_library(chain, ideal, tmp_path / "psl.lh5").numbers
     library = lh5.read("V01", str(tmp_path / "psl.lh5"))
     assert set(library) == {
         "r",
@@ -178,25 +180,36 @@ def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Pa
     assert json.loads(h5py.File(tmp_path / "psl.lh5")["V01"].attrs["cpunet"])["rings"] == 3
 
 
+def test_a_period_in_a_column_with_units_in_bytes(chain: Path, tmp_path: Path) -> None:
+    source = write(tmp_path / "ideal.lh5", charge(), dt=Array(np.array([1e-3])))
+    with h5py.File(source, "a") as file:
+        file["V01/dt"].attrs["units"] = np.bytes_(b"us")
+    translate_library(chain, source, tmp_path / "psl.lh5", low_rank=2)
+    assert read_library(tmp_path / "psl.lh5").dt_ns == 1
+    with h5py.File(tmp_path / "psl.lh5", "a") as file:
+        del file["V01/dt"]
+        file["V01/dt"] = np.array([1.0, 2.0])
+    with pytest.raises(CpunetError, match="the file has none"):
+        read_library(tmp_path / "psl.lh5")
+
+
 def test_without_rings_the_nodes_stay(chain: Path, tmp_path: Path) -> None:
     # as SolidStateDetectors.jl writes it: two nodes about the axis, and a step beyond the end
     nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
     source = write(tmp_path / "ideal.lh5", charge(), r=Array(nodes, attrs={"units": "m"}))
-    translate_library(chain, source, tmp_path / "psl.lh5", rings=0, format="simflow")
+    translate_library(chain, source, tmp_path / "psl.lh5", rings=0)
     library = read_library(tmp_path / "psl.lh5")
     np.testing.assert_allclose(library.r_mm, 1000 * nodes)
     np.testing.assert_array_equal(
         np.isfinite(library.drift_time_ns[0]), np.isfinite(charge()[..., 0])
     )
     with pytest.raises(CpunetError, match="-1: give 0 to 100 rings"):
-        translate_library(chain, source, tmp_path / "x.lh5", rings=-1, format="simflow")
+        translate_library(chain, source, tmp_path / "x.lh5", rings=-1)
 
 
 def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: Path) -> None:
-    translate_library(chain, ideal, tmp_path / "whole.lh5", format="simflow")
-    told = translate_library(
-        chain, ideal, tmp_path / "few.lh5", low_rank=8, format="simflow"
-    ).numbers["V01"]
+    translate_library(chain, ideal, tmp_path / "whole.lh5")
+    told = translate_library(chain, ideal, tmp_path / "few.lh5", low_rank=8).numbers["V01"]
     whole, few = read_library(tmp_path / "whole.lh5"), read_library(tmp_path / "few.lh5", "V01")
     assert (whole.rank, few.rank) == (None, 8)
     np.testing.assert_array_equal(whole.drift_time_ns[45], few.drift_time_ns[45])
@@ -209,6 +222,14 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
     assert expand_library(tmp_path / "few.lh5", tmp_path / "again.lh5") == ["V01"]
     again = read_library(tmp_path / "again.lh5")
     np.testing.assert_array_equal(again.currents(0), few.currents(0))
+    np.testing.assert_array_equal(again.drift_time_ns[45], few.drift_time_ns[45])
+    # whole libraries beside components are copied, with the groups about them
+    with h5py.File(tmp_path / "few.lh5", "a") as file, h5py.File(tmp_path / "whole.lh5") as one:
+        one.copy("V01", file, "geds/B02")
+    assert expand_library(tmp_path / "few.lh5", tmp_path / "both.lh5") == ["V01", "geds/B02"]
+    assert set(lh5.read("geds", str(tmp_path / "both.lh5"))) == {"B02"}
+    copied = read_library(tmp_path / "both.lh5", "geds/B02")
+    np.testing.assert_array_equal(copied.currents(0), whole.currents(0))
     with pytest.raises(CpunetError, match="no library of components"):
         expand_library(tmp_path / "whole.lh5", tmp_path / "x.lh5")
 
@@ -216,31 +237,27 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
 def test_components_of_a_detector_are_its_own(
     chain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cpunet.legend.production.MAX_TEMPLATES", 20)
+    monkeypatch.setattr("cpunet.legend.translate_library.MAX_TEMPLATES", 20)
     source = write(tmp_path / "ideal.lh5", charge())
-    alone = translate_library(
-        chain, source, tmp_path / "alone.lh5", low_rank=8, format="simflow"
-    ).numbers
+    alone = translate_library(chain, source, tmp_path / "alone.lh5", low_rank=8).numbers
     with h5py.File(source, "a") as file:
         for name in ("V02", "V03", "V04"):
             file.copy("V01", name)
-    beside = translate_library(
-        chain, source, tmp_path / "beside.lh5", low_rank=8, format="simflow"
-    ).numbers
+    beside = translate_library(chain, source, tmp_path / "beside.lh5", low_rank=8).numbers
     assert beside["V01"]["loss"] == alone["V01"]["loss"]
 
 
 def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None:
     other = write(tmp_path / "ideal.lh5", charge(), "B02")
     for source, name in ((ideal, "v.lh5"), (other, "b.lh5")):
-        translate_library(chain, source, tmp_path / name, format="simflow")
+        translate_library(chain, source, tmp_path / name)
     both = [tmp_path / "v.lh5", tmp_path / "b.lh5"]
     assert merge_libraries(both, tmp_path / "psl.lh5") == ["B02", "V01"]
     assert sorted(lh5.ls(str(tmp_path / "psl.lh5"))) == ["B02", "V01"]
     assert lh5.read("B02", str(tmp_path / "psl.lh5")).attrs["cpunet"]
     with pytest.raises(CpunetError, match="a second library of V01"):
         merge_libraries([both[0], tmp_path / "psl.lh5"], tmp_path / "x.lh5")
-    with pytest.raises(CpunetError, match="no realistic library"):
+    with pytest.raises(CpunetError, match="no current library"):
         merge_libraries([ideal], tmp_path / "x.lh5")
     with h5py.File(both[1], "a") as file:
         file["B02/t0"][...] = -500.0
@@ -259,11 +276,19 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns, production reads"),
+        ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns (dt in 'ns')"),
+        ({"dt": Scalar(1.0, attrs={"units": "furlong"})}, "dt in 'furlong'"),
+        ({"dt": None}, "no dt beside the waveforms"),
+        ({"z": Array(np.empty((0, 2)))}, "z is no column of numbers"),
+        (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
+        (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),
         ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
         ({"z": Array(Z, attrs={"units": "m"})}, "z reaches 7000 mm"),
         ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
-        ({"r": Array(np.arange(4.0), attrs={"units": "mm"})}, "expected (r, z, samples)"),
+        (
+            {"r": Array(np.arange(4.0), attrs={"units": "mm"})},
+            "expected numbers of shape (r, z, samples)",
+        ),
         ({"waveform_000_deg": Array(without(charge(), 2))}, "1 rows of 000_deg are NaN"),
         ({"waveform_045_deg": Array(without(charge(), np.s_[:]))}, "no template of 045_deg"),
         (
@@ -271,10 +296,7 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
             "1 templates hold NaN among their samples, the first at r 2, z 1 mm",
         ),
         (
-            dict.fromkeys(
-                ("waveform_000_deg", "waveform_045_deg"),
-                Array(np.diff(charge(), axis=2, prepend=0)),
-            ),
+            dict.fromkeys(WAVEFORMS, Array(np.diff(charge(), axis=2, prepend=0))),
             "these are currents",
         ),
     ],
@@ -284,7 +306,7 @@ def test_other_libraries_are_refused_in_one_line(
 ) -> None:
     source = write(tmp_path / "ideal.lh5", charge(), **change)
     with pytest.raises(CpunetError) as error:
-        translate_library(chain, source, tmp_path / "psl.lh5", format="simflow")
+        translate_library(chain, source, tmp_path / "psl.lh5")
     assert words in str(error.value)
     assert str(source) in str(error.value)
     assert "\n" not in str(error.value)
@@ -318,11 +340,11 @@ def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
 
 def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "ideal.lh5", without(charge(), np.s_[2, 3]))
-    told = translate_library(chain, source, tmp_path / "psl.lh5", format="simflow").numbers
+    told = translate_library(chain, source, tmp_path / "psl.lh5").numbers
     assert told["V01"]["healed"] == 2
     times = read_library(tmp_path / "psl.lh5").drift_time_ns[0]
     whole = write(tmp_path / "whole.lh5", charge())
-    translate_library(chain, whole, tmp_path / "psl2.lh5", format="simflow")
+    translate_library(chain, whole, tmp_path / "psl2.lh5")
     known = read_library(tmp_path / "psl2.lh5").drift_time_ns[0]
     assert times[2, 6] == pytest.approx(known[2, 6], abs=20)  # of 60 from node to node
 
@@ -330,7 +352,7 @@ def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
 def geant4_events(reference_data: Path, n_events: int | None) -> tuple[Any, Hits]:
     """Geometry A, and events above 600 keV: merged hits without those in the lithium."""
     detector = read_detector(str(reference_data / "siggen" / "geometry_A.yaml"))
-    hits = read_hits(reference_data / "geant4" / "g4_h20mm.npz").hits
+    hits = read_hits(reference_data / "geant4" / "g4_h20mm.npz")
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)[:n_events]], 0.05)
     maps = drift_maps(compute_fields(detector), SETTINGS)
     places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)
@@ -344,7 +366,7 @@ def full_a_over_e(run: Path, detector: Any, hits: Hits, mode: float) -> Any:
     fields, found = compute_fields(detector), []
     for first in range(0, hits.n_events, 500):
         events = simulate_events(fields, hits[first : first + 500], SETTINGS)
-        currents, _ = currents_about_peak(translate(events.waveforms)[0])
+        currents, _ = currents_about_peak(translate(events.waveforms))
         found.append(heights(currents) / mode)
     return np.concatenate(found)
 
@@ -383,9 +405,7 @@ def test_a_over_e_of_geant4_events_at_the_nodes(
 ) -> None:
     detector, hits = geant4_events(reference_data, 300)
     make_library(detector, tmp_path / "ideal.lh5", grid_mm=2.0)
-    told = translate_library(
-        chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5", format="simflow"
-    ).numbers
+    told = translate_library(chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5").numbers
     (name,) = told
     with h5py.File(tmp_path / "ideal.lh5") as file:
         there = ~np.isnan(file[f"{name}/waveform_000_deg"][:, :, 0])
@@ -415,9 +435,7 @@ def test_a_over_e_of_all_geant4_events(
 ) -> None:
     detector, hits = geant4_events(reference_data, None)
     make_library(detector, tmp_path / "ideal.lh5", grid_mm=0.5)
-    told = translate_library(
-        chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5", format="simflow"
-    ).numbers
+    told = translate_library(chain, tmp_path / "ideal.lh5", tmp_path / "psl.lh5").numbers
     ((_, numbers),) = told.items()
     assert hits.n_events > 8000
     r, phi = np.hypot(hits.x_mm, hits.y_mm), np.arctan2(hits.y_mm, hits.x_mm)

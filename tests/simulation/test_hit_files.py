@@ -1,0 +1,515 @@
+"""Hits of every format: which deposits are one event, in parts or at once; what is wrong."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+from lgdo import Array, Table, VectorOfVectors
+
+from cpunet.errors import CpunetError
+from cpunet.simulation import hit_sources
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_description import describe_hits
+from cpunet.simulation.hit_files import hit_detectors, hit_parts, read_hits
+from cpunet.simulation.hit_sources import EnergyWindow, HitFile
+from cpunet.simulation.hit_tables import parts_of, table_of
+from cpunet.simulation.hits import HitOptions, Hits
+
+N = 12
+# deposits of each Geant4 event: a decay of two steps, and one of its daughter 3 s later
+EVENT = np.repeat(np.arange(N), 3)
+TIME_NS = np.tile([5.0, 7.0, 3e9], N) + 1e12 * EVENT
+EDEP_KEV = np.tile([1500.0, 1114.5, 238.6], N)
+Z_MM = np.linspace(20, 30, 3 * N)
+# what a detector sees
+SEEN_KEV = [2614.5, 238.6] * N
+
+Column = tuple[np.ndarray, str]
+
+
+def remage(path: Path, columns: dict[str, Column], *, vectors: bool, table: str) -> Path:
+    """A table with a row per step, or with a row per event number and time window."""
+    ends = np.array([2, 3] * N).reshape(-1, 2)
+    ends = (ends + 3 * np.arange(N)[:, None]).ravel()
+    built = {}
+    for name, (values, units) in columns.items():
+        array = Array(values, attrs={"units": units} if units else {})
+        built[name] = (
+            VectorOfVectors(flattened_data=array, cumulative_length=Array(ends))
+            if (vectors)
+            else array
+        )
+    lh5.write(Table(col_dict=built), f"stp/{table}", path, wo_mode="overwrite_file")
+    return path
+
+
+def ntuple_csv(path: Path, columns: dict[str, Column]) -> Path:
+    head = "#class tools::wcsv::ntuple\n#title hits\n#separator 44\n"
+    head += "".join(
+        f"#column double {n}_in_{u}\n" if u else f"#column int {n}\n"
+        for n, (_, u) in columns.items()
+    )
+    rows = zip(*(values.tolist() for values, _ in columns.values()), strict=True)
+    path.write_text(head + "\n".join(",".join(map(str, row)) for row in rows))
+    return path
+
+
+def ntuple_hdf5(path: Path, columns: dict[str, Column]) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, (values, u) in columns.items():
+            name = f"{name}_in_{u}" if u else name
+            file[f"default_ntuples/det1/{name}/pages"] = values
+    return path
+
+
+def steps(**changed: Column) -> dict[str, Column]:
+    """The columns in units that are not those of the program."""
+    zero = np.zeros(3 * N)
+    places = {"xloc": (zero, "m"), "yloc": (zero, "m"), "zloc": (Z_MM / 1e3, "m")}
+    deposits = {"edep": (EDEP_KEV / 1e3, "MeV"), "time": (TIME_NS / 1e3, "us")}
+    return {"evtid": (EVENT, ""), **deposits, **places, **changed}
+
+
+def written(folder: Path, layout: str, columns: dict[str, Column], table: str = "det1") -> Path:
+    if layout == "csv":
+        return ntuple_csv(folder / "hits.csv", columns)
+    if layout == "hdf5":
+        return ntuple_hdf5(folder / "hits.hdf5", columns)
+    return remage(folder / "hits.lh5", columns, vectors=layout == "vectors", table=table)
+
+
+LAYOUTS = ("vectors", "flat", "csv", "hdf5")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_decays_of_a_chain_are_events_of_their_own(tmp_path: Path, layout: str) -> None:
+    path = written(tmp_path, layout, steps())
+    hits = read_hits(path)
+    np.testing.assert_allclose(hits.energy_kev, SEEN_KEV)
+    np.testing.assert_allclose(hits.z_mm, Z_MM)
+    # the first decay keeps the number of the file; no number comes twice
+    assert hits.event_number[::2].tolist() == list(range(N))
+    assert len(set(hits.event_number)) == 2 * N
+    whole = read_hits(path, HitOptions(time_window_us=1e7))
+    np.testing.assert_allclose(whole.energy_kev, 2614.5 + 238.6)
+    # the steps of the first decay are 2 ns apart
+    assert read_hits(path, HitOptions(time_window_us=1e-3)).n_events == 3 * N
+
+
+@pytest.mark.parametrize("size", [4, 1000])
+def test_late_deposits_are_counted_once(tmp_path, monkeypatch, caplog, size) -> None:
+    """A third of the events has its second step 500 ns after the first."""
+    monkeypatch.setattr(parts_of, "__defaults__", (size,))
+    time = TIME_NS.copy()
+    time[1::9] += 500
+    path = written(tmp_path, "vectors", steps(time=(time, "ns")))
+    for _ in HitFile(path).open(read_detector("icpc")).blocks:
+        pass
+    (told,) = caplog.messages
+    assert f"{N // 3} events have deposits more than 50 ns after their first" in told
+    caplog.clear()
+    HitFile(path, HitOptions(time_window_us=0.1)).open(read_detector("icpc"))
+    assert not caplog.messages
+
+
+def test_a_description_has_the_same_events(tmp_path: Path) -> None:
+    path = written(tmp_path, "flat", steps(det_uid=(np.tile([11, 11, 2], N), "")), "germanium")
+    for window_us, table in ((10.0, {"2": N, "11": N}), (1e-3, {"2": N, "11": 2 * N})):
+        told = describe_hits(path, HitOptions(time_window_us=window_us), {})["detectors"]
+        assert {name: one["events"] for name, one in told.items()} == table
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
+    uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
+    path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")
+    assert hit_detectors(path) == ["2", "11"]
+    with pytest.raises(
+        CpunetError, match="holds detectors 2, 11; choose one with `hits_detector`"
+    ):
+        read_hits(path)
+    np.testing.assert_allclose(read_hits(path, HitOptions("11")).energy_kev, 2614.5)
+    np.testing.assert_allclose(read_hits(path, HitOptions("2")).energy_kev, 238.6)
+
+
+def test_detectors_by_the_names_of_their_volumes(tmp_path: Path) -> None:
+    names = np.tile(["V01", "V01", "B02"], N)
+    path = written(tmp_path, "csv", steps(volume=(names, "")))
+    assert hit_detectors(path) == ["B02", "V01"]
+    np.testing.assert_allclose(read_hits(path, HitOptions("B02")).energy_kev, 238.6)
+
+
+@pytest.mark.parametrize("layout", ["flat", "csv", "hdf5"])
+def test_joined_jobs_number_their_events_anew(tmp_path: Path, layout: str) -> None:
+    numbers = np.repeat([3, 8, 9, 2, 3, 8], [6, 6, 6, 6, 6, 6])
+    path = written(tmp_path, layout, steps(evtid=(numbers, ""), time=(0 * TIME_NS, "ns")))
+    hits = read_hits(path)
+    assert np.diff(hits.offsets).tolist() == [6] * 6
+    assert hits.event_number.tolist() == [3, 8, 9, 2, 10, 11]
+
+
+def test_events_that_threads_wrote_in_blocks_stay_whole(tmp_path: Path) -> None:
+    # two threads with even and odd events; the blocks end within 4 and 5
+    numbers = np.repeat([0, 2, 4, 1, 3, 5, 4, 6, 5, 7, 8, 9], 3)
+    path = written(tmp_path, "flat", steps(evtid=(numbers, ""), time=(0 * TIME_NS, "ns")))
+    hits = read_hits(path)
+    assert hits.event_number.tolist() == [0, 2, 4, 1, 3, 5, 6, 7, 8, 9]
+    assert np.diff(hits.offsets).tolist() == [3, 3, 6, 3, 3, 6, 3, 3, 3, 3]
+
+
+def test_rows_in_the_order_of_time_stay_together(tmp_path: Path) -> None:
+    mixed = np.random.default_rng(4).permutation(3 * N)
+    shuffled = {name: (values[mixed], units) for name, (values, units) in steps().items()}
+    hits = read_hits(written(tmp_path, "flat", shuffled))
+    np.testing.assert_allclose(sorted(hits.energy_kev), sorted(SEEN_KEV))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("change", [{"edep": (EDEP_KEV, "J")}, {"time": (TIME_NS, "min")}])
+def test_units_that_are_not_known_are_refused(tmp_path, layout, change) -> None:
+    path = written(tmp_path, layout, steps(**change))
+    with pytest.raises(CpunetError, match=r"is in '(J|min)'; expected one of"):
+        read_hits(path)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(1e-3, "up to 2.615 keV"), (1e3, "2.614e.06 keV")]
+)
+def test_energies_of_another_unit_are_named(tmp_path, monkeypatch, factor, said) -> None:
+    path = written(tmp_path, "flat", steps(edep=(factor * EDEP_KEV, "keV")))
+    with pytest.raises(CpunetError, match=rf"{said}.* correct the unit of their column"):
+        read_hits(path)
+    monkeypatch.setattr(parts_of, "__defaults__", (4,))
+    with pytest.raises(CpunetError, match=said):
+        list(hit_parts(path)())
+
+
+def test_a_time_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "flat", steps(time=(np.full(3 * N, np.nan), "ns")))
+    with pytest.raises(CpunetError, match="event 0: a step has no finite position or time"):
+        read_hits(path)
+
+
+def stp(path: Path, numbers: np.ndarray, *, deposits: bool = True) -> Path:
+    """A table with a row per event of one to four steps on the axis of a detector."""
+    rng = np.random.default_rng(2)
+    ends = np.cumsum(rng.integers(1, 5, len(numbers)))
+    edep = rng.uniform(0, 900, ends[-1]) * (rng.random(ends[-1]) > 0.3) * deposits
+    places = {"xloc": 0 * edep, "yloc": 0 * edep, "zloc": rng.uniform(0.02, 0.03, len(edep))}
+    columns = {name: (values, "m") for name, values in places.items()}
+    table = {"evtid": Array(numbers)}
+    for name, (values, unit) in (columns | {"edep": (edep, "keV")}).items():
+        flat = Array(values, attrs={"units": unit})
+        table[name] = VectorOfVectors(flattened_data=flat, cumulative_length=Array(ends))
+    lh5.write(Table(table), "stp/V01", str(path), wo_mode="overwrite_file")
+    return path
+
+
+def require_same(a: Hits, b: Hits) -> None:
+    for name in ("x_mm", "y_mm", "z_mm", "edep_kev", "offsets", "event_number"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+EVENTS = 53
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("size", [pytest.param(1, marks=pytest.mark.thorough), 7, 52, 53, 1000])
+def test_parts_hold_the_same_hits(tmp_path, monkeypatch, size, repeated):
+    numbers = (
+        np.repeat(np.arange(EVENTS), 3)[:EVENTS] if repeated else 10 * np.arange(EVENTS)[::-1]
+    )
+    file = stp(tmp_path / "stp.lh5", numbers)
+    monkeypatch.setattr("cpunet.simulation.hit_tables.ROWS", size)
+    monkeypatch.setattr(parts_of, "__defaults__", (size,))
+    parts = hit_parts(file)
+    for _ in range(2):  # as often as one likes
+        found = list(parts())
+        assert len(found) > 1 or size >= 52
+        require_same(Hits.concatenate(found), read_hits(file))
+
+
+def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path, monkeypatch):
+    small = read_hits(stp(tmp_path / "small.lh5", np.arange(EVENTS)))
+    file = stp(tmp_path / "stp.lh5", 2**53 + np.arange(EVENTS))
+    read = read_hits(file)
+    np.testing.assert_array_equal(read.event_number, 2**53 + small.event_number)
+    np.testing.assert_array_equal(read.offsets, small.offsets)
+    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    require_same(Hits.concatenate(list(hit_parts(file)())), read)
+
+
+def test_event_numbers_that_are_text(tmp_path):
+    file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
+    with h5py.File(file, "r+") as content:
+        del content["stp/V01/evtid"]
+        content["stp/V01/evtid"] = [b"a"] * EVENTS
+        content["stp/V01/evtid"].attrs["datatype"] = "array<1>{real}"
+    with pytest.raises(CpunetError, match=r"stp\.lh5: [^\n]+$"):
+        list(hit_parts(file)())
+
+
+def test_rows_of_an_event_that_lie_apart_are_read_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    file = stp(tmp_path / "stp.lh5", np.r_[np.arange(EVENTS - 1), 0])
+    assert parts_of(file, table_of(file, None)) is None
+    (whole,) = hit_parts(file)()
+    require_same(whole, read_hits(file))
+
+
+def test_a_file_of_hits_gives_the_same_blocks(tmp_path, monkeypatch):
+    detector = read_detector("icpc")
+    file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
+    monkeypatch.setattr(hit_sources, "BLOCK_EVENTS", 8)
+    windows = (EnergyWindow("some", 100.0, 1500.0),)
+    whole = [HitFile(file), HitFile(file, windows=windows)]
+    expected = [(o.n_events, list(o.blocks)) for o in (one.open(detector) for one in whole)]
+    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    for source, (n_events, blocks) in zip(whole, expected, strict=True):
+        opened = source.open(detector)
+        found = list(opened.blocks)
+        assert opened.n_events == n_events == sum(map(len, found))
+        assert [len(block) for block in found] == [len(block) for block in blocks]
+        for one, other in zip(found, blocks, strict=True):
+            require_same(one, other)
+    assert expected[1][0] < expected[0][0]
+
+
+def test_what_is_wrong_is_told_of_parts_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    detector = read_detector("icpc")
+    file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
+    with pytest.raises(CpunetError, match="no event in none; widen window_kev"):
+        HitFile(file, windows=(EnergyWindow("none", 1e6, 2e6),)).open(detector)
+    with pytest.raises(CpunetError, match=r"all \d+ hits lie outside .* z 1020 to 1030 mm"):
+        HitFile(file, HitOptions(origin=(0, 0, -1000))).open(detector)
+    with pytest.raises(CpunetError, match="no detector V02; it holds V01"):
+        HitFile(file, HitOptions("V02")).open(detector)
+    stp(file, np.arange(EVENTS), deposits=False)
+    with pytest.raises(CpunetError, match="no step deposits energy"):
+        HitFile(file).open(detector)
+
+
+CSV_HEAD = "#class tools::wcsv::ntuple\n#title {title}\n#separator 44\n"
+
+
+def csv_file(folder: Path, columns: list[str], rows: list[str], title: str = "hits") -> Path:
+    head = CSV_HEAD.format(title=title) + "".join(f"#column double {c}\n" for c in columns)
+    path = folder / "hits.csv"
+    path.write_text(head + "\n".join(rows))
+    return path
+
+
+def g4simple_file(folder: Path, **changed: object) -> Path:
+    columns: dict[str, object] = {
+        "event": np.array([4, 4, 7, 7, 7], np.int32),
+        "volID": np.array([1, 1, 1, 2, 0], np.int32),
+        "Edep": np.array([0.5, 1.0, 0.25, 0.3, 0.0]),
+        "x": np.arange(5.0),
+        "y": np.zeros(5),
+        "z": np.array([1.0, 2, 3, 4, 5]),
+    }
+    columns.update(changed)
+    path = folder / "hits.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, values in columns.items():
+            if values is not None:
+                file[f"default_ntuples/g4sntuple/{name}/pages"] = values
+    return path
+
+
+def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
+    path = reference_data / "geant4" / "remage-th228-stp.lh5"
+    hits = read_hits(path, HitOptions("det1"))
+    assert (hits.n_events, len(hits.edep_kev)) == (16, 342)
+    assert hits.energy_kev[0] == pytest.approx(200.0)
+    assert hits.event_number[:3].tolist() == [36, 45, 106]
+    assert 10 < hits.x_mm.min() < hits.x_mm.max() < 50
+    with pytest.raises(CpunetError, match="no detector optdet1; it holds det1, det2, scint1"):
+        read_hits(path, HitOptions("optdet1"))
+
+
+def test_truncated_hdf5_is_one_line(reference_data: Path, tmp_path: Path) -> None:
+    whole = (reference_data / "geant4" / "remage-th228-stp.lh5").read_bytes()
+    for share in (0.001, 0.3, 0.9):
+        path = tmp_path / "cut.lh5"
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(CpunetError, match="truncated"):
+            read_hits(path, HitOptions("det1"))
+
+
+def test_geant4_csv_needs_units(reference_data: Path) -> None:
+    path = reference_data / "geant4" / "single-invcoax-th228-geant4.csv"
+    with pytest.raises(CpunetError, match="column X names no unit; give `length_unit`"):
+        read_hits(path)
+    hits = read_hits(path, HitOptions(length_unit="mm", energy_unit="keV"))
+    assert (hits.n_events, len(hits.edep_kev)) == (124, 1411)
+    assert hits.event_number[0] == 2
+    assert 2500 < hits.energy_kev.max() < 2615
+
+
+def test_npz_of_geant4(reference_data: Path) -> None:
+    path = reference_data / "geant4" / "g4_h20mm.npz"
+    hits = read_hits(path)
+    with np.load(path) as archive:
+        np.testing.assert_allclose(hits.energy_kev, archive["event_etot_keV"], rtol=1e-5)
+    assert 0 <= hits.z_mm.min() < hits.z_mm.max() <= 96
+
+
+def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
+    hits = read_hits(g4simple_file(tmp_path), HitOptions("1"))
+    np.testing.assert_allclose(hits.energy_kev, [1500, 250])
+    np.testing.assert_array_equal(hits.event_number, [4, 7])
+    np.testing.assert_array_equal(hits.z_mm, [1, 2, 3])
+    with pytest.raises(CpunetError, match="has columns for event, x, y, z, edep"):
+        read_hits(g4simple_file(tmp_path, Edep=None))
+    with pytest.raises(CpunetError, match="differ in length"):
+        read_hits(g4simple_file(tmp_path, x=np.zeros(3)), HitOptions("1"))
+
+
+def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
+    rows = ["3,1,10,20,30", "3,0,0,0,0", "5,0.5,1,2,3"]
+    plain = csv_file(tmp_path, ["event", "Edep", "x", "y", "z"], rows, title="steps data")
+    hits = read_hits(plain)
+    np.testing.assert_allclose(hits.energy_kev, [1000, 500])
+    assert len(hits.edep_kev) == 2  # a step without a deposit is none
+    named = ["event", "Edep [GeV]", "x [cm]", "y [cm]", "z [m]"]
+    rows = ["3,0.001,10,20,30", "5,0.0005,1,2,3"]
+    hits = read_hits(csv_file(tmp_path, named, rows))
+    np.testing.assert_allclose(hits.energy_kev, [1000, 500])
+    np.testing.assert_allclose(hits.position_mm[0], [100, 200, 30_000])
+
+
+def test_transform_to_the_crystal(tmp_path: Path) -> None:
+    path = csv_file(
+        tmp_path, ["event", "Edep", "x", "y", "z"], ["1,1,10,20,30"], title="steps data"
+    )
+    flipped = HitOptions(origin=(1, 2, 50), flip_z=True)
+    np.testing.assert_allclose(read_hits(path, flipped).position_mm, [[9, -18, 20]])
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "message"),
+    [
+        (["event", "x", "y", "z"], ["1,2,3,4"], "no column for edep"),
+        (["event", "Edep", "x", "y", "z"], ["1,2,3,4,5", "1,2"], "is it cut off"),
+        (["event", "Edep", "x", "y", "z"], ["1,2,3"], "3 values a line for 5 columns"),
+        (["event", "Edep", "x", "y", "z"], [], "holds no steps"),
+        (["event", "Edep", "x", "y", "z"], ["8,-2,3,4,5"], "event 8: a step"),
+        (["event", "Edep", "x", "y", "z"], ["8,nan,3,4,5"], "event 8: a step"),
+        (["event", "Edep", "x", "y", "z"], ["8,0,3,4,5"], "no step deposits energy"),
+        (["event", "Edep [J]", "x", "y", "z"], ["8,1,3,4,5"], "is in 'J'; expected"),
+    ],
+)
+def test_bad_csv_is_one_line(
+    tmp_path: Path, columns: list[str], rows: list[str], message: str
+) -> None:
+    path = csv_file(tmp_path, columns, rows, title="steps data")
+    with pytest.raises(CpunetError, match=message) as caught:
+        read_hits(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 rubbish", b"\x89HDF\r\n\x1a\n", b"a,b"])
+def test_foreign_files_are_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "foreign"
+    path.write_bytes(content)
+    with pytest.raises(CpunetError, match="foreign: "):
+        read_hits(path)
+
+
+GOOD = {
+    "x_mm": np.array([1.0, 2, 3]),
+    "y_mm": np.zeros(3),
+    "z_mm": np.array([10.0, 20, 30]),
+    "edep_keV": np.array([500.0, 600, 700]),
+    "offsets": np.array([0, 2, 3]),
+}
+NPZ_DEFECTS = [
+    ("x_mm", np.array([np.nan, 0, 0])),
+    ("x_mm", np.array(["1", "2", "3"])),
+    ("edep_keV", np.array([500.0, 600])),
+    ("edep_keV", np.array([-1.0, 1, 1])),
+    ("offsets", np.array([0, 1.5, 3])),
+    ("offsets", np.array([0, 3, 2])),
+]
+
+
+@pytest.mark.parametrize(("name", "values"), NPZ_DEFECTS)
+def test_archives(tmp_path: Path, name: str, values: np.ndarray) -> None:
+    path = tmp_path / "hits.npz"
+    np.savez(path, **(GOOD | {name: values}))
+    with pytest.raises(CpunetError, match=rf"^{re.escape(str(path))}: [^\n]+$"):
+        read_hits(path)
+
+
+def one_table(path: Path, **changes: object) -> Path:
+    rows = [[1.0, 2], [3.0]]
+    columns: dict[str, object] = {
+        "evtid": Array(np.array([3, 7])),
+        "edep": VectorOfVectors([[500.0, 600], [700.0]], attrs={"units": "keV"}),
+        **{f"{axis}loc": VectorOfVectors(rows, attrs={"units": "mm"}) for axis in "xyz"},
+    }
+    lh5.write(Table(col_dict=columns | changes), "stp/det1", path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"xloc": VectorOfVectors([[1.0], [2.0, 3]], attrs={"units": "mm"})},
+        {"evtid": Array(np.array([3, np.nan]))},
+        {"zloc": VectorOfVectors([[1.0, 2], [3.0]], attrs={"units": "mile"})},
+    ],
+)
+def test_remage_tables(tmp_path: Path, change: dict[str, object]) -> None:
+    path = one_table(tmp_path / "stp.lh5", **change)
+    with pytest.raises(CpunetError, match=rf"^{re.escape(str(path))}: [^\n]+$"):
+        read_hits(path)
+
+
+@pytest.mark.parametrize("origin", [0.01, np.array([0.01])])
+def test_an_origin_is_a_number_or_an_array_of_one(tmp_path: Path, origin: object) -> None:
+    path = one_table(tmp_path / "stp.lh5")
+    with h5py.File(path, "r+") as file:
+        file["detector_origins/det1/xloc"] = origin  # in m
+        file["detector_origins/det1/yloc"] = file["detector_origins/det1/zloc"] = 0.0
+    assert read_hits(path).x_mm.tolist() == [-9, -8, -7]
+
+
+def test_a_file_of_remage_without_steps(tmp_path: Path) -> None:
+    path = one_table(tmp_path / "stp.lh5")
+    with h5py.File(path, "r+") as file:
+        del file["stp/det1/edep"]
+    with pytest.raises(CpunetError, match="no table of stp or default_ntuples has columns"):
+        read_hits(path)
+
+
+def test_stored_hits_of_other_events(tmp_path: Path) -> None:
+    path = tmp_path / "sim.lh5"
+    with h5py.File(path, "w") as file:
+        file["geds/hits/event_number"] = [1, 1, 2]
+        for name, units in (("x", "mm"), ("y", "mm"), ("z", "mm"), ("edep", "keV")):
+            file[f"geds/hits/{name}"] = np.full(3, 10.0)
+            file[f"geds/hits/{name}"].attrs["units"] = units
+        file["geds/sim/event_number"] = [1, 2, 3]
+    with pytest.raises(CpunetError, match="geds/hits has no hit of event 3"):
+        read_hits(path)
+
+
+def test_archives_name_no_detector_and_a_far_origin_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hits.npz"
+    np.savez(path, **(GOOD | {"offsets": np.array([0.0, 2, 3])}))
+    assert read_hits(path).offsets.tolist() == [0, 2, 3]
+    with pytest.raises(CpunetError, match="name no detector to pick V01 by; leave"):
+        read_hits(path, HitOptions("V01"))
+    with pytest.raises(CpunetError, match="check the units and the origin"):
+        read_hits(path, HitOptions(origin=(1e300, 0, 0)))
+    with pytest.raises(CpunetError, match="cannot be read"):
+        read_hits(tmp_path / "none.lh5")
