@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration import search
-from cpunet.calibration.inputs import Freedom, known_depletion
+from cpunet.calibration.inputs import Freedom, known_depletion, require_depletion
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import ROUNDS, Search, _relaxed
 from cpunet.errors import CpunetError
@@ -94,6 +94,29 @@ def test_scaled_impurities_keep_their_tilt_and_the_surface_charge(
         voltage = solve(detector).depletion_V(factor * detector.impurity_scale, tilt)
         found = known_depletion(physics, (voltage, 1.0))(np.array([np.log(factor)]))
         assert found[0] == pytest.approx(0, abs=3)  # V
+
+
+@pytest.mark.parametrize(
+    ("bias", "given"),
+    [
+        (1.005, {}),  # a step of the impurities is 1 %
+        (1.2, {"impurity_factor": (1.3, 0.05)}),
+        (1.2, {"depletion_voltage": (3000.0, 50.0)}),
+    ],
+)
+def test_a_detector_that_does_not_deplete_within_the_priors_is_refused(bias, given):
+    detector = read_detector("ppc", ["grid_mm=0.25"])
+    depletes = solve(detector).depletion_V(detector.impurity_scale)
+    physics = Physics(
+        detector.model_copy(update={"bias_V": bias * depletes}),
+        SimulationSettings(),
+        (named("temperature"), named("impurity")),
+    )
+    with pytest.raises(
+        CpunetError, match=r"within the priors it depletes at .* its bias is .*;"
+    ):
+        require_depletion(physics, given)
+    require_depletion(physics.of(physics.nuisances[:1]), {})  # as simulated it does
 
 
 def test_what_is_free_and_what_is_not():
