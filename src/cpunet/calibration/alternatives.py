@@ -50,16 +50,18 @@ def side_by_side(
     Returns
     -------
     list of dict, list of str
-        Of each of the physics the values of what is free, the rise of chi-square, and by line
-        the medians of current amplitude and drift time (ns); the lines that would tell the
-        physics apart, the best first.
+        Of each of the physics the values of what is free in any, the rise of chi-square, and
+        by line the medians of current amplitude and drift time (ns); the lines that would tell
+        the physics apart, the best first.
     """
     energy_kev = np.add.reduceat(hits.edep_kev, hits.offsets[:-1])
-    free, found, apart = ~used.select(energy_kev), [], {}
+    free, apart = ~used.select(energy_kev), {}
+    physics = fits[0][0].nearby.simulator.physics
+    chosen = {i for problem, _ in fits for i in problem.parameters.free}
+    names = [physics.nuisances[i].name for i in sorted(chosen)]
+    found = []
     for problem, rise in fits:
-        parameters, physics = problem.parameters, problem.nearby.simulator.physics
-        names = [physics.nuisances[i].name for i in parameters.free]
-        values = physics.values(parameters.coordinates)
+        values = physics.values(problem.parameters.coordinates)
         found.append({**{name: values[name] for name in names}, "chi_square_rise": rise})
     for line in (*recipe.peaks, CONTINUUM):
         rows = np.flatnonzero(free & parse_selection(line, recipe.peaks).select(energy_kev))

@@ -107,9 +107,9 @@ class Calibration(Run):
     def alternatives(self) -> DataFrame:
         """Physics that explain the data about as well, the calibrated ones first.
 
-        Values of the free parameters, the rise of chi-square, and the medians of current
-        amplitude and drift time (ns) that they predict for energies that were not used. Empty
-        if there are none.
+        Values of what is free in any of them, the rise of chi-square, and the medians of
+        current amplitude and drift time (ns) that they predict for energies that were not used.
+        Empty if there are none.
         """
         from pandas import DataFrame
 
@@ -140,10 +140,8 @@ class Calibration(Run):
             lines.append(f"left as simulated: {falls}")
         lines.append(f"chi-square per function {before:.2f} before, {after:.2f} after")
         if len(others := self.alternatives):
-            table = others.map(lambda v: f"{v:.5g}").replace("nan", "as simulated").T
-            about = ["alternatives", "calibrated", *map(str, table.columns[1:])]
-            rows = [[titled(n), *table.loc[n]] for n in table.index]
-            lines.append(text_table(about, rows))
+            rows = [[titled(n), *(f"{v:.5g}" for v in others[n])] for n in others]
+            lines.append(text_table(["alternatives", "calibrated", *others.index[1:]], rows))
         return "\n".join([*lines, str(self.folder)])
 
     def _shown(self) -> dict[str, str]:

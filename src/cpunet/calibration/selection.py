@@ -1,9 +1,9 @@
 r"""Which parameters of the physics should be free: those that describe held-out pulses better.
 
 All pulses are of the energies that the calibration is made on. Both sides are halved, every
-second event. Near the current point the deviations are linear, so chain and any set of parameters can be
-fitted to one half, and the deviations of the other half be told, without any simulation. A
-parameter that only follows fluctuations makes the other half worse.
+second event. Near the current point the deviations are linear, so chain and any set of
+parameters can be fitted to one half, and the deviations of the other half be told, without any
+simulation. A parameter that only follows fluctuations makes the other half worse.
 """
 
 from __future__ import annotations
