@@ -12,7 +12,7 @@ from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.networks.response_layer import PADDING_AFTER
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.parameters import pulse_parameters
+from cpunet.pulses.parameters import current_amplitude, drift_time
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
@@ -24,6 +24,8 @@ CONTINUUM = "1000-1500"
 LEAST, MOST = 100, 500
 # Difference of two predictions, in its error with the events simulated, that tells them apart.
 DECIDES = 3.0
+# Fraction of the charge with which the drift ends; on a flat top rounding finds the maximum.
+COLLECTED = 0.99
 _NUMBERS = ("current_amplitude", "drift_time")
 
 
@@ -89,7 +91,7 @@ def _error(values: Values, n: int) -> float:
 def _numbers(
     problem: JointProblem, hits: Hits, energy_kev: Values, recipe: Recipe
 ) -> dict[str, Values]:
-    """Parameters of pulses after the chain, without noise."""
+    """Current amplitude after the chain, and drift time before it, without noise."""
     physics, parameters = problem.nearby.simulator.physics, problem.parameters
     waveforms = Simulator(hits, physics).exact(parameters.coordinates)
     pulses = Pulses.of(waveforms, dt_ns=physics.settings.dt_ns, energy_kev=energy_kev)
@@ -97,6 +99,8 @@ def _numbers(
     with torch.no_grad():
         records = parameters.chain.response(torch.from_numpy(windows.waveforms)).numpy()
     records /= records[:, -PADDING_AFTER:].mean(axis=1, keepdims=True)
-    translated = Pulses.of(records, dt_ns=pulses.dt_ns, energy_kev=windows.energy_kev)
-    every = pulse_parameters(translated, recipe.preparation, recipe.scores)
-    return {name: every[name] for name in _NUMBERS}
+    ends = np.minimum(windows.waveforms, COLLECTED)
+    return {
+        "current_amplitude": current_amplitude(records),
+        "drift_time": drift_time(ends, pulses.dt_ns, recipe.scores.drift_start_fraction),
+    }
