@@ -1,156 +1,217 @@
-"""Are the errors of a calibration right? Many small, disjoint experiments from large stands.
+"""Are the errors of a calibration right? Small test stands with physics from the priors.
 
-    cpunet stand --preset legend200 --events FEP=20000 --seed 11 --out big
-    OMP_NUM_THREADS=1 python benchmarks/calibration_coverage.py big --sets 50
+    nice python benchmarks/calibration_coverage.py --stands 50 --results coverage.jsonl
+    python benchmarks/calibration_coverage.py --stands 0 --figure pulls.png
 
-Prints the pulls, (found - true) / error, of each free parameter, with their mean and width;
-``--figure FILE`` draws them.  The truth is read from the stand's ``stand.json``.
-
-Events of a stand are independent, and each is used in one experiment only.  If the errors are
-right, the mean pull of n experiments scatters by 1 / sqrt(n), for one stand or several.
+Each stand has independent events of both sides, and the true values of a group of parameters,
+the free ones of its fit, drawn from their priors.  If priors and errors are right, the pulls
+(found - true) / error of every parameter have mean 0 and width 1, also where the prior knows
+more than the pulses.  Each result is appended to the file at once; a stand whose result it
+holds is not made again, so that the benchmark can be stopped, resumed and run in parts
+(``--groups 1 2``).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+import cpunet
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Nuisance, Physics, named
+from cpunet.calibration.nuisances import Physics, named, priors, titled
 from cpunet.calibration.search import Search
-from cpunet.calibration.titles import titled
 from cpunet.electronics.measured import measured_noise
 from cpunet.plotting import styled
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
-from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.training.pulse_sets import PulseSets
+
+# All that may become free, in groups that are fitted together.
+GROUPS = (
+    ("temperature", "impurity", "self_repulsion"),
+    ("diffusion", "cloud", "tilt"),
+    ("hole_velocity_low", "hole_velocity_high"),
+    ("electron_velocity_low", "electron_velocity_high"),
+    ("hole_trapping", "electron_trapping"),
+    ("bias", "li_thickness"),
+)
+# Simulated with values three errors of the prior or more from zero, which is a bound.
+SIMULATED = {
+    "self_repulsion": 1.0,
+    "cloud_fwhm_mm": 0.6,
+    "hole_trapping_per_us": 0.03,
+    "electron_trapping_per_us": 0.03,
+}
+LINE_KEV = 2614.5
+GIVEN = {"self_repulsion": (1.0, 0.33)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--results", type=Path, default=Path("coverage.jsonl"))
+    parser.add_argument("--stands", type=int, default=50, help="of each group")
+    parser.add_argument("--groups", type=int, nargs="+", default=range(1, len(GROUPS) + 1))
+    parser.add_argument("--events", type=int, default=500, help="full-energy ones of a stand")
+    parser.add_argument("--detector", default="ppc")
+    parser.add_argument("--figure", type=Path)
+    arguments = parser.parse_args()
+    found = _stored(arguments.results)
+    done = {(one["group"], one["seed"]) for one in found}
+    for seed in range(1, arguments.stands + 1):
+        for group in arguments.groups:
+            if (group, seed) in done:
+                continue
+            result = experiment(group, seed, arguments.detector, arguments.events)
+            with arguments.results.open("a") as file:
+                file.write(json.dumps(result) + "\n")
+            found.append(result)
+            told = "  ".join(f"{n} {_pull(v):+.2f}" for n, v in result["parameters"].items())
+            about = f"{result['chi_square']:.2f}  {result['seconds']:3.0f} s"
+            print(f"group {group}, stand {seed:2d}  {about}  {told}", flush=True)
+    _tell(found, arguments.figure)
+
+
+def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, Any]:
+    """Make a stand with physics drawn from the priors, and calibrate it."""
+    begun, names = time.perf_counter(), GROUPS[group - 1]
+    nuisances = tuple(named(name) for name in names)
+    rng = np.random.default_rng([group, seed])
+    with tempfile.TemporaryDirectory() as folder:
+        made = {k: v for k, v in SIMULATED.items() if k in {n.name for n in nuisances}}
+        nominal = read_detector(detector)
+        settings = SimulationSettings(**made)
+        before = Physics(nominal, settings, nuisances)
+        drawn = [p.centre + p.width * rng.normal() for p in priors(before, GIVEN)]
+        stand = cpunet.make_stand(
+            Path(folder) / "stand",
+            detector=detector,
+            events={"FEP": events},
+            shift=_shift(before, np.array(drawn)),
+            settings=[f"{name}={value}" for name, value in made.items()],
+            seed=100 * group + seed,
+        )
+        search, truth = _search(stand, before, np.array(drawn), seed)
+        calibrated = search.run()
+    at = calibrated.problem.parameters.coordinates
+    covariance = calibrated.covariance[-len(names) :, -len(names) :]
+    return {
+        "group": group,
+        "seed": seed,
+        "pulses": len(search.energy_kev),
+        "chi_square": calibrated.chi_square / calibrated.problem.moments,
+        "by_chance": calibrated.problem.by_chance[0] / calibrated.problem.moments,
+        "rounds": calibrated.rounds,
+        "settled": calibrated.settled,
+        "seconds": time.perf_counter() - begun,
+        "parameters": {
+            n.name: {"found": float(x), "true": float(t), "error": float(e), "prior": p.width}
+            for n, x, t, e, p in zip(
+                nuisances, at, truth, calibrated.errors, priors(before, GIVEN), strict=True
+            )
+        },
+        "covariance": covariance.tolist(),
+    }
+
+
+def _shift(physics: Physics, coordinates: np.ndarray) -> dict[str, float]:
+    """Shift of a stand to some coordinates."""
+    shift = {}
+    for nuisance, x in zip(physics.nuisances, coordinates, strict=True):
+        nominal = physics.nominal(nuisance)
+        value = nuisance.value(nominal, float(x))
+        offset = nuisance.name in (
+            "temperature_K", "bias_V", "li_thickness_mm", "impurity_tilt_1e10_per_cm4",
+            "hole_trapping_per_us", "electron_trapping_per_us",
+        )  # fmt: skip
+        shift[nuisance.name] = value - nominal if offset else value
+    return shift
+
+
+def _search(
+    stand: cpunet.Stand, before: Physics, drawn: np.ndarray, seed: int
+) -> tuple[Search, np.ndarray]:
+    recipe = load_recipe("fast")
+    selection = parse_selection("2000-2700", recipe.peaks)
+    sim = load_pulses(stand.sim, "simulated", recipe, selection).prepared
+    data = load_pulses(stand.data, "measured", recipe, selection).prepared
+    for side in (sim, data):  # the line is calibrated to its energy, whatever is trapped
+        side.pulses.energy_kev[:] = LINE_KEV
+    noise, _ = measured_noise(data, recipe.preparation)
+    stored = StoredSimulation.read(stand.sim.path)
+    physics = Physics(stored.detector, stored.settings, before.nuisances)
+    truth = [
+        n.coordinate(physics.nominal(n), n.value(physics.nominal(n), float(x)))
+        for n, x in zip(physics.nuisances, drawn, strict=True)
+    ]
+    search = Search(
+        simulator=Simulator(stored.hits[sim.index], physics),
+        sets=PulseSets(sim.pulses, data.pulses, noise, recipe, np.random.default_rng(seed)),
+        energy_kev=sim.pulses.energy_kev,
+        recipe=recipe,
+        given={k: v for k, v in GIVEN.items() if k in {n.name for n in physics.nuisances}},
+        free=list(range(len(physics.nuisances))),
+    )
+    return search, np.array(truth)
+
+
+def _stored(path: Path) -> list[dict[str, Any]]:
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def _pull(one: dict[str, float]) -> float:
+    return (one["found"] - one["true"]) / one["error"]
+
+
+def _tell(found: list[dict[str, Any]], figure: Path | None) -> None:
+    """Print mean and width of the pulls of each parameter."""
+    pulls: dict[str, list[float]] = {}
+    known: dict[str, list[float]] = {}
+    for one in found:
+        for name, values in one["parameters"].items():
+            pulls.setdefault(name, []).append(_pull(values))
+            known.setdefault(name, []).append(values["error"] / values["prior"])
+    for name, of in pulls.items():
+        n = len(of)
+        width = np.std(of, ddof=1) if n > 1 else float("nan")
+        print(
+            f"{name}: {n} stands, error {np.median(known[name]):.2f} of the prior, pulls: mean "
+            f"{np.mean(of):+.2f} ± {1 / n**0.5:.2f}, width {width:.2f} ± {(2 * n) ** -0.5:.2f}"
+        )
+    if figure is not None:
+        drawn = {name: np.array(of) for name, of in pulls.items()}
+        pulls_figure(drawn).savefig(figure, dpi=110, metadata={"Software": None})
 
 
 @styled
 def pulls_figure(pulls: dict[str, np.ndarray]) -> Figure:
     """Histograms of pulls beside the normal distribution."""
-    figure = Figure(figsize=(3.4 * len(pulls), 2.8))
+    columns = min(4, len(pulls))
+    rows = -(-len(pulls) // columns)
+    figure = Figure(figsize=(3.0 * columns, 2.4 * rows))
     grid, edges = np.linspace(-4, 4, 200), np.linspace(-4, 4, 17)
-    for panel, (name, values) in zip(
-        figure.subplots(1, len(pulls), squeeze=False)[0], pulls.items(), strict=True
-    ):
-        panel.hist(values, edges, color="#0072B2", label=f"{len(values)} experiments")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel in panels[len(pulls) :]:
+        panel.set_axis_off()
+    for panel, (name, values) in zip(panels, pulls.items(), strict=False):
+        panel.hist(values, edges, color="#0072B2")
         normal = np.exp(-0.5 * grid**2) / np.sqrt(2 * np.pi)
-        panel.plot(grid, len(values) * 0.5 * normal, color="black", label="normal")
+        panel.plot(grid, len(values) * 0.5 * normal, color="black")
         panel.set_xlabel(f"pull of {titled(name, units=False)}")
-        panel.set_ylabel("experiments")
-        panel.set_title(f"{values.mean():+.2f}, width {values.std(ddof=1):.2f}")
-        panel.margins(y=0.35)  # room for the legend
-    figure.axes[0].legend(loc="upper left", ncols=2)
+        panel.set_title(f"{len(values)}: {values.mean():+.2f}, width {values.std(ddof=1):.2f}")
     return figure
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("stands", type=Path, nargs="+")
-    parser.add_argument("--sets", type=int, default=50, help="parts of each stand")
-    parser.add_argument("--first", type=int, help="only so many of them")
-    parser.add_argument("--free", default="temperature,impurity")
-    parser.add_argument("--figure", type=Path)
-    arguments = parser.parse_args()
-    nuisances = tuple(named(name) for name in arguments.free.split(","))
-    found, begun = [], time.perf_counter()
-    print("stand, part, chi-square, pulls of", ", ".join(n.name for n in nuisances))
-    for stand in arguments.stands:
-        for i, result in enumerate(experiments(stand, nuisances, arguments.sets)):
-            found.append(result)
-            told = "  ".join(f"{pull:+.2f}" for pull in result.pulls)
-            print(f"{stand} {i + 1:3d}  {result.chi_square:.2f}  {told}", flush=True)
-            if i + 1 == arguments.first:
-                break
-    pulls = np.array([result.pulls for result in found])
-    errors = np.median([result.errors for result in found], axis=0)
-    chi = np.array([result.chi_square for result in found])
-    print(f"{len(found)} experiments, {time.perf_counter() - begun:.0f} s")
-    print(f"chi-square per function {chi.mean():.2f}, from {chi.min():.2f} to {chi.max():.2f}")
-    for nuisance, error, of in zip(nuisances, errors, pulls.T, strict=True):
-        print(
-            f"{nuisance.name}: error {error:.3g}, pulls: mean "
-            f"{of.mean():+.2f} ± {of.std() / len(of) ** 0.5:.2f}, width {of.std(ddof=1):.2f}"
-        )
-    if arguments.figure:
-        named_pulls = {n.name: pulls[:, j] for j, n in enumerate(nuisances)}
-        pulls_figure(named_pulls).savefig(
-            arguments.figure, dpi=110, metadata={"Software": None}
-        )
-
-
-class Experiment(NamedTuple):
-    """Pulls and errors of the free coordinates, and chi-square per function."""
-
-    pulls: np.ndarray
-    errors: np.ndarray
-    chi_square: float
-
-
-def experiments(
-    stand: Path, nuisances: tuple[Nuisance, ...], sets: int
-) -> Iterator[Experiment]:
-    """Calibrate disjoint parts of a stand."""
-    recipe = load_recipe("fast")
-    selection = parse_selection("FEP", recipe.peaks)
-    files = [PulseFile(stand / f"{name}.lh5") for name in ("sim", "data")]
-    sim = load_pulses(files[0], "simulated", recipe, selection).prepared
-    measured = load_pulses(files[1], "measured", recipe, selection)
-    data = measured.prepared
-    noise, _ = measured_noise(measured, recipe.preparation)
-    stored = StoredSimulation.read(files[0].path)
-    physics = Physics(stored.detector, stored.settings, nuisances)
-    truth = true_coordinates(physics, json.loads((stand / "stand.json").read_text())["data"])
-    rng = np.random.default_rng(1)
-    n = min(len(sim), len(data)) // sets
-    rows = [rng.permutation(len(side))[: n * sets] for side in (sim, data)]
-    for i in range(sets):
-        some, measured = (
-            side[order[i * n : (i + 1) * n]]
-            for side, order in zip((sim, data), rows, strict=True)
-        )
-        calibrated = Search(
-            simulator=Simulator(stored.hits[some.index], physics),
-            sets=PulseSets(
-                some.pulses, measured.pulses, noise, recipe, np.random.default_rng(i)
-            ),
-            energy_kev=some.pulses.energy_kev,
-            recipe=recipe,
-            free=list(range(len(nuisances))),
-        ).run()
-        yield Experiment(
-            (calibrated.problem.parameters.coordinates - truth) / calibrated.errors,
-            calibrated.errors,
-            calibrated.chi_square / calibrated.problem.moments,
-        )
-
-
-def true_coordinates(physics: Physics, made: dict) -> np.ndarray:
-    """Coordinates of the data side of a stand."""
-    detector = Detector.model_validate(made["detector"])
-    coordinates = []
-    for nuisance in physics.nuisances:
-        nominal = physics.nominal(nuisance)
-        if nuisance.name == "impurity_factor":
-            value = detector.impurity_scale / physics.detector.impurity_scale
-        elif nuisance.field in made["detector"]:
-            value = made["detector"][nuisance.field]
-        else:
-            value = made["settings"][nuisance.field]
-        coordinates.append(nuisance.coordinate(nominal, float(value)))
-    return np.array(coordinates)
 
 
 if __name__ == "__main__":

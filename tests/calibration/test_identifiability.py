@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.calibration.identifiability import Information, promises
+from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.nuisances import named
 
 NUISANCES = tuple(named(name) for name in ("temperature", "hole_velocity_low", "cloud"))
@@ -42,21 +42,23 @@ def test_what_moves_pulses_alike_is_one_direction(alike):
 def test_alone_each_is_known_and_together_neither(alike):
     assert alike.errors([0])[0] < 0.01 * WIDTHS[0]
     assert alike.errors()[0] > 0.2 * WIDTHS[0]
-    assert alike.told() == [0]
+
+
+@pytest.mark.parametrize(("correlation", "n"), [(-0.99, 1), (0.99, 1), (0.5, 0)])
+def test_a_degenerate_pair_is_told_as_its_known_combination(correlation, n):
+    covariance = np.eye(3)
+    covariance[:2, :2] = 0.64 * np.array([[1, correlation], [correlation, 1]])
+    covariance[2, 2] = 0.01
+    found = together(["a", "b", "c"], covariance)
+    assert len(found) == n
+    for pair in found:
+        combination = np.array([pair.components["a"], pair.components["b"], 0])
+        assert combination @ covariance @ combination == pytest.approx(pair.error**2)
+        assert pair.error == pytest.approx(0.8 * 0.1)
+    # both known far better than before: two numbers
+    assert not together(["a", "b"], 0.01 * covariance[:2, :2])
 
 
 def test_errors_follow_the_number_of_pulses(alike):
     ratio = alike.errors([0]) / alike.for_pulses(4000).errors([0])
     assert ratio == pytest.approx(2, rel=0.01)
-
-
-def test_a_promise_is_kept_where_all_is_linear():
-    rng = np.random.default_rng(1)
-    jacobian, residuals = rng.normal(size=(40, 4)), rng.normal(size=40)
-    promised = promises(jacobian, residuals, [0, 1, 2])
-    costs = []
-    for columns in ([0, 1, 2], [0, 1, 2, 3]):
-        move = np.linalg.lstsq(jacobian[:, columns], residuals)[0]
-        left = residuals - jacobian[:, columns] @ move
-        costs.append(left @ left)
-    assert promised == {3: pytest.approx(costs[0] - costs[1])}

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration.nuisances import NUISANCES, Physics, known_before, named, priors
-from cpunet.calibration.titles import TITLES
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -81,7 +80,3 @@ def test_what_is_not_known_or_possible_is_refused():
             PHYSICS.settings,
             hot.nuisances,
         ).at(np.array([2.0]))
-
-
-def test_every_parameter_has_a_title():
-    assert set(TITLES) == {nuisance.name for nuisance in NUISANCES}

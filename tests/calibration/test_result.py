@@ -7,23 +7,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.result import described, notes
+from cpunet.calibration.result import described, doubts, notes
 from cpunet.calibration.search import Calibrated
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 
-NUISANCES = tuple(named(name) for name in ("temperature", "impurity", "cloud"))
+SHORT = ("temperature", "impurity", "cloud", "self_repulsion", "diffusion")
+NUISANCES = tuple(named(name) for name in SHORT)
 PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
 
 
 def calibrated(values=(), given=None) -> Calibrated:
-    """A calibration that ended at these values of temperature, impurity and cloud."""
+    """A calibration that ended at these values, in their order; others are as simulated."""
     response = ElectronicsResponse(load_recipe("fast").matching[0], 16.0)
-    parameters = JointParameters(response, PHYSICS, np.zeros(3), range(3), given or {})
+    parameters = JointParameters(response, PHYSICS, np.zeros(5), range(5), given or {})
     vector = parameters.vector()
     for i, value in enumerate(values):
         nominal = PHYSICS.nominal(NUISANCES[i])
@@ -45,9 +47,9 @@ def calibrated(values=(), given=None) -> Calibrated:
         chi_square_before=9.0,
         pulls_before=np.zeros(2),
         chi_square=2.0,
-        directions=[],
+        scale=1.0,
+        information=Information(NUISANCES, np.eye(5), np.ones(5), 100.0),
         promised={},
-        errors_all=dict.fromkeys((n.name for n in NUISANCES), 0.1),
         rounds=1,
         settled=True,
     )
@@ -69,5 +71,56 @@ def test_a_prior_is_told_as_it_was_given():
 def test_a_parameter_at_its_bound_is_told(factor):
     """Rounding in a coordinate does not hide it."""
     told = notes(calibrated((85.0, factor)))
-    assert any(note.startswith("impurity_factor is at its bound, ") for note in told)
-    assert not any("temperature_K is at its bound" in note for note in told)
+    assert any(
+        "the fit uses impurity_factor" in note and "at its bound" in note for note in told
+    )
+    assert not any("temperature_K" in note for note in told)
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "why"),
+    [
+        ((94.9,), "temperature_K", "3.3 errors of its prior"),
+        ((85.0, 1.0, 1.1), "cloud_fwhm_mm", "0 to 1 is possible"),
+        ((85.0, 1.0, 0.1, 2.1), "self_repulsion", "0 to 2 is possible"),
+        ((85.0, 1.0, 0.1, 0.0, 0.14), "diffusion_constant", "0.06 to 0.13 is possible"),
+        ((85.0, 1.0, 0.1, 0.0, 0.05), "diffusion_constant", "0.06 to 0.13 is possible"),
+    ],
+)
+def test_what_cannot_be_is_no_finding(values, name, why):
+    """In remarks, numbers, and the files that hold the physics."""
+    told = described(calibrated(values))
+    doubtful = {n for n, one in told["parameters"].items() if one["doubt"]}
+    assert doubtful == {name}
+    assert why in told["parameters"][name]["doubt"]
+    assert any(
+        note.startswith(f"the fit uses {name} = ")
+        and "to make up for something else" in note
+        and "`prior`" in note
+        for note in told["notes"]
+    )
+    assert not any("no other physics are needed" in note for note in told["notes"])
+    comment = doubts(told["parameters"])
+    assert comment.startswith(f"# {name}: no finding, makes up for something else")
+    assert comment.count("\n") == 1
+
+
+def test_what_can_be_is_a_finding():
+    told = described(calibrated((93.9, 1.1, 0.4, 1.0, 0.11)))
+    assert not any(one["doubt"] for one in told["parameters"].values())
+    assert not doubts(told["parameters"])
+    assert not told["together"]
+
+
+def test_of_a_degenerate_pair_the_direction_is_told():
+    one = calibrated((93.0, 1.05))
+    n = one.problem.parameters.n_chain
+    (t, i), widths = (n, n + 1), one.problem.parameters.widths
+    for a, b, share in ((t, t, 1.0), (i, i, 1.0), (t, i, -0.99), (i, t, -0.99)):
+        one.covariance[a, b] = 0.64 * share * widths[a] * widths[b]
+    (pair,) = described(one)["together"]
+    assert pair["components"] == pytest.approx(
+        {"temperature_K": 0.5**0.5, "impurity_factor": 0.5**0.5}
+    )
+    assert pair["value"] == pytest.approx((8 / 3 + np.log(1.05) / 0.1) / 2**0.5)
+    assert pair["error"] == pytest.approx(0.08)

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration import search
-from cpunet.calibration.inputs import Freedom, known_depletion
+from cpunet.calibration.inputs import Freedom, known_depletion, require_depletion
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import ROUNDS, Search, _relaxed
+from cpunet.calibration.selection import Selection
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -80,6 +81,43 @@ def test_after_the_last_round_nothing_is_simulated(monkeypatch):
     assert len(moved) == ROUNDS - 1
 
 
+def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
+    """Of three parameters the second acts as the first one, which has moved by ten errors."""
+    columns = np.array([[10.0, 9.9, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 3.0]])
+    selection = Selection(columns, np.zeros(3), np.zeros((2, 3)), np.array([1.0, 0, 0]))
+    fitted = []
+
+    def problem(response, nearby, free):
+        fitted.append((free, nearby.centre))
+        parameters = SimpleNamespace(
+            chain=SimpleNamespace(response=response),
+            coordinates=nearby.centre,
+            free=free,
+            n_chain=0,
+        )
+        return SimpleNamespace(
+            parameters=parameters, nearby=nearby, weigh_like=lambda other: None
+        )
+
+    monkeypatch.setattr(
+        search, "levenberg_marquardt", lambda *_: SimpleNamespace(covariance=np.eye(3))
+    )
+    found = Search.__new__(Search)
+    found.free = None
+    found.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
+    found._moved = lambda nearby, move, _: SimpleNamespace(centre=nearby.centre + move)
+    found._problem = problem
+    here = problem("chain", SimpleNamespace(centre=np.array([1.0, 0, 0])), [0])
+    (only,) = found._alternatives(here, selection)
+    assert only[0].parameters.free == [1]
+    # the first one is as simulated, the second one where a linear fit has it
+    expected = np.linalg.lstsq(columns[:, 1:2], np.array([10.0, 0, 0]))[0]
+    assert only[0].parameters.coordinates == pytest.approx([0, *expected, 0])
+    assert [free for free, _ in fitted[1:]] == [[1]]
+    found.free = [0]  # as given by the user
+    assert not found._alternatives(here, selection)
+
+
 @pytest.mark.parametrize(
     "other_charge", ["impurity_tilt_1e10_per_cm4=0.1", "surface_charge_1e10_per_cm2=0.1"]
 )
@@ -94,6 +132,29 @@ def test_scaled_impurities_keep_their_tilt_and_the_surface_charge(
         voltage = solve(detector).depletion_V(factor * detector.impurity_scale, tilt)
         found = known_depletion(physics, (voltage, 1.0))(np.array([np.log(factor)]))
         assert found[0] == pytest.approx(0, abs=3)  # V
+
+
+@pytest.mark.parametrize(
+    ("bias", "given"),
+    [
+        (1.005, {}),  # a step of the impurities is 1 %
+        (1.2, {"impurity_factor": (1.3, 0.05)}),
+        (1.2, {"depletion_voltage": (3000.0, 50.0)}),
+    ],
+)
+def test_a_detector_that_does_not_deplete_within_the_priors_is_refused(bias, given):
+    detector = read_detector("ppc", ["grid_mm=0.25"])
+    depletes = solve(detector).depletion_V(detector.impurity_scale)
+    physics = Physics(
+        detector.model_copy(update={"bias_V": bias * depletes}),
+        SimulationSettings(),
+        (named("temperature"), named("impurity")),
+    )
+    with pytest.raises(
+        CpunetError, match=r"within the priors it depletes at .* its bias is .*;"
+    ):
+        require_depletion(physics, given)
+    require_depletion(physics.of(physics.nuisances[:1]), {})  # as simulated it does
 
 
 def test_what_is_free_and_what_is_not():

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 import cpunet
+from cpunet.calibration.alternatives import side_by_side
 from cpunet.calibration.calibrated_run import (
     CALIBRATION,
     DETECTOR,
@@ -26,12 +27,18 @@ from cpunet.calibration.calibrated_run import (
 )
 from cpunet.calibration.figures import calibration_figures
 from cpunet.calibration.identifiability import Information
-from cpunet.calibration.inputs import DEPLETION, Freedom, Sides, known_depletion, read_sides
+from cpunet.calibration.inputs import (
+    DEPLETION,
+    Freedom,
+    Sides,
+    known_depletion,
+    read_sides,
+    require_depletion,
+)
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Physics, known_before
-from cpunet.calibration.result import described, hopeless
+from cpunet.calibration.nuisances import Physics, known_before, titled
+from cpunet.calibration.result import described, doubts
 from cpunet.calibration.search import Calibrated, Search
-from cpunet.calibration.titles import titled
 from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
@@ -44,9 +51,7 @@ from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_fi
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
-from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_sources import HitFile
-from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
 from cpunet.training.chain import train_chain
 from cpunet.training.job import TrainingJob
@@ -57,6 +62,8 @@ log = logging.getLogger(__name__)
 
 # Numbers of pulses per side for which a plan gives the errors.
 PLANNED = (1000, 4000, 40_000)
+# Chi-square per function beyond which the data are of another detector.
+HOPELESS = 50.0
 
 
 def calibrate(
@@ -179,9 +186,11 @@ class _Job:
             calibrated = self._search(sides, bar.update).run()
         self._require_hope(calibrated, sides)
         content = self._content(calibrated, sides)
+        if len(calibrated.alternatives) > 1:
+            self._compare(calibrated, sides, content)
         for note in content["notes"]:
             log.info(titled(note))
-        _simulate_calibrated(calibrated, sides, folder, self.seed)
+        _simulate_calibrated(calibrated, sides, folder, self.seed, content["parameters"])
         again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, sides.selection)
         # not stretched: what is off in the drift is for the physics to explain
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
@@ -218,7 +227,7 @@ class _Job:
         return Plan(
             {
                 "cpunet": cpunet.__version__,
-                "detector": sides.physics.detector.name,
+                "detector": sides.stored.detector.name,
                 "pulses": list(PLANNED),
                 "errors": _errors_by_pulses(
                     information, search.simulator.physics, search.given
@@ -241,8 +250,10 @@ class _Job:
         noise, note = measured_noise(sides.data, preparation, tails)
         if note is not None:
             log.warning(note)
-        physics, given = sides.physics.of(self.freedom.looked_at), self.freedom.priors
-        hits = sides.stored.hits[sides.sim.prepared.index]
+        stored, given = sides.stored, self.freedom.priors
+        physics = Physics(stored.detector, stored.settings, self.freedom.looked_at)
+        require_depletion(physics, given)
+        hits = stored.hits[sides.sim.prepared.index]
         rng = np.random.default_rng(self.seed)
         free = self.freedom.free
         return Search(
@@ -256,19 +267,30 @@ class _Job:
         )
 
     def _require_hope(self, calibrated: Calibrated, sides: Sides) -> None:
-        if hopeless(calibrated):
-            per = calibrated.chi_square / calibrated.problem.moments
+        per = calibrated.chi_square / calibrated.problem.moments
+        if per > HOPELESS:
             raise CpunetError(
-                f"{self.data.path}: no physics near those of {sides.physics.detector.name} "
+                f"{self.data.path}: no physics near those of {sides.stored.detector.name} "
                 f"make the simulation look like it (chi-square {per:.0f} per function); is it "
                 "of another detector, or of other energies (`peak`)?"
             )
+
+    def _compare(self, calibrated: Calibrated, sides: Sides, content: dict[str, Any]) -> None:
+        """Add the physics that explain the data about as well, and what would decide."""
+        fits, hits = calibrated.alternatives, sides.stored.hits
+        rows, decide = side_by_side(fits, hits, self.recipe, sides.selection)
+        content["alternatives"], content["would_decide"] = rows, decide
+        remedy = f"`peak` {','.join([self.peak, *decide[:2]])} would decide"
+        if not decide:
+            remedy = f"none of the energies of {self.sim.path.name} would decide"
+        told = f"{len(rows) - 1} other physics explain {self.peak} as well"
+        content["notes"].append(f"{told} (alternatives): {remedy}")
 
     def _content(self, calibrated: Calibrated, sides: Sides) -> dict[str, Any]:
         compared = calibrated.problem.bands
         return {
             "cpunet": cpunet.__version__,
-            "detector": sides.physics.detector.name,
+            "detector": sides.stored.detector.name,
             "data": str(self.data.path),
             "peak": self.peak,
             "seed": self.seed,
@@ -280,24 +302,22 @@ class _Job:
         }
 
 
-def _simulate_calibrated(calibrated: Calibrated, sides: Sides, folder: Path, seed: int) -> None:
+def _simulate_calibrated(
+    calibrated: Calibrated, sides: Sides, folder: Path, seed: int, found: Mapping[str, Any]
+) -> None:
     """Write the calibrated physics, and all events simulated with it."""
     parameters = calibrated.problem.parameters
     detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
-    _write_physics(folder, detector, settings)
+    for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
+        text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+        (folder / name).write_text(doubts(found) + text, encoding="utf-8")
     simulate(
         folder / SIM,
         detector=detector,
-        hits=HitFile(sides.sim_path, placed=True),
+        hits=HitFile(sides.sim.path, placed=True),
         settings_file=settings,
         seed=seed,
     )
-
-
-def _write_physics(folder: Path, detector: Detector, settings: SimulationSettings) -> None:
-    for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
-        text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-        (folder / name).write_text(text, encoding="utf-8")
 
 
 def _errors_by_pulses(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import Field
 
-from cpunet.calibration.titles import titled
+from cpunet.calibration.nuisances import titled
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.settings import read_json, read_settings
@@ -103,35 +103,66 @@ class Calibration(Run):
 
         return calibration_figures(self.content)
 
+    @property
+    def alternatives(self) -> DataFrame:
+        """Physics that explain the data about as well, the calibrated ones first.
+
+        Values of what is free in any of them, the rise of chi-square, and the medians of
+        current amplitude and drift time (ns) that they predict for energies that were not used.
+        Empty if there are none.
+        """
+        from pandas import DataFrame
+
+        return DataFrame(self.content.get("alternatives", ()))
+
     def __str__(self) -> str:
         content = self.content
         chi, fixed = content["chi_square"], content["fixed"]
         before, after = (chi[key] / chi["moments"] for key in ("before", "after"))
         lines = [
-            f"{titled(name)} {told['value']:.5g} ± {told['error']:.2g} (simulated with "
-            f"{told['simulated']:.5g}; ± {told['error_all']:.2g} if all physics were free)"
-            for name, told in content["parameters"].items()
+            f"{titled(name)} {shown} (simulated with {told['simulated']:.5g}; "
+            f"± {told['error_all']:.2g} if all physics were free)"
+            for (name, shown), told in zip(
+                self._shown().items(), content["parameters"].values(), strict=True
+            )
         ] or ["no parameter of the physics is determined better than it was known"]
+        lines += [
+            f"only together: {titled(pair['words'], units=False)} = {pair['value']:.2f} ± "
+            f"{pair['error']:.2g} (errors of the priors)"
+            for pair in content["together"]
+        ]
         if fixed:
             falls = ", ".join(
-                f"{titled(name)} (chi-square would fall by "
-                f"{told['chi_square_would_fall_by']:.1f})"
+                f"{titled(name)} (± {told['error_if_free']:.2g} if free, chi-square would fall "
+                f"by {told['chi_square_would_fall_by']:.1f})"
                 for name, told in fixed.items()
             )
             lines.append(f"left as simulated: {falls}")
         lines.append(f"chi-square per function {before:.2f} before, {after:.2f} after")
+        if len(others := self.alternatives):
+            rows = [[titled(n), *(f"{v:.5g}" for v in others[n])] for n in others]
+            lines.append(text_table(["alternatives", "calibrated", *others.index[1:]], rows))
         return "\n".join([*lines, str(self.folder)])
+
+    def _shown(self) -> dict[str, str]:
+        """Each value with its error, or why there is none to tell."""
+        pairs = {name for pair in self.content["together"] for name in pair["components"]}
+        found = {}
+        for name, told in self.content["parameters"].items():
+            value = f"{told['value']:.5g} ± {told['error']:.2g}"
+            if told["doubt"]:
+                value = f"no finding: {told['value']:.5g} makes up for something else"
+            elif name in pairs:
+                value = "known only together with another"
+            found[name] = value
+        return found
 
     def _repr_html_(self) -> str:
         from cpunet.html_pages import part
 
         rows = [
-            [
-                titled(name),
-                f"{one['value']:.5g} ± {one['error']:.2g}",
-                f"{one['simulated']:.5g}",
-            ]
-            for name, one in self.content["parameters"].items()
+            [titled(name), shown, f"{self.content['parameters'][name]['simulated']:.5g}"]
+            for name, shown in self._shown().items()
         ]
         head = ["physics", "calibrated", "as simulated"]
         shown = part(

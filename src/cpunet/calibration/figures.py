@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.calibration.titles import titled
+from cpunet.calibration.nuisances import titled
 from cpunet.plotting import COLOURS, styled
 
 BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,9 @@ from cpunet.calibration.nuisances import Nuisance, Values
 
 # A parameter is determined by the data if its error is below this fraction of its prior.
 TOLD = 0.5
+# Error of a combination of two parameters, relative to their own, below which it is told in
+# their place if one of them is not determined.
+PARALLEL = 0.3
 # Minimum component of a direction that is shown.
 SHOWN = 0.25
 
@@ -153,41 +157,36 @@ class Information:
             found.append(Direction(components, float(1 / np.sqrt(1 + max(size, 0.0)))))
         return found
 
-    def told(self) -> list[int]:
-        """Positions of the parameters that the data determine, in their order."""
-        chosen: list[int] = []
-        for i, width in enumerate(self.widths.tolist()):
-            if self.errors([*chosen, i])[-1] < TOLD * width:
-                chosen.append(i)
-        return chosen
 
-
-def promises(jacobian: Values, residuals: Values, free: Sequence[int]) -> dict[int, float]:
-    r"""Expected decrease of chi-square for each fixed column if it were free.
-
-    To first order, with the residuals :math:`r` and the column :math:`j` projected
-    orthogonally to the free columns,
-
-    .. math:: \Delta\chi^2 = \frac{(j_\perp^T r_\perp)^2}{j_\perp^T j_\perp}.
+def together(names: Sequence[str], covariance: Values) -> list[Direction]:
+    """Combinations of two parameters of which only the combination is known.
 
     Parameters
     ----------
-    jacobian, residuals
-        Derivatives for all columns, and residuals, including the rows of the priors, at the
-        end of the fit of the free columns.
-    free
-        Indices of the free columns.
+    names
+        Names of the parameters.
+    covariance
+        Their covariance in units of the priors.
+
+    Returns
+    -------
+    list of Direction
+        For each such pair the combination that is known.
 
     Examples
     --------
-    >>> promises(np.diag([1.0, 2.0]), np.array([0.0, 3.0]), free=[0])
-    {1: 9.0}
+    >>> pair = together(["a", "b"], np.array([[0.5, -0.49], [-0.49, 0.5]]))
+    >>> pair[0].words, round(pair[0].error, 6)
+    ('0.71 a + 0.71 b', 0.1)
     """
-    others = [i for i in range(jacobian.shape[1]) if i not in set(free)]
-    base, _ = np.linalg.qr(jacobian[:, list(free)])
-    left = residuals - base @ (base.T @ residuals)
-    found = {}
-    for i in others:
-        column = jacobian[:, i] - base @ (base.T @ jacobian[:, i])
-        found[i] = float(column @ left) ** 2 / max(float(column @ column), 1e-12)
+    found = []
+    for i, j in combinations(range(len(names)), 2):
+        pair = covariance[np.ix_([i, j], [i, j])]
+        errors = np.sqrt(pair.diagonal())
+        sizes, axes = np.linalg.eigh(pair)
+        known = float(np.sqrt(max(sizes[0], 0.0)))
+        if errors.max() > TOLD and known < PARALLEL * errors.min():
+            axis = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
+            components = {names[i]: float(axis[0]), names[j]: float(axis[1])}
+            found.append(Direction(components, known))
     return found

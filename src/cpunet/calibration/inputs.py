@@ -6,11 +6,17 @@ import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
-from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
+from cpunet.calibration.nuisances import (
+    NUISANCES,
+    Nuisance,
+    Physics,
+    Values,
+    named,
+    priors,
+)
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import (
     InputSet,
@@ -23,6 +29,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.superposition import solve
+from cpunet.training.energy_bands import LEAST
 
 log = logging.getLogger(__name__)
 
@@ -105,20 +112,14 @@ class Sides:
     ----------
     sim, data
         Prepared pulses of both sides.
-    sim_path
-        File of the simulated pulses with their hits.
-    physics
-        Initial physics of the simulation; nothing is free yet.
     stored
-        Hits, one event per pulse of the file.
+        Detector, settings and hits, one event per pulse of the file.
     selection
         Selected energies.
     """
 
     sim: InputSet
     data: InputSet
-    sim_path: Path
-    physics: Physics
     stored: StoredSimulation
     selection: EnergySelection
 
@@ -140,11 +141,46 @@ def read_sides(
     require_same_sampling(simulated, data)
     for note in require_both_sides(simulated, data, selection):
         log.warning(note)
+    fewest = min(len(simulated.prepared), len(data.prepared))
+    if fewest < LEAST:
+        raise CpunetError(
+            f"{fewest} pulses of {peak} on a side tell nothing of the physics, nor of the "
+            f"readout, which takes {LEAST}",
+            "give more files, or more energies as `peak`; all stays known as it was",
+        )
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
     some = replace(simulated, prepared=simulated.prepared[rows])
-    physics = Physics(stored.detector, stored.settings, ())
-    return Sides(some, data, sim.path, physics, stored, selection)
+    return Sides(some, data, stored, selection)
+
+
+def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse a detector that is not depleted where its physics begin to be varied.
+
+    Raises
+    ------
+    CpunetError
+        If a depletion voltage, as simulated, with the values of the priors, one step of the
+        impurities higher, or as measured, is above the bias.
+    """
+    n = len(physics.nuisances)
+    others = {name: value for name, value in given.items() if name != DEPLETION}
+    centres = np.array([prior.centre for prior in priors(physics, others)])
+    higher = np.array([(x.name == "impurity_factor") * x.step for x in physics.nuisances])
+    needed, bias = [], physics.detector.bias_V
+    for coordinates in (np.zeros(n), higher, centres):
+        detector, _ = physics.at(coordinates)
+        scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
+        needed.append(solve(detector).depletion_V(scale, tilt) + bias - detector.bias_V)
+    if DEPLETION in given:
+        needed.append(given[DEPLETION][0])
+    if max(needed) > bias:
+        raise CpunetError(
+            f"detector {physics.detector.name}: within the priors it depletes at "
+            f"{max(needed):.0f} V, its bias is {bias:.0f} V",
+            "correct bias_V or the impurities and simulate again, give a `prior` with which it "
+            "depletes, or `fix` impurity",
+        )
 
 
 def known_depletion(

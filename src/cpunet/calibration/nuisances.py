@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -32,10 +33,10 @@ class Nuisance:
         Name in outputs, with the unit.
     short
         Short name for the command line.
-    field
-        Field of `Detector` or `SimulationSettings`.
     kind
         Relation of the coordinate to the parameter.
+    unit
+        Unit, or the kind of a number without one.
     prior
         Standard deviation of the coordinate before any data.
     step
@@ -48,12 +49,16 @@ class Nuisance:
         Origin of the prior.
     first
         Whether it is considered before the others.
+    possible
+        Range of values that can be true, if narrower than the allowed one.
+    field
+        Field of `Detector` or `SimulationSettings`, if not the name.
     """
 
     name: str
     short: str
-    field: str
     kind: Literal["added", "factor", "square"]
+    unit: str
     prior: float
     step: float
     reach: float
@@ -61,6 +66,11 @@ class Nuisance:
     highest: float
     source: str
     first: bool = False
+    possible: tuple[float, float] = (-math.inf, math.inf)
+    field: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "field", self.field or self.name)
 
     def value(self, nominal: float, coordinate: float) -> float:
         """Value of the parameter at a coordinate, within the allowed range.
@@ -106,64 +116,81 @@ _MOBILITIES = (
 # are used only if these do not explain the data.
 NUISANCES = (
     Nuisance(
-        "temperature_K", "temperature", "temperature_K", "added",
-        3.0, 0.5, 1.5, 40, 120, "sensors sit beside crystals, not in them", first=True,
+        "temperature_K", "temperature", "added", "[K]", 3.0, 0.5, 1.5, 40, 120,
+        "sensors sit beside crystals, not in them", first=True,
     ),
     Nuisance(
-        "impurity_factor", "impurity", "impurity_scale", "factor",
-        0.1, 0.01, 0.03, 1e-3, 1e3, "what a depletion voltage tells of it (Hall probes: 30 %)",
-        first=True,
+        "impurity_factor", "impurity", "factor", "(factor)", 0.1, 0.01, 0.03, 1e-3, 1e3,
+        "what a depletion voltage tells of it (Hall probes: 30 %)",
+        first=True, field="impurity_scale",
     ),
     Nuisance(
-        "self_repulsion", "self_repulsion", "self_repulsion", "added",
-        1.0, 0.3, 0.9, 0, 10, "none or all of what a model of the cloud gives", first=True,
+        "self_repulsion", "self_repulsion", "added", "(factor)", 1.0, 0.3, 0.9, 0, 10,
+        "none or all of what a model of the cloud gives", first=True, possible=(0, 2),
     ),
     Nuisance(
-        "diffusion_constant", "diffusion", "diffusion_constant", "added",
-        0.03, 0.01, 0.03, 1e-3, 1, "0.066 to 0.12 V mm/cm: kT/e, and what was measured",
-        first=True,
+        "diffusion_constant", "diffusion", "added", "[V mm/cm]", 0.03, 0.01, 0.03, 1e-3, 1,
+        "0.066 to 0.12 V mm/cm: kT/e, and what was measured", first=True, possible=(0.06, 0.13),
     ),
     Nuisance(
-        "cloud_fwhm_mm", "cloud", "cloud_fwhm_mm", "square",
-        0.1, 0.03, 0.1, 0, 5, "0.1 to 0.6 mm: ranges of electrons", first=True,
+        "cloud_fwhm_mm", "cloud", "square", "[mm]", 0.1, 0.03, 0.1, 0, 5,
+        "0.1 to 0.6 mm: ranges of electrons", first=True, possible=(0, 1),
     ),
     Nuisance(
-        "impurity_tilt_1e10_per_cm4", "tilt", "impurity_tilt_1e10_per_cm4", "added",
-        0.03, 0.005, 0.02, -10, 10, "30 % of a gradient of 1e9 per cm4",
+        "impurity_tilt_1e10_per_cm4", "tilt", "added", "[10¹⁰/cm⁴]", 0.03, 0.005, 0.02, -10, 10,
+        "30 % of a gradient of 1e9 per cm4",
     ),
     Nuisance(
-        "hole_velocity_low_factor", "hole_velocity_low", "hole_velocity_low_factor", "factor",
+        "hole_velocity_low_factor", "hole_velocity_low", "factor", "(factor)",
         0.1, 0.01, 0.03, 0.25, 4, _MOBILITIES,
     ),
     Nuisance(
-        "hole_velocity_high_factor", "hole_velocity_high", "hole_velocity_high_factor",
-        "factor", 0.1, 0.02, 0.05, 0.25, 4, _MOBILITIES,
+        "hole_velocity_high_factor", "hole_velocity_high", "factor", "(factor)",
+        0.1, 0.02, 0.05, 0.25, 4, _MOBILITIES,
     ),
     Nuisance(
-        "electron_velocity_low_factor", "electron_velocity_low", "electron_velocity_low_factor",
-        "factor", 0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
+        "electron_velocity_low_factor", "electron_velocity_low", "factor", "(factor)",
+        0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
     ),
     Nuisance(
-        "electron_velocity_high_factor", "electron_velocity_high",
-        "electron_velocity_high_factor", "factor", 0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
+        "electron_velocity_high_factor", "electron_velocity_high", "factor", "(factor)",
+        0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
     ),
     Nuisance(
-        "hole_trapping_per_us", "hole_trapping", "hole_trapping_per_us", "added",
+        "hole_trapping_per_us", "hole_trapping", "added", "[1/µs]", 0.01, 0.005, 0.03, 0, 10,
+        "0 to 1 % per us",
+    ),
+    Nuisance(
+        "electron_trapping_per_us", "electron_trapping", "added", "[1/µs]",
         0.01, 0.005, 0.03, 0, 10, "0 to 1 % per us",
     ),
     Nuisance(
-        "electron_trapping_per_us", "electron_trapping", "electron_trapping_per_us", "added",
-        0.01, 0.005, 0.03, 0, 10, "0 to 1 % per us",
+        "bias_V", "bias", "added", "[V]", 5.0, 20.0, 60.0, 10, 2e4,
+        "what high-voltage modules are calibrated to",
     ),
     Nuisance(
-        "bias_V", "bias", "bias_V", "added",
-        5.0, 20.0, 60.0, 10, 2e4, "what high-voltage modules are calibrated to",
-    ),
-    Nuisance(
-        "li_thickness_mm", "li_thickness", "li_thickness", "added",
-        0.2, 0.1, 0.3, 0.01, 5, "what a full-charge collection depth is measured to",
+        "li_thickness_mm", "li_thickness", "added", "[mm]", 0.2, 0.1, 0.3, 0.01, 5,
+        "what a full-charge collection depth is measured to", field="li_thickness",
     ),
 )  # fmt: skip
+_NAMES = re.compile(rf"\b({'|'.join(n.name for n in NUISANCES)})\b")
+
+
+def titled(text: str, *, units: bool = True) -> str:
+    """Put words in place of the names of parameters in a text.
+
+    Examples
+    --------
+    >>> titled("bias_V"), titled("0.94 self_repulsion", units=False)
+    ('bias [V]', '0.94 self repulsion')
+    """
+
+    def title(found: re.Match[str]) -> str:
+        nuisance = named(found[1])
+        words = nuisance.short.replace("_", " ")
+        return f"{words} {nuisance.unit}" if units else words
+
+    return _NAMES.sub(title, text)
 
 
 def named(text: str) -> Nuisance:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from cpunet.calibration.joint_problem import JointProblem
+from cpunet.calibration.identifiability import together
+from cpunet.calibration.joint_problem import JointParameters, JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values, known_before
 from cpunet.calibration.other_chains import BEYOND_CHANCE
 from cpunet.calibration.search import Calibrated
@@ -15,8 +17,6 @@ from cpunet.calibration.search import Calibrated
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
-# Chi-square per moment beyond which the physics does not describe the data at all.
-HOPELESS = 50.0
 # Advice where a parameter is unexpected, besides the general one.
 ADVICE = {
     "self_repulsion": "it acts within each hit, so hits that are not merged within "
@@ -33,22 +33,21 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
     -------
     dict
         ``parameters``: value, error (with the parameters below as simulated), error_all (with
-        all parameters considered free), simulated value and prior of each free parameter;
-        ``fixed``: parameters considered but kept as simulated, and the decrease of chi-square
-        expected if they were free; ``chi_square``; ``directions``; ``covariance`` of chain and
-        coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
+        all parameters considered free), simulated value and prior of each free parameter, and
+        ``doubt``, why its value is no finding, or None; ``together``: pairs of which only a
+        combination is known, with its value and error in units of the priors;
+        ``fixed``: parameters considered but kept as simulated, with the decrease of chi-square
+        and the error expected if they were free; ``chi_square``; ``directions``;
+        ``covariance`` of chain and coordinates; ``pulls`` of the functions, before and after;
+        ``profiles``; ``notes``.
     """
     problem = calibrated.problem
     vector = problem.parameters.vector()
-    physics = problem.nearby.simulator.physics
-    values = physics.values(problem.parameters.coordinates)
     mean, spread = problem.by_chance
     return {
         "parameters": _parameters(calibrated),
-        "fixed": {
-            name: {"value": values[name], "chi_square_would_fall_by": fall}
-            for name, fall in calibrated.promised.items()
-        },
+        "together": _together(calibrated),
+        "fixed": _fixed(calibrated),
         "chi_square": {
             "before": calibrated.chi_square_before,
             "after": calibrated.chi_square,
@@ -57,7 +56,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
             "by_chance": {"mean": mean, "standard_deviation": spread},
             "errors_scaled_by": calibrated.scale,
         },
-        "directions": [direction.describe() for direction in calibrated.directions],
+        "directions": [found.describe() for found in calibrated.information.directions()],
         "covariance": {
             "names": list(problem.parameters.names),
             "values": vector.tolist(),
@@ -78,31 +77,26 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
 def notes(calibrated: Calibrated) -> list[str]:
     """Remarks on the result of a calibration."""
     problem = calibrated.problem
-    parameters, physics = problem.parameters, problem.nearby.simulator.physics
-    values = physics.values(parameters.coordinates)
-    found = []
-    vector, n = parameters.vector(), parameters.n_chain
-    for k, i in enumerate(parameters.free):
-        nuisance = physics.nuisances[i]
-        value, name = values[nuisance.name], nuisance.name
-        if vector[n + k] in (parameters.low[n + k], parameters.high[n + k]):
-            found.append(f"{name} is at its bound, {value:g}: fix it, or free another")
-        width = parameters.widths[n + k]
-        off = (vector[n + k] - parameters.centre[n + k]) / width
-        if abs(off) > FAR:
-            found.append(
-                f"{name} = {value:.4g} is {abs(off):.1f} errors of its prior from it: give a "
-                "wider prior if that is possible, or free what else moves pulses so"
-                + (f"; {ADVICE[name]}" if name in ADVICE else "")
-            )
+    found = [
+        f"the fit uses {name} = {one['value']:.4g} to make up for something else "
+        f"({one['doubt']}): free what else moves pulses so, or give a `prior` if it can be"
+        + (f"; {ADVICE[name]}" if name in ADVICE else "")
+        for name, one in _parameters(calibrated).items()
+        if one["doubt"]
+    ]
     per = calibrated.chi_square / problem.moments
-    asked = {k: v for k, v in calibrated.promised.items() if v > WORTH_TELLING}
+    physics = problem.nearby.simulator.physics
+    asked = {
+        physics.nuisances[i].name: fall
+        for i, fall in calibrated.promised.items()
+        if fall > WORTH_TELLING
+    }
     best = max(asked, key=lambda name: asked[name], default=None)
     mean, spread = (number / problem.moments for number in problem.by_chance)
     if per <= mean + BEYOND_CHANCE * spread:
         found.append(
-            f"chi-square is {per:.2f} per function, as by chance ({mean:.2f} ± {spread:.2f}): "
-            "no other physics are needed"
+            f"chi-square is {per:.2f} per function, as by chance ({mean:.2f} ± {spread:.2f})"
+            + ("" if found else ": no other physics are needed")
         )
     else:
         rest = (
@@ -117,19 +111,25 @@ def notes(calibrated: Calibrated) -> list[str]:
     return found
 
 
-def hopeless(calibrated: Calibrated) -> bool:
-    """Whether the data clearly belong to another detector."""
-    return calibrated.chi_square > HOPELESS * calibrated.problem.moments
+def doubts(parameters: Mapping[str, Any]) -> str:
+    """Comment on the parameters whose values are no findings, for the files of the physics."""
+    lines = [
+        f"# {name}: no finding, makes up for something else ({one['doubt']})\n"
+        for name, one in parameters.items()
+        if one["doubt"]
+    ]
+    return "".join(lines)
 
 
 def _parameters(calibrated: Calibrated) -> dict[str, Any]:
-    """Value, errors, simulated value and prior of each free parameter, by name."""
+    """Value, errors, simulated value, prior and doubt of each free parameter, by name."""
     problem = calibrated.problem
     parameters, physics = problem.parameters, problem.nearby.simulator.physics
     values = physics.values(parameters.coordinates)
-    before = known_before(physics, parameters.given)
+    before, n = known_before(physics, parameters.given), parameters.n_chain
+    errors_all = calibrated.scale * calibrated.information.errors()
     free = {}
-    for i, error in zip(parameters.free, calibrated.errors, strict=True):
+    for k, (i, error) in enumerate(zip(parameters.free, calibrated.errors, strict=True)):
         nuisance = physics.nuisances[i]
         nominal, value = physics.nominal(nuisance), values[nuisance.name]
         slope = nuisance.slope(nominal, value)
@@ -137,8 +137,9 @@ def _parameters(calibrated: Calibrated) -> dict[str, Any]:
         free[nuisance.name] = {
             "value": value,
             "error": float(slope * error),
-            "error_all": slope * calibrated.errors_all[nuisance.name],
+            "error_all": float(slope * errors_all[i]),
             "simulated": nominal,
+            "doubt": _doubt(nuisance, value, parameters, n + k),
             "prior": {
                 "value": centre,
                 "error": width,
@@ -146,6 +147,51 @@ def _parameters(calibrated: Calibrated) -> dict[str, Any]:
             },
         }
     return free
+
+
+def _fixed(calibrated: Calibrated) -> dict[str, Any]:
+    """Value of each fixed parameter; fall of chi-square and error if it were free."""
+    parameters = calibrated.problem.parameters
+    physics = calibrated.problem.nearby.simulator.physics
+    values, found = physics.values(parameters.coordinates), {}
+    for i, fall in calibrated.promised.items():
+        nuisance = physics.nuisances[i]
+        error = calibrated.scale * calibrated.information.errors([*parameters.free, i])[-1]
+        value = values[nuisance.name]
+        found[nuisance.name] = {
+            "value": value,
+            "chi_square_would_fall_by": fall,
+            "error_if_free": float(nuisance.slope(physics.nominal(nuisance), value) * error),
+        }
+    return found
+
+
+def _doubt(nuisance: Nuisance, value: float, parameters: JointParameters, k: int) -> str | None:
+    """Why the value of a parameter, number `k` of all, is no finding."""
+    x = parameters.vector()[k]
+    off = abs(x - parameters.centre[k]) / parameters.widths[k]
+    low, high = nuisance.possible
+    if x in (parameters.low[k], parameters.high[k]) and value != 0:  # none of it can be true
+        return "at its bound"
+    if not low <= value <= high:
+        return f"{low:g} to {high:g} is possible"
+    return f"{off:.1f} errors of its prior from it" if off > FAR else None
+
+
+def _together(calibrated: Calibrated) -> list[dict[str, Any]]:
+    """Pairs of free parameters of which only a combination is known."""
+    parameters = calibrated.problem.parameters
+    n = parameters.n_chain
+    names, widths = parameters.names[n:], parameters.widths[n:]
+    off = (parameters.vector()[n:] - parameters.centre[n:]) / widths
+    at = dict(zip(names, off.tolist(), strict=True))
+    return [
+        {
+            **one.describe(),
+            "value": sum(size * at[name] for name, size in one.components.items()),
+        }
+        for one in together(names, calibrated.covariance[n:, n:] / np.outer(widths, widths))
+    ]
 
 
 def _profiles(calibrated: Calibrated) -> dict[str, Any]:

@@ -10,23 +10,24 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cpunet.calibration.functions import SlicedFunctions
-from cpunet.calibration.identifiability import Direction, Information, promises
+from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters, JointProblem, fewest
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.calibration.other_chains import decaying_chain, ringing_chain
+from cpunet.calibration.selection import Selection
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_problem import ResponseProblem
+from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import start_response
 
 log = logging.getLogger(__name__)
@@ -39,9 +40,12 @@ SETTLED = 0.4
 # Maximum move of a coordinate in one round, in units of the reach of its derivative, and number
 # of times the move is halved if pulses cannot be simulated there.
 FARTHEST, HALVINGS = 1.5, 4
-# Expected decrease of chi-square (five standard deviations) for which a fixed parameter is
-# freed, and maximum number of such parameters.
+# Decrease of chi-square of held-out pulses (five standard deviations) for which a fixed
+# parameter is freed, and maximum number of such parameters.
 NEEDED, MAX_MORE = 25.0, 3
+# Other sets of parameters are fitted if chi-square would rise by less than this in a linear
+# forecast, and are alternatives if it does so by less than the second; most, and their rounds.
+LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
 # Other chains, and the round in which each is first tried: no physics can replace the ringing
 # of a readout, but early decays are visible only when the physics are about right.
 OTHER_CHAINS: dict[OtherChain, int] = {ringing_chain: 1, decaying_chain: 2}
@@ -63,14 +67,17 @@ class Calibrated:
         Chi-square and pulls with the chain alone, for the physics as simulated.
     chi_square
         Chi-square with chain and physics.
-    directions
-        Directions of all physics considered, best known first.
+    scale
+        Factor of the errors from imperfect agreement, see `JointProblem.by_chance`.
+    information
+        Information on all physics.
     promised
-        Expected decrease of chi-square for each fixed parameter if it were free.
-    errors_all
-        Errors of all coordinates considered if all of them were free.
+        Expected decrease of chi-square for each fixed parameter if it were free, by position.
     rounds, settled
         Number of rounds, and whether the physics was unchanged in the last one.
+    alternatives
+        All physics that explain the data about as well, these first, and by how much
+        chi-square with priors is larger.
     """
 
     problem: JointProblem
@@ -78,11 +85,12 @@ class Calibrated:
     chi_square_before: float
     pulls_before: Values
     chi_square: float
-    directions: list[Direction]
-    promised: dict[str, float]
-    errors_all: dict[str, float]
+    scale: float
+    information: Information
+    promised: dict[int, float]
     rounds: int
     settled: bool
+    alternatives: Sequence[tuple[JointProblem, float]] = ()
 
     @property
     def response(self) -> ElectronicsResponse:
@@ -95,11 +103,6 @@ class Calibrated:
         """Standard errors of the free coordinates."""
         n = self.problem.parameters.n_chain
         return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
-
-    @property
-    def scale(self) -> float:
-        """Factor of the errors from imperfect agreement, see `JointProblem.by_chance`."""
-        return _scale(self.problem, self.chi_square)
 
 
 @dataclass(eq=False)
@@ -145,7 +148,7 @@ class Search:
         nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._looked_at, few)
         problem = self._problem(self._chain(), nearby, self._looked_at)
         problem.few = few
-        return Information.of(problem, _jacobian(problem))
+        return self._looked(problem)[0]
 
     def run(self) -> Calibrated:
         """Search until the physics no longer changes.
@@ -200,6 +203,7 @@ class Search:
         nearby: Nearby,
         free: Sequence[int],
         *,
+        bands: Sequence[Band] | None = None,
         held: bool = False,
     ) -> JointProblem:
         """Comparison near the point at which pulses were simulated."""
@@ -208,7 +212,7 @@ class Search:
         )
         return JointProblem(
             parameters,
-            self._bands,
+            bands or self._bands,
             self._functions,
             nearby,
             self.energy_kev,
@@ -223,8 +227,8 @@ class Search:
             return list(self.free)
         problem = self._problem(response, nearby, self._first)
         problem.few = fewest(self._bands)
-        told = Information.of(problem, _jacobian(problem)).told()
-        return [self._first[i] for i in told]
+        information, selection = self._looked(problem)
+        return [self._first[i] for i in selection.begin(information, range(len(self._first)))]
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
         """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
@@ -262,17 +266,22 @@ class Search:
         return None
 
     def _needed(self, problem: JointProblem) -> int | None:
-        """Fixed parameter with the largest expected decrease of chi-square, if significant."""
+        """Fixed parameter that held-out pulses need most, if significant."""
         if self.free is not None:
             return None
-        promised = self._promised(problem)[0]
-        if not promised:
-            return None
-        best = max(promised, key=lambda i: promised[i])
-        return best if promised[best] > NEEDED else None
+        (_, selection), free = self._examined(problem)[1:], problem.parameters.free
+        falls = {
+            i: selection.score(free) - selection.score([*free, i])
+            for i in self._looked_at
+            if i not in free
+        }
+        best = max(falls, key=lambda i: falls[i], default=None)
+        return best if best is not None and falls[best] > NEEDED else None
 
-    def _promised(self, problem: JointProblem) -> tuple[dict[int, float], Information]:
-        """Expected decreases for fixed parameters, and the information on all."""
+    def _examined(
+        self, problem: JointProblem
+    ) -> tuple[dict[int, float], Information, Selection]:
+        """Expected decreases of chi-square for fixed parameters, and about all of them."""
         parameters = problem.parameters
         fixed = [i for i in self._looked_at if i not in parameters.free]
         missing = problem.nearby.unknown(fixed)
@@ -282,14 +291,66 @@ class Search:
         whole = self._problem(parameters.chain.response, problem.nearby, self._looked_at)
         whole.few = few
         whole.parameters.coordinates = parameters.coordinates.copy()
-        jacobian = _jacobian(whole)
-        n, where = parameters.n_chain, whole.parameters.free
-        free = [*range(n), *(n + where.index(i) for i in parameters.free)]
-        residuals = whole.residuals(whole.parameters.vector())
-        found = promises(jacobian, residuals, free)
-        return {where[i - n]: fall for i, fall in found.items()}, Information.of(
-            whole, jacobian
+        information, selection = self._looked(whole)
+        free = parameters.free
+        here = selection.cost(free)[0]
+        falls = {i: here - selection.cost([*free, i])[0] for i in fixed}
+        return falls, information, selection
+
+    def _looked(self, problem: JointProblem) -> tuple[Information, Selection]:
+        """What all pulses, and each half of them, tell of the free parameters."""
+        parameters, vector = problem.parameters, problem.parameters.vector()
+        residuals = problem.residuals(vector)
+        jacobian = problem.jacobian(vector, residuals)
+        halves = []
+        for k in range(2):
+            half = self._problem(
+                parameters.chain.response,
+                problem.nearby,
+                parameters.free,
+                bands=[_half(band, k) for band in self._bands],
+                held=True,  # with the weights of all, and all of its pulses
+            )
+            half.few = None
+            half.weigh_like(problem)
+            half.parameters.coordinates = parameters.coordinates.copy()
+            halves.append(half.residuals(vector)[: problem.moments])
+        selection = Selection(
+            jacobian, residuals, np.array(halves), parameters.coordinates[parameters.free]
         )
+        return Information.of(problem, jacobian), selection
+
+    def _alternatives(
+        self, problem: JointProblem, selection: Selection
+    ) -> list[tuple[JointProblem, Minimum]]:
+        """Fits of other sets of parameters that may explain the pulses as well."""
+        if self.free is not None:
+            return []
+        free = problem.parameters.free
+        here, _ = selection.cost(free)
+        forecast = [(*selection.cost(other), other) for other in selection.others(free)]
+        forecast.sort(key=lambda one: one[0])
+        found = []
+        for cost, there, other in forecast[:MAX_OTHERS]:
+            if cost - here > LIKELY:
+                break
+            kept = np.isin(np.arange(self._n), other)
+            fit, nearby = problem, problem.nearby
+            try:
+                for _ in range(OTHER_ROUNDS):
+                    move = np.where(kept, there, 0) - nearby.centre
+                    nearby = self._moved(nearby, move, other)
+                    fit = self._problem(fit.parameters.chain.response, nearby, other)
+                    fit.weigh_like(problem)
+                    minimum = levenberg_marquardt(fit, STEPS, None)
+                    there = fit.parameters.coordinates
+                    if _settled(fit, minimum, there - nearby.centre):
+                        break
+            except CpunetError:  # these physics cannot be simulated
+                continue
+            if not there[~kept].any():  # all that is not free is as simulated
+                found.append((fit, minimum))
+        return found
 
     def _ended(
         self,
@@ -300,29 +361,32 @@ class Search:
         *,
         settled: bool,
     ) -> Calibrated:
+        promised, information, selection = self._examined(problem)
+        fits = [(problem, found), *self._alternatives(problem, selection)]
+        best = min(fits, key=lambda fit: fit[1].cost)
+        if best[1].cost < found.cost - NEEDED:
+            problem, found = best
+            promised, information, _ = self._examined(problem)
         before.weigh_like(problem)
         vector = before.parameters.vector()
-        promised, information = self._promised(problem)
-        nuisances = self.simulator.physics.nuisances
         chi_square = problem.chi_square(problem.parameters.vector())
-        scale = _scale(problem, chi_square)
+        mean, spread = problem.by_chance
+        # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
+        scale = float(np.sqrt(max(1.0, chi_square / (mean + 2 * spread))))
+        rises = [(fit, minimum.cost - found.cost) for fit, minimum in fits]
+        rises.sort(key=lambda one: (one[0] is not problem, one[1]))
         return Calibrated(
             problem=problem,
             covariance=scale**2 * found.covariance,
             chi_square_before=before.chi_square(vector),
             pulls_before=before.pulls(vector),
             chi_square=chi_square,
-            directions=information.directions(),
-            errors_all=dict(
-                zip(
-                    (nuisance.name for nuisance in information.nuisances),
-                    (scale * information.errors()).tolist(),
-                    strict=True,
-                )
-            ),
-            promised={nuisances[i].name: fall for i, fall in promised.items()},
+            scale=scale,
+            information=information,
+            promised=promised,
             rounds=rounds,
             settled=settled,
+            alternatives=[one for one in rises if one[1] < SAME],
         )
 
     def _tell(self, when: str, problem: JointProblem, found: Minimum | None = None) -> None:
@@ -340,15 +404,11 @@ class Search:
         log.info(", ".join(told))
 
 
-def _scale(problem: JointProblem, chi_square: float) -> float:
-    """Scale errors by the root of chi-square over its upper limit by chance (two sigmas)."""
-    mean, spread = problem.by_chance
-    return float(np.sqrt(max(1.0, chi_square / (mean + 2 * spread))))
-
-
-def _jacobian(problem: JointProblem) -> Values:
-    vector = problem.parameters.vector()
-    return problem.jacobian(vector, problem.residuals(vector))
+def _half(band: Band, k: int) -> Band:
+    """Every second pulse of both sides, beginning with the first or the second."""
+    some = slice(k, None, 2)
+    moments = replace(band.moments, data=band.moments.data[some])
+    return replace(band, sim=replace(band.sim.of(some), moments=moments), rows=band.rows[some])
 
 
 def _relaxed(moved: Values, last: Values) -> Values:
