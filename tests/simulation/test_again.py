@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from cpunet.simulation import again
 from cpunet.simulation.again import SameHits
-from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector
@@ -80,13 +79,12 @@ def test_it_is_a_new_simulation_from_one_solution(
     assert len(solved) == 1
 
 
-def test_another_lithium_layer_merges_the_hits_anew(hits: Hits) -> None:
+def test_another_lithium_layer_is_solved_anew(hits: Hits) -> None:
     thick, settings = changed(li_thickness=3.0)
-    same = SameHits(hits, cluster_mm=5.0)
+    same = SameHits(hits)
     lost = []
     for detector in (DETECTOR, thick):
-        merged = merge_hits(hits, detector, 5.0)
-        new = simulate_events(compute_fields(detector), merged, settings)
+        new = simulate_events(compute_fields(detector), hits, settings)
         old = same.simulate(detector, settings)
         np.testing.assert_array_equal(old.waveforms, new.waveforms)
         np.testing.assert_array_equal(old.lost_kev, new.lost_kev)

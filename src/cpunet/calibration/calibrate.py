@@ -183,7 +183,9 @@ class _Job:
         clock, started = time.perf_counter(), datetime.now(UTC)
         sides = self._sides()
         with stage("Calibrating") as bar:
-            calibrated = self._search(sides, bar.update).run()
+            search = self._search(sides, bar.update)
+            bar.total = search.simulations
+            calibrated = search.run()
         self._require_hope(calibrated, sides)
         content = self._content(calibrated, sides)
         if len(calibrated.alternatives) > 1:
@@ -219,6 +221,7 @@ class _Job:
         sides = self._sides()
         with stage("Planning") as bar:
             search = self._search(sides, bar.update)
+            bar.total = 2 + 2 * len(search.simulator.physics.nuisances)
             information = search.plan()
         directions = {
             str(n): [found.describe() for found in information.for_pulses(n / 2).directions()]

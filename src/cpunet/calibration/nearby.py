@@ -50,24 +50,21 @@ class Simulator:
         self, hits: Hits, physics: Physics, simulated: Callable[[], None] = lambda: None
     ) -> None:
         self.physics, self._simulated = physics, simulated
-        self._hits = hits
-        self._parts: dict[int | None, SameHits] = {None: SameHits(hits)}
+        self._same = SameHits(hits)
         self._finer = _finer(physics.settings)
 
     def exact(self, coordinates: Values) -> FloatArray:
         """Pulses as `cpunet simulate` produces them, shape (events, samples)."""
         detector, settings = self.physics.at(coordinates)
-        events = self._parts[None].simulate(detector, settings)
+        events = self._same.simulate(detector, settings)
         self._simulated()
         return events.waveforms
 
     def quick(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Finely sampled pulses of the first `most` events, for differences."""
-        if most not in self._parts:
-            self._parts[most] = SameHits(self._hits[:most])
         detector, settings = self.physics.at(coordinates)
         fine = settings.model_copy(update={"dt_ns": settings.dt_ns / self._finer})
-        events = self._parts[most].simulate(detector, fine, mode="quick")
+        events = self._same.simulate(detector, fine, mode="quick", most=most)
         self._simulated()
         return events.waveforms
 

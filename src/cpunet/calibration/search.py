@@ -49,6 +49,7 @@ LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
 # Other chains, and the round in which each is first tried: no physics can replace the ringing
 # of a readout, but early decays are visible only when the physics are about right.
 OTHER_CHAINS: dict[OtherChain, int] = {ringing_chain: 1, decaying_chain: 2}
+USUAL_ROUNDS = 4  # of most searches, for the remaining time
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
 
@@ -181,6 +182,14 @@ class Search:
             last = _relaxed(moved, last)
             nearby = self._moved(nearby, last, free)
         return self._ended(problem, found, before, number, settled=settled)
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations of a usual search, in which derivatives take two each.
+
+        They are of the first parameters, and once more of those that are free, or of the rest.
+        """
+        return USUAL_ROUNDS + 3 + 2 * (len(self._first) + self._n)
 
     @property
     def _n(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import superposed_fields
 from cpunet.simulation.geometry import Detector
@@ -12,8 +11,8 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import NOT_IN_PARTS, Superposition, solve
 
-# For quick pulses. Merging within 0.2 mm changes the effect of self-repulsion by 15 %.
-_QUICK_MERGING_MM, _QUICK_STRIDE = 0.1, 4
+# Maximum number of time steps that a drift step of quick pulses replaces.
+_QUICK_STRIDE = 5
 # Maximum number of detector shapes (such as lithium thicknesses) whose potentials are kept.
 _MAX_SHAPES = 4
 
@@ -23,17 +22,12 @@ class SameHits:
 
     Another temperature, bias, velocity, cloud or trapping, or another scale or tilt of the
     impurities, needs no new solution of the fields. Another shape of the active germanium,
-    such as another ``li_thickness``, needs one (seconds, then cached) and merges the hits
-    anew.
+    such as another ``li_thickness``, needs one (seconds, then cached).
 
     Parameters
     ----------
     hits
-        Events in the frame of the crystal, merged or not.
-    cluster_mm
-        Distance in mm within which hits are merged, see
-        `cpunet.simulation.clustering.merge_hits`. 0 for hits that are merged already, such as
-        those stored with simulated pulses.
+        Merged events in the frame of the crystal.
 
     Examples
     --------
@@ -48,9 +42,9 @@ class SameHits:
     True
     """
 
-    def __init__(self, hits: Hits, *, cluster_mm: float = 0.0) -> None:
-        self._hits, self._cluster_mm = hits, cluster_mm
-        self._shapes: dict[str, tuple[Superposition, Hits, Hits, float]] = {}
+    def __init__(self, hits: Hits) -> None:
+        self._hits = hits
+        self._solutions: dict[str, Superposition] = {}
 
     def simulate(
         self,
@@ -58,6 +52,7 @@ class SameHits:
         settings: SimulationSettings,
         *,
         mode: Literal["exact", "quick", "library"] = "exact",
+        most: int | None = None,
     ) -> EventPulses:
         """Pulses of the events with the physics of `detector` and `settings`.
 
@@ -66,46 +61,38 @@ class SameHits:
         detector, settings
             Detector and simulation settings.
         mode
-            ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` merges more hits
-            and takes longer steps, for differences between two sets of physics: its errors
-            are nearly equal in both. See docs/simulation.md for accuracy and speed.
+            ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` takes longer
+            steps, for differences between two sets of physics: its errors are nearly equal in
+            both. See docs/simulation.md for accuracy and speed.
+        most
+            Number of first events to simulate; None for all.
 
         Raises
         ------
         CpunetError
             If the detector is not depleted, or a hit is not finite.
         """
-        solution, hits, fewer, repelling = self._of(detector)
         fields = superposed_fields(
-            solution,
+            self._solution(detector),
             bias_V=detector.bias_V,
             impurity_scale=detector.impurity_scale,
             impurity_tilt=detector.impurity_tilt_1e10_per_cm4,
             temperature_K=detector.temperature_K,
             depletion=False,
         )
-        if mode == "quick":
-            longer = {
-                "stride": max(_QUICK_STRIDE, settings.stride),
-                "self_repulsion": repelling * settings.self_repulsion,
-            }
-            return simulate_events(fields, fewer, settings.model_copy(update=longer))
-        return simulate_events(fields, hits, settings, mode)
+        hits = self._hits[:most]
+        if mode != "quick":
+            return simulate_events(fields, hits, settings, mode)
+        steps = settings.steps_per_sample
+        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
+        return simulate_events(fields, hits, settings, stride=stride)
 
-    def _of(self, detector: Detector) -> tuple[Superposition, Hits, Hits, float]:
-        """Potentials of a detector, its hits, and its hits merged more coarsely.
-
-        Coarser hits repel themselves more strongly. The last value is the factor that
-        compensates for this on average.
-        """
+    def _solution(self, detector: Detector) -> Superposition:
+        """Potentials of a detector."""
         key = detector.fingerprint(exclude=NOT_IN_PARTS)
-        if key not in self._shapes:
-            distance = self._cluster_mm
-            fine = merge_hits(self._hits, detector, distance)
-            coarse = merge_hits(fine, detector, max(_QUICK_MERGING_MM, distance))
-            if len(self._shapes) == _MAX_SHAPES:
+        if key not in self._solutions:
+            if len(self._solutions) == _MAX_SHAPES:
                 # keep the first, with which all others are compared
-                del self._shapes[list(self._shapes)[1]]
-            repelling = (fine.edep_kev**2).sum() / max((coarse.edep_kev**2).sum(), 1e-9)
-            self._shapes[key] = solve(detector), fine, coarse, float(repelling)
-        return self._shapes[key]
+                del self._solutions[list(self._solutions)[1]]
+            self._solutions[key] = solve(detector)
+        return self._solutions[key]

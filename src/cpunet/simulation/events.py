@@ -81,6 +81,7 @@ def simulate_events(
     settings: SimulationSettings,
     mode: Literal["exact", "library"] = "exact",
     library: Library | None = None,
+    stride: int = 1,
 ) -> EventPulses:
     r"""Simulate the pulse of each event, in parallel over the events.
 
@@ -103,6 +104,8 @@ def simulate_events(
         and drifts only the hits where these are not accurate enough.
     library
         Pre-computed pulses for the same fields and settings; built if None.
+    stride
+        Number of time steps that a step of the drift replaces, a divisor of those per sample.
 
     Raises
     ------
@@ -119,7 +122,7 @@ def simulate_events(
     waveforms = np.zeros((n, settings.n_samples), np.float32)
     lost_kev, trapped_kev = np.zeros(n), np.zeros(n)
     outcome = np.zeros(len(table), np.int8)
-    task = drift_task(fields, settings)
+    task = drift_task(fields, settings, stride)
     for begin in range(0, n, _BLOCK):
         end = min(begin + _BLOCK, n)
         part = slice(begin, end)

@@ -71,10 +71,10 @@ def build_library(fields: Maps, settings: SimulationSettings) -> Library:
 
 
 def _task(fields: Maps, settings: SimulationSettings) -> Task:
-    """Single steps, and no jumps from place to place, which could not be interpolated."""
+    """No jumps from place to place, which could not be interpolated."""
     task = drift_task(fields, settings)
     rounding = EXACT if task.rounding == EXACT else WHOLE_ON_AVERAGE
-    return task._replace(stride=1, rounding=rounding)
+    return task._replace(rounding=rounding)
 
 
 def _empty(fields: Maps, settings: SimulationSettings) -> Library:

@@ -24,8 +24,6 @@ class SimulationSettings(Config):
     ----------
     step_ns
         Time step of the pulses and of the drift in ns.
-    stride
-        Number of time steps per drift step. The pulse is interpolated in between.
     dt_ns
         Sampling period of the pulses in ns. Each sample is the mean over its time steps.
     length_ns
@@ -79,7 +77,6 @@ class SimulationSettings(Config):
     switches = ("self_repulsion",)
 
     step_ns: _Nanoseconds = 1.0
-    stride: Annotated[int, Field(ge=1, le=16)] = 1
     dt_ns: _Nanoseconds = 16.0
     length_ns: Annotated[float, Field(gt=0, le=1e7)] = 3600.0
     diffusion: bool = True

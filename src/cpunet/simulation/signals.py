@@ -34,8 +34,8 @@ class Task(NamedTuple):
 
     The cloud starts with a FWHM of `cloud_fwhm_mm`; see `cpunet.simulation.cloud` for
     `diffusion` and `repulsion_per_kev`. `rounding` of its duration is `EXACT`, `WHOLE` or
-    `WHOLE_ON_AVERAGE`. `stride` and `per_sample` are the numbers of time steps per step of the
-    drift and per sample.
+    `WHOLE_ON_AVERAGE`. A step of the drift lasts `step_ns` and replaces `stride` time steps;
+    `per_sample` is the number of steps of the drift per sample.
     """
 
     cloud_fwhm_mm: float
@@ -171,8 +171,11 @@ def hit_table(
     return table
 
 
-def drift_task(fields: Maps, settings: SimulationSettings) -> Task:
-    """Parameters of the compiled loops for some settings."""
+def drift_task(fields: Maps, settings: SimulationSettings, stride: int = 1) -> Task:
+    """Parameters of the compiled loops for some settings.
+
+    A drift step replaces `stride` time steps, a divisor of their number per sample.
+    """
     constant = diffusion_constant(settings.diffusion_constant, fields.temperature_K)
     growing = settings.diffusion or settings.self_repulsion > 0
     return Task(
@@ -180,9 +183,9 @@ def drift_task(fields: Maps, settings: SimulationSettings) -> Task:
         diffusion=constant if settings.diffusion else 0.0,
         repulsion_per_kev=repulsion_constant(1.0) * settings.self_repulsion,
         rounding=WHOLE if settings.diffusion_constant == "siggen" else EXACT,
-        step_ns=settings.step_ns,
-        stride=settings.stride,
-        per_sample=settings.steps_per_sample,
+        step_ns=stride * settings.step_ns,
+        stride=stride,
+        per_sample=settings.steps_per_sample // stride,
         n_samples=settings.n_samples,
     )
 
@@ -196,27 +199,23 @@ def point_signal(
     Returns the last step, whether all charge is collected, the FWHM in steps of the smearing
     by the cloud, and the fraction trapped.
     """
-    stride = task.stride
-    record = signal if stride == 1 else np.empty(len(signal) // stride + 2)
-    record[:] = 0.0
-    long_ns = stride * task.step_ns
+    signal[:] = 0.0
     start = (hit[0], hit[1], hit[2])
     nowhere = np.empty((0, 3))
     point = (0.0, 0.0, 0.0)
     growing = (task.cloud_fwhm_mm, task.diffusion, task.repulsion_per_kev * hit[3])
     steps_e, arrived_e, _, _, trapped_e = drift(
-        maps, ELECTRON, start, long_ns, stride, point, record, nowhere
+        maps, ELECTRON, start, task.step_ns, task.stride, point, signal, nowhere
     )
     steps_h, arrived_h, size, speed, trapped_h = drift(
-        maps, HOLE, start, long_ns, stride, growing, record, nowhere
+        maps, HOLE, start, task.step_ns, task.stride, growing, signal, nowhere
     )
     fwhm = cloud_steps(size, speed, task)
-    if stride > 1:
-        for i in range(len(signal)):
-            k = i // stride
-            part = (i - k * stride) / stride
-            signal[i] = record[k] + part * (record[k + 1] - record[k])
-    last = stride * max(steps_e, steps_h)
+    if task.stride > 1:  # means over the time steps that a step of the drift replaces
+        later = (task.stride - 1) / (2 * task.stride)
+        for i in range(len(signal) - 1):
+            signal[i] += later * (signal[i + 1] - signal[i])
+    last = max(steps_e, steps_h)
     return last, arrived_e and arrived_h, fwhm, trapped_e + trapped_h
 
 

@@ -96,6 +96,8 @@ def levenberg_marquardt(
         cost = float(residuals @ residuals)
         jacobian, updates = problem.jacobian(vector, residuals), 0
         for _ in range(max(1, most)):
+            if not updates and _promised(jacobian, residuals) < CONVERGED:
+                break
             step = _step(problem, jacobian, vector, residuals, damping)
             if step is None and updates:
                 # the derivatives may be outdated
@@ -126,11 +128,17 @@ def levenberg_marquardt(
             "the fit of the response diverged; check that the sets hold single pulses of one "
             "detector (cpunet info), or train on other energies (`peak`)"
         )
-    # the last derivatives may be those before the last step, which can be a long one
-    jacobian = problem.jacobian(vector, residuals)
+    if updates:  # the last derivatives may be those before a long step
+        jacobian = problem.jacobian(vector, residuals)
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
     return Minimum(cost, covariance)
+
+
+def _promised(jacobian: Values, residuals: Values) -> float:
+    """Fall of chi-square in a full step if the residuals were linear."""
+    gradient = jacobian.T @ residuals
+    return float(gradient @ np.linalg.lstsq(jacobian.T @ jacobian, gradient)[0])
 
 
 def _step(
