@@ -144,10 +144,11 @@ def _search(
     recipe = load_recipe("fast")
     selection = parse_selection("2000-2700", recipe.peaks)
     sim = load_pulses(stand.sim, "simulated", recipe, selection).prepared
-    data = load_pulses(stand.data, "measured", recipe, selection).prepared
+    measured = load_pulses(stand.data, "measured", recipe, selection)
+    data = measured.prepared
     for side in (sim, data):  # the line is calibrated to its energy, whatever is trapped
         side.pulses.energy_kev[:] = LINE_KEV
-    noise, _ = measured_noise(data, recipe.preparation)
+    noise, _ = measured_noise(measured, recipe.preparation)
     stored = StoredSimulation.read(stand.sim.path)
     physics = Physics(stored.detector, stored.settings, before.nuisances)
     truth = [
