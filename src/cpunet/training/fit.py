@@ -23,8 +23,9 @@ from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.pulse_sets import SINGLE, Continuum
 from cpunet.training.response_fit import Fit, fit_response
-from cpunet.training.response_starts import with_drift_terms
+from cpunet.training.response_starts import DRIFT, with_drift_terms
 from cpunet.training.run import FitInfo, Run
 
 log = logging.getLogger(__name__)
@@ -34,13 +35,15 @@ log = logging.getLogger(__name__)
 class Sides:
     """Prepared pulses of both sides, the file of the measured ones, and its prepared set.
 
-    Without `data_set`, remains of earlier pulses are not looked for.
+    Without `data_set`, remains of earlier pulses are not looked for.  `continuum` reads
+    the pulses of both sides away from all lines.
     """
 
     sim: Pulses
     data: Pulses
     data_file: PulseFile
     data_set: InputSet | None = None
+    continuum: Continuum | None = None
 
 
 def known_response(run: Run, like: Recipe) -> Readout:
@@ -103,9 +106,12 @@ class Matched(NamedTuple):
             log.info(f"fit: {fit.verdict}")
         if fit.drift is not None:
             log.info(str(fit.drift))
+        for part, gain in fit.gains.items():
+            if part != DRIFT[1] or "drift_stretch" not in info.parameters:
+                log.info(f"{part}: {gain}")
         for number, cause in enumerate(info.causes, 1):
             log.info(f"  {number}. {cause}")
-        for found in beyond(info.parameters) + stretched(info.parameters):
+        for found in beyond(info.parameters) + stretched(info.parameters, fit.gains):
             log.warning(found)
 
 
@@ -150,6 +156,8 @@ def match(
         "listener": listen,
     }
     fitted = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
+    if fitted is fit_response:
+        given["continuum"] = sides.continuum
     response, fit = fitted(sides.sim, sides.data, noise, recipe, **given)
     told = _described(fit, response, noise, sides)
     if told_of_remains is not None:
@@ -169,15 +177,16 @@ def _described(
 ) -> dict[str, Any]:
     """Content of `FitInfo`, without remains."""
     parameters = response.describe()
+    counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     return {
         "parameters": parameters,
         **asdict(fit),
         "drift": fit.drift and {"verdict": str(fit.drift), **asdict(fit.drift)},
-        "verdict": "; ".join([fit.verdict, *stretched(parameters)]),
+        "verdict": "; ".join([fit.verdict, *stretched(parameters, fit.gains)]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
-            "sim": len(sides.sim) - sum(n for n, _ in fit.bands.values()),
-            "data": len(sides.data) - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
+            "sim": len(sides.sim) - sum(n for n, _ in counts),
+            "data": len(sides.data) - sum(m for _, m in counts) - fit.data_left_out,
         },
         "noise": {
             "baselines": noise.n_baselines,

@@ -14,6 +14,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.devices import peak_memory_mb
 from cpunet.training.fit import Sides
+from cpunet.training.pulse_sets import Continuum
 from cpunet.training.run import Run, versions
 
 
@@ -33,6 +34,8 @@ class TrainingJob:
         Run to start from.
     resume
         Whether a training of networks is to be resumed.
+    continuum
+        Reads the pulses of both sides away from all lines.
     """
 
     recipe: Recipe
@@ -45,13 +48,13 @@ class TrainingJob:
     folder: Path
     init: Run | None = None
     resume: bool = False
+    continuum: Continuum | None = None
 
     @property
     def sides(self) -> Sides:
         """Pulses of both sides."""
-        return Sides(
-            self.sim.prepared.pulses, self.data.prepared.pulses, self.data_file, self.data
-        )
+        sim, data = self.sim.prepared.pulses, self.data.prepared.pulses
+        return Sides(sim, data, self.data_file, self.data, self.continuum)
 
     def run(
         self, model: nn.Module, recipe: Recipe, started: str, seconds: float, **more: Any

@@ -80,6 +80,7 @@ class FitInfo(Part):
     errors: dict[str, float] = {}
     covariance: list[list[float]] = []
     pulls: dict[str, float] = {}
+    gains: dict[str, str] = {}
     noise: dict[str, float] = {}
     in_no_band: dict[str, int] = {}
     remains: RemainsInfo | None = None

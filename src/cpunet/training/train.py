@@ -6,6 +6,7 @@ import logging
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,12 +18,13 @@ from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
 from cpunet.outputs import folder_written_aside, refuse_inputs
 from cpunet.pulses.channels import ALL, Outcome, Pair, one_by_one, own_folder, paired
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     load_pulses,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -31,7 +33,9 @@ from cpunet.training.chain import train_chain
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.checkpoints import unfinished_folder, unfinished_name
 from cpunet.training.devices import resolve_device
+from cpunet.training.energy_bands import continuum
 from cpunet.training.job import TrainingJob
+from cpunet.training.moments import MIN_N
 from cpunet.training.networks import train_networks
 from cpunet.training.run import INFO, RUN, Run, RunLike, as_run, read_losses
 
@@ -192,12 +196,23 @@ def _job(
     for finding in compare_sides(sim, data, selection):
         if finding.level != Level.FINE:
             log.warning(finding)
+    away, beside = continuum(recipe), None
+    enough = min(int(away.select(side.energies_kev).sum()) for side in (sim, data)) >= MIN_N
+    if enough and not selection.ranges_kev:
+        beside = partial(_continuum, pair, recipe, away)
     if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
         kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
         raise CpunetError(f"{init.name}: {kinds}; resample them")
     return TrainingJob(
-        recipe, peak, seed, device, sim, data, pair[1], Path(folder), init, resume
+        recipe, peak, seed, device, sim, data, pair[1], Path(folder), init, resume, beside
     )
+
+
+def _continuum(pair: Pair, recipe: Recipe, away: EnergySelection) -> tuple[Pulses, Pulses]:
+    """Pulses of both sides away from all lines, read when a fit needs them."""
+    sim = load_pulses(pair[0], "simulated", recipe, away, tell=False)
+    data = load_pulses(pair[1], "measured", recipe, away, tell=False)
+    return sim.prepared.pulses, data.prepared.pulses
 
 
 def _trained(job: TrainingJob, out: Path | None) -> Run:
