@@ -22,7 +22,6 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from cpunet.errors import CpunetError
-from cpunet.kernels import use_threads
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -61,7 +60,7 @@ def outcomes(
     if (jobs := min(jobs, len(tasks))) > 1:
         yield from _in_processes(make, tasks, jobs, once)
         return
-    import torch  # imported late: seconds
+    import torch  # imported late, too
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -123,6 +122,8 @@ def _begin(make: Callable[[], Callable[[Any], Any]]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    from cpunet.kernels import use_threads  # imported late: numba takes a second
+
     use_threads(1)
     global _do
     _do = make()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,6 @@ import torch
 from cpunet.networks.learned_response import StepResponse
 from cpunet.recipes import load_recipe
 from cpunet.training.differentiable import DifferentiableReadings, DifferentiableSet
-from cpunet.training.drift_training import _chosen, _HeldOut, _split
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.pulse_sets import PulseSets
@@ -152,32 +149,3 @@ def test_the_unet_makes_up_for_a_drift_simulated_too_short():
     alone = load_recipe("cpunet", ["training.noise_sets=2", "training.drift_terms=0"])
     _, fit = fit_learned(short, true.data, true.noise, alone, seed=0)
     assert fit.drift is None
-
-
-def test_what_is_held_out_is_in_no_fit(band):
-    """Not in those with wide bins either."""
-    known, held = _split(band, np.random.default_rng(0))
-    wide = known.with_wider_bins(0.2)
-    assert not set(held.rows) & set(wide.rows)
-    assert len(held.rows) + len(wide.rows) == len(band.rows)
-    assert len(wide.moments.values) == len(known.moments.values)
-    assert (wide.moments.amplitude_widths >= 0.2).all()
-    np.testing.assert_array_equal(wide.sim.sim, known.sim.sim)
-
-
-@pytest.mark.parametrize(("gain", "share"), [(0.0, 0), (0.02, 0), (0.5, 2)])
-def test_only_what_held_out_pulses_gain_is_kept(gain, share):
-    """Of two distances, one of them nearer to the data by `gain` of a standard deviation."""
-    rng = np.random.default_rng(0)
-    data, sim = rng.normal(size=(200, 3)), rng.normal(size=(200, 3))
-    of = SimpleNamespace(whiten=np.eye(3), sigma=np.full(3, 200**-0.5))
-    held = []
-    for part in (1.0, 0.5, 0.0):
-        one = object.__new__(_HeldOut)
-        sides = ((values, np.ones(200)) for values in (sim + part * gain, data))
-        one.sides, one.comparisons, one.scales = [tuple(sides)], [of], [1.0]
-        held.append(one)
-    found, mismatch, errors = _chosen(held, seed=0)
-    assert found == share
-    assert errors[0] == 0
-    assert len(mismatch) == 3

@@ -598,7 +598,7 @@ def piled(out):
     ]
 
 
-def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
+def test_piled_up_pulses_are_within_raw_traces_and_told(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     options = {"adc": True, "scale": ADC, "seed": 3, "realisations": 5}
     translate(busy, source, tmp_path / "none.lh5", **options)
@@ -609,7 +609,7 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
     assert 0 < (count > 0).sum() < 5 * N
     assert np.array_equal(np.isnan(kev), count == 0)
     clean, more = (values(tmp_path / f"{name}.lh5").astype(float) for name in ("none", "some"))
-    # away from the pulse, the trace rises by the second pulse's energy where it is said
+    # away from the pulse, the trace rises by the piled-up pulse's energy where it is said
     single = (count == 1) & (np.abs(after_ns) > 1500) & (np.abs(after_ns) < 7000)
     assert single.sum() >= 3
     for row in np.flatnonzero(single):
@@ -620,7 +620,7 @@ def test_second_pulses_are_within_raw_traces_and_told(busy, tmp_path):
         assert added[at + 5 : at + 15].mean() == pytest.approx(wanted, rel=0.1, abs=40)
 
 
-def test_second_pulses_are_within_windows(busy, tmp_path):
+def test_piled_up_pulses_are_within_windows(busy, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     out, options = tmp_path / "some.lh5", {"seed": 3, "realisations": 10}
     translate(busy, source, out, pile_up_khz=20, **options)
@@ -628,7 +628,7 @@ def test_second_pulses_are_within_windows(busy, tmp_path):
     assert len(count) == 10 * N
     # 20 kHz for a record of 1,400 samples of 16 ns
     assert count.mean() == pytest.approx(0.448, abs=0.1)
-    # baselines are flat but behind a second pulse, or on its edge
+    # baselines are flat but behind a piled-up pulse, or on its edge
     tilt = np.abs(values(out)[:, :50].mean(axis=1) - values(out)[:, 100:150].mean(axis=1))
     assert tilt[count == 0].max() < 0.03
     inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)

@@ -21,7 +21,7 @@ from cpunet.simulation.hits import Hits
 # Besides the lines, what most measurements of thorium have much of.
 CONTINUUM = "1000-1500"
 # Events of a line for a prediction, at least and at most.
-LEAST, MOST = 100, 500
+LEAST, MAX_PULSES = 100, 500
 # Difference of two predictions, in its error with the events simulated, that tells them apart.
 DECIDES = 3.0
 # Fraction of the charge with which the drift ends; on a flat top rounding finds the maximum.
@@ -69,7 +69,7 @@ def side_by_side(
         rows = np.flatnonzero(free & parse_selection(line, recipe.peaks).select(energy_kev))
         if len(rows) < LEAST:
             continue
-        some = rows[:MOST]
+        some = rows[:MAX_PULSES]
         of = [_numbers(one, hits[some], energy_kev[some], recipe) for one, _ in fits]
         apart[line] = 0.0
         for name in _NUMBERS:

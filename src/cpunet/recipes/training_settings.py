@@ -88,9 +88,10 @@ class MatchingConfig(Config):
     response's poles times the next of ``start_factors``; the best of all is kept.  If it is
     still poor, a ringing at one of ``ringing_mhz`` is tried.  If pulses begin differently than
     simulated, up to ``drift_terms`` parameters that stretch the drift are tried first.
-    Finally, all pulses are compared with ``noise_sets`` draws of the noise each, optimally
-    weighted (unless the drift was stretched), with the components in ``conditional_bins`` of
-    the current amplitude.
+    Each of these is kept if held-out pulses gain.  Finally, all pulses are compared with
+    ``noise_sets`` draws of the noise each, optimally weighted with the components in
+    ``conditional_bins`` of the current amplitude; or, if the drift was stretched, by their
+    moments and by the single sites of the continuum.
     """
 
     method: Literal["matching"]

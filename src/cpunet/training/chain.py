@@ -30,7 +30,7 @@ def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
             bar.update(1)
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
-        found = match(job.sim, job.data, job.recipe, job.seed, listen, known)
+        found = match(job.sim, job.data, job.recipe, job.seed, listen, known, job.continuum)
     found.log()
     seconds = time.perf_counter() - clock
     began = started.isoformat(timespec="seconds")

@@ -158,7 +158,8 @@ def _told(found: _Response) -> dict[str, Any]:
 def _doubts(found: _Response) -> list[str]:
     """Reasons why the numbers of a run do not describe a readout alone."""
     fit = found.run.fit
-    doubts = beyond(found.parameters) + stretched(found.parameters)
+    gains = {} if fit is None else fit.gains
+    doubts = beyond(found.parameters) + stretched(found.parameters, gains)
     if fit is not None and fit.causes:
         doubts.insert(
             0,

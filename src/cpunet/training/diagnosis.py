@@ -143,18 +143,21 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
     return []
 
 
-def stretched(parameters: Mapping[str, float]) -> list[str]:
-    """Say in words that the simulated drift was stretched, if it was.
+def stretched(parameters: Mapping[str, float], gains: Mapping[str, str] = {}) -> list[str]:
+    """Say in words that the simulated drift was stretched, if it was, and what that may mean.
 
     Parameters
     ----------
     parameters
         Parameters from `ElectronicsResponse.describe`.
+    gains
+        What held-out pulses say of each part that was tried.
 
     Examples
     --------
-    >>> stretched({"drift_stretch": 0.052})
-    ['charges drift for 5.2 % longer than simulated; cpunet calibrate finds out why']
+    >>> print(stretched({"drift_stretch": 0.052})[0])
+    charges drift for 5.2 % longer than simulated, as in a warmer detector, at a lower bias or \
+with other impurities: cpunet calibrate tells which
     """
     stretch = parameters.get("drift_stretch")
     if stretch is None:
@@ -163,7 +166,12 @@ def stretched(parameters: Mapping[str, float]) -> list[str]:
     size = f"charges drift for {_longer(stretch + change)} than simulated"
     if change:
         size += f" in the last microsecond, {_longer(stretch)} near its end"
-    return [f"{size}; cpunet calibrate finds out why"]
+    if (gain := gains.get("a stretch of the drift", "").partition("; ")[2]) != "":
+        size += f" ({gain})"
+    cause = (
+        "warmer detector, at a lower bias" if stretch > 0 else "colder one, at a higher bias"
+    )
+    return [f"{size}, as in a {cause} or with other impurities: cpunet calibrate tells which"]
 
 
 def _longer(stretch: float) -> str:

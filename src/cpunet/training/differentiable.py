@@ -20,7 +20,7 @@ from torch import Tensor
 
 from cpunet.networks.learned_response import StepResponse
 from cpunet.networks.linear_inverse import stretch
-from cpunet.networks.response_layer import PADDING_AFTER, padded_length
+from cpunet.networks.response_layer import PADDING_AFTER, Readout, padded_length
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.training.moments import Moments
 from cpunet.training.translated import PLATEAU, Translated
@@ -92,11 +92,13 @@ class DifferentiableReadings:
 
     def functions(self, linear: Tensor, amplitude: Tensor, clip: float | None = None) -> Tensor:
         """Functions of each pulse as `Moments.functions`, shape (pulses, moments)."""
+        density = _density(amplitude, self.bins, self.bin_widths)
+        if self.moments.balance is not None:
+            return density @ torch.from_numpy(self.moments.balance).float()
         config, limit = self.config, clip or self.config.clip
         linear = linear.clamp(-limit, limit)
         first = len(config.segments) - 1
         squared = torch.cat([linear[:, first : first + config.squares], linear[:, -1:]], dim=1)
-        density = _density(amplitude, self.bins, self.bin_widths)
         return torch.cat([linear, squared.square(), density], dim=1)
 
     def conditional(self, centres: Tensor, widths: Tensor) -> Functions:
@@ -192,7 +194,7 @@ class DifferentiableSet:
         return records * (self.sim.moments.preparation.tail_level / plateau)
 
     @torch.no_grad()
-    def values(self, response: StepResponse) -> npt.NDArray[np.float64]:
+    def values(self, response: Readout) -> npt.NDArray[np.float64]:
         """Moments' functions of each pulse, means over the draws, shape (pulses, moments)."""
         transfer = response.transfer(self.padded).to(torch.complex64)
         out = []

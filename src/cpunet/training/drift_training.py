@@ -22,6 +22,7 @@ from cpunet.networks.learned_response import DriftUNet, LearnedResponse
 from cpunet.networks.response_layer import current_spectrum
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.fitter import Fitter
+from cpunet.training.held_out import HeldOut, compared, split
 from cpunet.training.moments import BLOCK
 from cpunet.training.response_problem import Band, Comparison, ResponseProblem
 
@@ -32,7 +33,6 @@ BETAS, WEIGHT_DECAY, MEMORY, WARM_UP = (0.5, 0.99), 1e-2, 0.9, 10
 # units of a typical logarithm of the rate, and of a variance of one sample.
 OF_MEAN, OF_PULSES, TYPICAL = 0.05, 1.0, 0.05
 SHARES = (0.0, 0.5, 1.0)
-RESAMPLED, SURE = 200, 2.0
 SHOWN = 2048  # pulses that show what it does
 
 
@@ -109,8 +109,7 @@ def fit_drift(
         Seed of the network, its batches and the held-out pulses.
     """
     rng = np.random.default_rng(seed)
-    split = [_split(band, rng) for band in bands]
-    known, held = [one for one, _ in split], [other for _, other in split]
+    known, held = split(bands, HELD_OUT, rng)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         drift = DriftUNet(response.config.width, float(response.dt_ns))
@@ -128,8 +127,9 @@ def fit_drift(
         step.coordinates.data.copy_(torch.lerp(without, whole, share))
         if 0 < share < 1:
             fitter.follow(ResponseProblem(step, changed(known, drift), draws=1))
-        results.append(_HeldOut(changed(held, drift), known, response))
-    chosen, mismatch, error = _chosen(results, seed)
+        results.append([HeldOut(changed(held, drift), known, response)])
+    gain = compared(results, seed)
+    chosen = gain.best
     drift.share.fill_(1.0)
     longer, blur_ns = _learned(drift, bands[0])
     drift.share.fill_(SHARES[chosen])
@@ -137,7 +137,7 @@ def fit_drift(
     if chosen:
         response.drift = drift
         response.config = response.config.model_copy(update={"drift": True})
-    return DriftFit(SHARES[chosen], mismatch, error, longer, blur_ns)
+    return DriftFit(SHARES[chosen], gain.mismatch, gain.error, longer, blur_ns)
 
 
 def _learned(drift: DriftUNet, band: Band) -> tuple[list[float], float]:
@@ -147,23 +147,6 @@ def _learned(drift: DriftUNet, band: Band) -> tuple[list[float], float]:
     variance = float(blur_ns2.mean())
     blur_ns = math.copysign(math.sqrt(abs(variance)), variance)
     return [float(longer[rows].mean()) for rows in quarters], blur_ns
-
-
-def _split(band: Band, rng: np.random.Generator) -> tuple[Band, Band]:
-    """A band without a part of its pulses, and that part."""
-    moments = band.moments
-    sim, data = (rng.permutation(n) for n in (len(band.sim), len(moments.data)))
-    kept, held = [], []
-    for rows in (sim, data):
-        n = round(HELD_OUT * len(rows))
-        kept.append(np.sort(rows[n:]))
-        held.append(np.sort(rows[:n]))
-    parts = []
-    for of_sim, of_data in (kept, held):
-        own = replace(moments, data=moments.data[of_data], values=moments.values[of_data])
-        part = replace(band.sim.of(of_sim), moments=own)
-        parts.append(Band(band.name, part, band.rows[of_sim]))
-    return parts[0], parts[1]
 
 
 class _Trained:
@@ -222,48 +205,3 @@ def _train(
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
-
-
-class _HeldOut:
-    """Functions of held-out pulses, from which chi-square follows for any sample of them."""
-
-    def __init__(
-        self, bands: Sequence[Band], known: Sequence[Band], response: LearnedResponse
-    ) -> None:
-        # functions and weights of both sides
-        self.sides = []
-        for band in bands:
-            data = band.moments.values
-            simulated = DifferentiableSet(band.sim).values(response.step), band.sim.weights
-            self.sides.append((simulated, (data, np.ones(len(data)))))
-        # the covariance of those that were trained on, which are more
-        self.comparisons = [Comparison(band) for band in known]
-        self.scales = [held.pairs / band.pairs for held, band in zip(bands, known, strict=True)]
-
-    def chi_square(self, rng: np.random.Generator | None = None) -> float:
-        """Per moment, of all pulses or of pulses drawn from them with replacement."""
-        total, n = 0.0, 0
-        for sides, of, scale in zip(self.sides, self.comparisons, self.scales, strict=True):
-            means = []
-            for values, weights in sides:
-                size = len(values)
-                rows = np.arange(size) if rng is None else rng.integers(size, size=size)
-                means.append(np.average(values[rows], axis=0, weights=weights[rows]))
-            white = of.whiten @ ((means[0] - means[1]) / of.sigma)
-            total, n = total + scale * float(white @ white), n + len(white)
-        return total / n
-
-
-def _chosen(held: Sequence[_HeldOut], seed: int) -> tuple[int, list[float], list[float]]:
-    """Index of the share to keep; chi-squares; errors of their differences from the first."""
-    found = [one.chi_square() for one in held]
-    drawn = np.array(
-        [
-            [one.chi_square(np.random.default_rng((seed, draw))) for one in held]
-            for draw in range(RESAMPLED)
-        ]
-    )
-    errors = (drawn - drawn[:, :1]).std(axis=0)
-    sure = found[0] - np.array(found) > SURE * errors
-    best = int(np.argmin(np.where(sure, found, found[0])))
-    return best, found, errors.tolist()

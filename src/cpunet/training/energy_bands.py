@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.peaks import label_peaks
-from cpunet.recipes.schema import PeakConfig
+from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
+from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.moments import Rows, Values
 
 # Ratio of the limits of a band; the next is used only if no band of the one before is possible.
@@ -23,6 +23,8 @@ WIDEST = (1.3, 2.0, 4.0, np.inf)
 LEAST = 200  # minimum number of pulses of each side in a band
 # Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
 SLICES, IN_SLICE = 32, 50
+# The continuum begins where noise is small, and ends well before a line and its sidebands.
+CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
 HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
 
 
@@ -115,20 +117,43 @@ def _continuum(
         parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
         if min(counts) >= LEAST:
             low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
-            weights = _weights(sim_kev[parts[0]], data_kev[parts[1]])
+            weights = spectrum_weights(sim_kev[parts[0]], data_kev[parts[1]])
             if weights.any():
-                weights /= weights.mean()
                 name = f"{low:.0f}-{top:.0f} keV"
                 bands.append(EnergyBand(name, parts[0], parts[1], weights))
         rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
     return bands
 
 
-def _weights(sim_kev: Values, data_kev: Values) -> Values:
-    """Weights of simulated pulses that give them the data's spectrum; all 0 without overlap."""
+def continuum(recipe: Recipe) -> EnergySelection:
+    """Energies below the highest line, away from all lines and from what scores look at.
+
+    Examples
+    --------
+    >>> from cpunet.recipes import load_recipe
+    >>> continuum(load_recipe("fast")).name
+    '1000-1543,1643-2004,2154-2565'
+    """
+    centres = [line.energy_kev for line in recipe.peaks.values()]
+    used = [(kev - CLEAR_KEV, kev + CLEAR_KEV) for kev in centres]
+    used += recipe.scores.continuum_kev.values()
+    ranges, first = [], CONTINUUM_FROM_KEV
+    for low, stop in sorted(used):
+        if low > first:
+            ranges.append(f"{first:.0f}-{low:.0f}")
+        first = max(first, stop)
+    return parse_selection(",".join(ranges), recipe.peaks)
+
+
+def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
+    """Weights of simulated pulses that give them the data's spectrum, with a mean of 1.
+
+    All are 0 if the spectra do not overlap.
+    """
     slices = max(2, min(SLICES, min(len(sim_kev), len(data_kev)) // IN_SLICE))
     edges = np.quantile(data_kev, np.linspace(0, 1, slices + 1)[1:-1])
     of_sim, of_data = np.searchsorted(edges, sim_kev), np.searchsorted(edges, data_kev)
     counts = [np.bincount(of, minlength=slices) for of in (of_sim, of_data)]
     ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
-    return np.asarray(np.minimum(ratio, HEAVIEST)[of_sim])
+    weights = np.minimum(ratio, HEAVIEST)[of_sim]
+    return np.asarray(weights / max(weights.mean(), 1e-9))

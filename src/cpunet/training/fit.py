@@ -20,8 +20,9 @@ from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.pulse_sets import SINGLE, Continuum
 from cpunet.training.response_fit import Fit, fit_response
-from cpunet.training.response_starts import with_drift_terms
+from cpunet.training.response_starts import DRIFT, with_drift_terms
 from cpunet.training.run import FitInfo, Run
 
 log = logging.getLogger(__name__)
@@ -87,9 +88,12 @@ class Matched(NamedTuple):
             log.info(f"fit: {fit.verdict}")
         if fit.drift is not None:
             log.info(str(fit.drift))
+        for part, gain in fit.gains.items():
+            if part != DRIFT[1] or "drift_stretch" not in info.parameters:
+                log.info(f"{part}: {gain}")
         for number, cause in enumerate(info.causes, 1):
             log.info(f"  {number}. {cause}")
-        for found in beyond(info.parameters) + stretched(info.parameters):
+        for found in beyond(info.parameters) + stretched(info.parameters, fit.gains):
             log.warning(found)
 
 
@@ -100,6 +104,7 @@ def match(
     seed: int,
     listen: Listener,
     known: Readout | None = None,
+    continuum: Continuum | None = None,
 ) -> Matched:
     """Measure the noise, fit the response, and invert it.
 
@@ -115,6 +120,8 @@ def match(
         Function called with step and chi-square.
     known
         Response to start from, if any.
+    continuum
+        Reads the pulses of both sides away from all lines, if a fit needs them.
 
     Raises
     ------
@@ -135,6 +142,8 @@ def match(
         "listener": listen,
     }
     fitted = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
+    if fitted is fit_response:
+        given["continuum"] = continuum
     simulated, measured = sim.prepared.pulses, data.prepared.pulses
     response, fit = fitted(simulated, measured, noise, recipe, **given)
     told = _described(fit, response, noise, len(sim.prepared), len(data.prepared))
@@ -154,15 +163,16 @@ def _described(
 ) -> dict[str, Any]:
     """Content of `FitInfo`, without tails."""
     parameters = response.describe()
+    counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     return {
         "parameters": parameters,
         **asdict(fit),
         "drift": fit.drift and {"verdict": str(fit.drift), **asdict(fit.drift)},
-        "verdict": "; ".join([fit.verdict, *stretched(parameters)]),
+        "verdict": "; ".join([fit.verdict, *stretched(parameters, fit.gains)]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
-            "sim": n_sim - sum(n for n, _ in fit.bands.values()),
-            "data": n_data - sum(m for _, m in fit.bands.values()) - fit.data_left_out,
+            "sim": n_sim - sum(n for n, _ in counts),
+            "data": n_data - sum(m for _, m in counts) - fit.data_left_out,
         },
         "noise": {
             "baselines": noise.n_baselines,

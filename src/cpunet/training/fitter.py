@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from cpunet.electronics.drawn_tails import KnownDecay
@@ -57,14 +57,20 @@ class Fitter:
         Main decay as known from pile-up tails, if it is.
     listener
         Called with the number of steps so far, and chi-square.
+    seed
+        Seed of the pulses that are held out.
     steps
         Number of steps so far.
+    gains
+        What held-out pulses say of each part that was tried.
     """
 
     training: MatchingConfig
     decay: KnownDecay | None = None
     listener: Listener | None = None
+    seed: int = 0
     steps: int = 0
+    gains: dict[str, str] = field(default_factory=dict)
 
     def follow(self, problem: ResponseProblem) -> Fitted:
         """Take a few steps from the current response, after a small change of the pulses."""

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Self
@@ -19,19 +20,23 @@ from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
 from cpunet.outputs import folder_written_aside
 from cpunet.pulses.channels import Pair, own_folder
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain import train_chain
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.checkpoints import unfinished_folder, unfinished_name
 from cpunet.training.devices import peak_memory_mb
+from cpunet.training.energy_bands import continuum
+from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks
+from cpunet.training.pulse_sets import Continuum
 from cpunet.training.run import INFO, RUN, Run, RunLike, as_run, read_losses, versions
 
 log = logging.getLogger(__name__)
@@ -53,6 +58,8 @@ class TrainingJob:
         Run to start from.
     resume
         Whether a training of networks is to be resumed.
+    continuum
+        Reads the pulses of both sides away from all lines.
     """
 
     recipe: Recipe
@@ -64,6 +71,7 @@ class TrainingJob:
     folder: Path
     init: Run | None = None
     resume: bool = False
+    continuum: Continuum | None = None
 
     @classmethod
     def of(
@@ -86,10 +94,15 @@ class TrainingJob:
         for finding in compare_sides(sim, data, selection):
             if finding.level != Level.FINE:
                 log.warning(finding)
+        away, beside = continuum(recipe), None
+        there = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
+        if there >= MIN_PULSES and not selection.ranges_kev:
+            beside = partial(_continuum, pair, recipe, away)
         if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
             kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
             raise CpunetError(f"{init.name}: {kinds}; resample them")
-        return cls(recipe, peak, seed, device, sim, data, Path(folder), init, resume)
+        place = Path(folder)
+        return cls(recipe, peak, seed, device, sim, data, place, init, resume, beside)
 
     def trained(self, out: Path | None) -> Run:
         """Train, and write the folder of the job, which becomes `out`."""
@@ -138,6 +151,13 @@ class TrainingJob:
             data=self.data.provenance(),
             **more,
         )
+
+
+def _continuum(pair: Pair, recipe: Recipe, away: EnergySelection) -> tuple[Pulses, Pulses]:
+    """Pulses of both sides away from all lines, read when a fit needs them."""
+    sim = load_pulses(pair[0], "simulated", recipe, away, tell=False)
+    data = load_pulses(pair[1], "measured", recipe, away, tell=False)
+    return sim.prepared.pulses, data.prepared.pulses
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ def fit_learned(
         covariance = _determined(response.step, everything, fitter)
     else:
         covariance = fitter.follow(ResponseProblem(response.step, everything, 2)).covariance
-    fit = described(ResponseProblem(response.step, everything), covariance, fitter.steps)
+    fit = described(ResponseProblem(response.step, everything), covariance, fitter)
     return response, replace(fit, drift=tried)
 
 

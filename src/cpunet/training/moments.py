@@ -36,6 +36,9 @@ EDGE = 60  # samples on either side of the half maximum that contain the steepes
 EARLY, WRONG, LATE = 30, 20.0, 2.0
 MIN_SHARE = 0.2  # of the median amplitude; below it, there is no single pulse
 QUIET = 0.05  # of the height; above it before the pulse, there is another pulse
+# Width of the logarithm of the current amplitude in which the peak of the single sites is the
+# highest, and the centres of the bins about it.
+PEAK_WIDTH, ABOUT_PEAK = 0.01, np.linspace(-0.03, 0.02, 10)
 # Maximum number of measured pulses that define the functions, and pulses read at a time.
 DRAWN, BLOCK = 8192, 512
 
@@ -90,6 +93,10 @@ class Moments:
         Lowest and highest tail slope of the data.  Quality cuts limit it, so simulated pulses
         beyond it are excluded, too: with a fast decay the tails of late pulses are steeper, and
         such a cut removes more of them.
+    balance
+        Makes moments of the bins of the current amplitude which do not depend on how many
+        pulses are in them, shape (bins, moments); then there are no others.  See
+        `single_sites`.
     """
 
     config: MatchingConfig
@@ -106,6 +113,7 @@ class Moments:
     names: tuple[str, ...]
     left_out: int
     slope_range: tuple[float, float]
+    balance: Values | None = None
 
     @classmethod
     def of_data(
@@ -203,6 +211,35 @@ class Moments:
         wide = replace(self, amplitude_widths=np.maximum(self.amplitude_widths, width))
         return replace(wide, values=wide.functions(self.data))
 
+    def single_sites(self) -> Moments:
+        r"""Only the place and shape of the peak of the single-site pulses.
+
+        How many pulses are in this peak depends on where the gammas come from, the peak does
+        not.  Of the bins :math:`f_k` about it, with shares :math:`p_k` in the data, the moments
+        are :math:`f_k - p_k \sum_j f_j`.
+        """
+        logs = np.sort(self.data.log_amplitude)
+        counts = np.searchsorted(logs, logs + PEAK_WIDTH) - np.arange(len(logs))
+        highest = logs[counts.argmax()] + 0.5 * PEAK_WIDTH
+        bins = np.eye(len(ABOUT_PEAK))
+        peak = replace(
+            self,
+            amplitude_centres=highest + ABOUT_PEAK,
+            amplitude_widths=np.full(len(bins), np.diff(ABOUT_PEAK).max()),
+            balance=bins,
+        )
+        shares = peak.functions(self.data).mean(axis=0)
+        balance = (bins - shares / shares.sum())[:, :-1]  # the last follows from the others
+        peak = replace(peak, balance=balance)
+        return replace(
+            peak,
+            values=peak.functions(self.data),
+            left_out=0,
+            names=tuple(
+                f"current amplitude of single sites, bin {i + 1}" for i in range(len(bins) - 1)
+            ),
+        )
+
     def window(self, last: int) -> Window:
         """Where records are read whose half maxima are before a sample."""
         return _window(self.config, self.preparation, self.level, last)
@@ -223,11 +260,15 @@ class Moments:
         squared = [linear[:, first : first + self.config.squares], linear[:, -1:]]
         distance = readings.log_amplitude[:, np.newaxis] - self.amplitude_centres
         density = np.exp(-0.5 * (distance / self.amplitude_widths) ** 2)
+        if self.balance is not None:
+            return np.asarray(density @ self.balance)
         return np.concatenate([linear, np.concatenate(squared, axis=1) ** 2, density], axis=1)
 
     @property
     def model_errors(self) -> Values:
         """Errors of the moments, in their standard deviations, if the physics are wrong."""
+        if self.balance is not None:
+            return np.zeros(len(self.names))
         errors = [WRONG if stop <= EARLY else LATE for stop in self.config.segments[1:]]
         errors += [WRONG] * self.config.components + [0.0]
         errors += [WRONG] * self.config.squares

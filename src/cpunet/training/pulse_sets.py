@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,13 +12,17 @@ from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import Recipe
-from cpunet.training.energy_bands import EnergyBand, energy_bands
-from cpunet.training.moments import Moments, Rows
+from cpunet.training.energy_bands import EnergyBand, energy_bands, spectrum_weights
+from cpunet.training.moments import Moments, Rows, TooFewPulsesError, Values
 from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, Translated
 
 # Minimum number of pulses of a band if only some of a set are taken.
 MIN_OF_BAND = 400
+Continuum = Callable[[], tuple[Pulses, Pulses]]
+SINGLE = "single sites of the continuum"  # name of their band
+# Draws of the noise of single sites, of which there are few, for each of other pulses.
+MORE_DRAWS = 4
 
 
 class PulseSets:
@@ -35,6 +40,8 @@ class PulseSets:
         Random generator that chooses the subsets and draws the noise.
     tails
         Pile-up tails in the data.
+    continuum
+        Reads the pulses of both sides away from all lines, for `single_sites`.
 
     Raises
     ------
@@ -50,9 +57,10 @@ class PulseSets:
         recipe: Recipe,
         rng: np.random.Generator,
         tails: DrawnTails | None = None,
+        continuum: Continuum | None = None,
     ) -> None:
         self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
-        self.tails = tails
+        self.tails, self.continuum = tails, continuum
         require_energies(sim.energy_kev)
         parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
         # in random order, so that any first part is representative
@@ -77,16 +85,39 @@ class PulseSets:
             some.append(self._band(band, *chosen))
         return some
 
+    def single_sites(self) -> list[Band]:
+        """Single sites of the continuum, whose peak of the current amplitude is compared.
+
+        There are none if the pulses are too few.
+        """
+        if self.continuum is None:
+            return []
+        sim, data = self.continuum()
+        _, training = self.recipe.matching
+        try:
+            moments = Moments.of_data(data.waveforms, training, self.recipe.preparation)
+        except TooFewPulsesError:
+            return []
+        weights = spectrum_weights(sim.energy_kev, data.energy_kev)
+        draws = MORE_DRAWS * training.noise_sets
+        translated = self._translated(sim, moments.single_sites(), weights, draws)
+        return [Band(SINGLE, translated, np.arange(len(sim)))]
+
     def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
         _, training = self.recipe.matching
         measured = _taken(self.data.waveforms, band.data[data])
         moments = Moments.of_data(measured, training, self.recipe.preparation)
         rows = band.sim[sim]
-        pulses, energy_kev = _taken(self.sim.waveforms, rows), self.sim.energy_kev[rows]
-        length, draws = record_length(pulses.shape[1]), training.noise_sets
-        drawn = Noise.draw(self.noise, energy_kev, length, draws, self.rng, self.tails)
-        translated = Translated(pulses, drawn, moments, band.weights[sim])
-        return Band(band.name, translated, rows)
+        pulses = self.sim if len(rows) == len(self.sim) else self.sim[rows]
+        weights, draws = band.weights[sim], training.noise_sets
+        return Band(band.name, self._translated(pulses, moments, weights, draws), rows)
+
+    def _translated(
+        self, sim: Pulses, moments: Moments, weights: Values, draws: int
+    ) -> Translated:
+        length = record_length(sim.waveforms.shape[1])
+        drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
+        return Translated(sim.waveforms, drawn, moments, weights)
 
 
 def _taken(waveforms: FloatArray, rows: Rows) -> FloatArray:

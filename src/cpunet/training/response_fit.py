@@ -10,7 +10,7 @@ then determine the response within it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,11 +21,12 @@ from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
 from cpunet.training.drift_training import DriftFit
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
+from cpunet.training.held_out import held_out_gain
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
-from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import (
     HOPELESS_FIT,
@@ -77,6 +78,8 @@ class Fit:
         the data's, see `cpunet.training.misfit`.
     drift
         What a U-Net before a learned readout gains, if one was trained.
+    gains
+        What held-out pulses say of each part that was tried.
     """
 
     chi_square: float
@@ -91,6 +94,7 @@ class Fit:
     amplitude_shift: float
     amplitude_shift_error: float
     drift: DriftFit | None = None
+    gains: dict[str, str] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
@@ -136,6 +140,7 @@ def fit_response(
     seed: int,
     known: ElectronicsResponse | None = None,
     tails: DrawnTails | None = None,
+    continuum: Continuum | None = None,
     listener: Listener | None = None,
 ) -> tuple[ElectronicsResponse, Fit]:
     """Fit a response to unpaired prepared pulses.
@@ -156,6 +161,9 @@ def fit_response(
         recipe's own starts are tried only if that fails.
     tails
         Pile-up tails in the data, which are added to the translations.
+    continuum
+        Reads the pulses of both sides away from all lines, whose single sites are compared,
+        too, if the drift was stretched.
     listener
         Called with step and chi-square.
 
@@ -166,16 +174,17 @@ def fit_response(
     """
     config, training = recipe.chain, recipe.matching.training
     rng = np.random.default_rng(seed)
-    sets = PulseSets(sim, data, noise, recipe, rng, tails)
+    sets = PulseSets(sim, data, noise, recipe, rng, tails, continuum)
     some = sets.bands(training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
-    fitter = Fitter(training, None if tails is None else tails.known_decay, listener)
+    decay = None if tails is None else tails.known_decay
+    fitter = Fitter(training, decay, listener, seed)
     near = None if known is None else from_known(first, known, fitter)
     found = near or best_start(first, config, fitter)
     everything = sets.bands()
     response = found.problem.response
     if response.drift is None and not found.poor:
-        fit = _determined(found, everything, fitter)
+        fit = _determined(found, everything, sets, fitter)
         if not fit.poor:
             return response, fit
     elif found.per_moment > ANOTHER_DETECTOR and onset_is_off(found.problem):
@@ -184,7 +193,7 @@ def fit_response(
     response = found.problem.response
     if found.poor and onset_is_off(found.problem):
         return response, _with_wrong_physics(found, fitter)
-    return response, _determined(found, everything, fitter)
+    return response, _determined(found, everything, sets, fitter)
 
 
 def _extended(found: Fitted, fitter: Fitter) -> Fitted:
@@ -203,7 +212,22 @@ def _extended(found: Fitted, fitter: Fitter) -> Fitted:
     return found
 
 
-def _determined(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fit:
+def _single_sites(response: ElectronicsResponse, sets: PulseSets, fitter: Fitter) -> list[Band]:
+    """Single sites of the continuum, unless held-out pulses lose by them.
+
+    If the simulated drift is wrong, so are the charge clouds.  Nearly all pulses of a line have
+    many sites, whose clouds are not as large as that of one; the sharp peak of these tells.
+    """
+    single = sets.single_sites()
+    if single:
+        gain = held_out_gain([(response, ()), (response, single)], sets.bands(CHECKED), fitter)
+        fitter.gains[SINGLE] = f"{'left out' if gain.lost else 'used'}; {gain}"
+        if gain.lost:
+            return []
+    return single
+
+
+def _determined(found: Fitted, bands: Sequence[Band], sets: PulseSets, fitter: Fitter) -> Fit:
     """Determine the response within its valley from all pulses.
 
     Optimal weights trust the shapes of the pulses to a thousandth.  A simulation whose drift
@@ -211,14 +235,15 @@ def _determined(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fit:
     """
     response = found.problem.response
     if response.drift is not None:
-        whole = _with_more(found, bands, fitter)
-        return described(whole.problem, whole.covariance, fitter.steps)
+        further = _single_sites(response, sets, fitter)
+        whole = fitter.fit(ResponseProblem(response, [*bands, *further]), coarse=False)
+        return described(whole.problem, whole.covariance, fitter)
     compared = ResponseProblem(response, bands)
     for _ in range(ROUNDS):
         covariance = refine(found.problem, bands, fitter.training.conditional_bins)
         deviations = compared.deviations(compared.parameters.vector())
         fitter.count(float(deviations @ deviations))
-    return described(compared, covariance, fitter.steps)
+    return described(compared, covariance, fitter)
 
 
 def _with_more(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fitted:
@@ -233,21 +258,23 @@ def _with_wrong_physics(found: Fitted, fitter: Fitter) -> Fit:
     deviations = problem.deviations(problem.parameters.vector())
     problem.allow_for_model_error()
     again = fitter.fit(problem, coarse=False)
-    fit = described(problem, again.covariance, fitter.steps)
+    fit = described(problem, again.covariance, fitter)
     return replace(fit, chi_square=float(deviations @ deviations))
 
 
-def described(problem: ResponseProblem, covariance: Values, steps: int) -> Fit:
+def described(problem: ResponseProblem, covariance: Values, fitter: Fitter) -> Fit:
     """Describe the fit of a response."""
     parameters = problem.parameters
     vector = parameters.vector()
     pulls, deviations = problem.pulls(vector), problem.deviations(vector)
-    shift, shift_error = amplitude_shift(problem.response, problem.bands)
+    whole = [band for band in problem.bands if band.moments.balance is None]
+    shift, shift_error = amplitude_shift(problem.response, whole)
     return Fit(
         chi_square=float(deviations @ deviations),
         moments=problem.moments,
         pairs=problem.pairs,
-        steps=steps,
+        steps=fitter.steps,
+        gains=fitter.gains,
         errors=parameters.by_name(np.sqrt(covariance.diagonal())),
         pulls=dict(zip(problem.names, pulls.tolist(), strict=True)),
         data_left_out=problem.left_out,

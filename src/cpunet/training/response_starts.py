@@ -2,7 +2,7 @@
 
 A fit only finds the minimum of the valley that it starts in.  There are therefore several
 starts and, if the fit is poor, a stretch of the simulated drift, a fast decay with a free time
-and a ringing.
+and a ringing.  Each is kept only if held-out pulses gain, see `cpunet.training.held_out`.
 """
 
 from __future__ import annotations
@@ -19,18 +19,22 @@ from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
+from cpunet.training.held_out import held_out_gain
 from cpunet.training.response_problem import STRETCH, ResponseProblem
 from cpunet.training.ringing import most_promising_ringing
 
 # Chi-square per moment of another detector; in a wrong valley it is about three.
 HOPELESS_FIT = 20.0
-# A ringing or free decay must lower chi-square to this fraction.  A ringing is tried from a
-# higher expected one: derivatives far from the minimum underestimate the decrease.
+# A ringing must lower chi-square to this fraction, and promise the next: derivatives
+# far from the minimum underestimate the decrease.
 RINGS, PROMISES = 0.7, 0.9
-# A term that stretches the drift must lower chi-square by this much, four standard deviations.
-# One that is 0 within this many of its own is not needed.  Drift that is longer or shorter by
-# more than a third is that of another detector.
-STRETCHES, SURE, MAX_STRETCH = 16.0, 3.0, 1 / 3
+# What is added must lower chi-square by this much, four standard deviations.  A stretch that is
+# 0 within this many of its own is not needed.  Drift that is longer or shorter by more than a
+# third is that of another detector.
+ADDS, SURE, MAX_STRETCH = 16.0, 3.0, 1 / 3
+# Parts that are tried, as the user reads them.
+DECAY, RINGING = "a decay of free time", "a ringing"
+DRIFT = {1: "a stretch of the drift", 2: "its change with time"}  # by number of terms
 # Starting times of a free fast decay in us, and its shares.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
 MIN_SHARE, MAX_SHARE = 0.005, 0.2
@@ -102,7 +106,7 @@ def onset_is_off(problem: ResponseProblem) -> bool:
 
 
 def drift_if_better(found: Fitted, fitter: Fitter) -> Fitted:
-    """Stretch the simulated drift by one more parameter if that lowers chi-square clearly."""
+    """Stretch the simulated drift by one more parameter if that gains."""
     response = found.problem.response
     terms = response.config.drift_terms + 1
     if terms > fitter.training.drift_terms:
@@ -111,7 +115,17 @@ def drift_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     again = fitter.fit(found.problem.of(tried), coarse=terms == 1)
     assert tried.drift is not None
     sane = float(tried.drift.stretch.detach().abs().max()) < MAX_STRETCH
-    return again if sane and again.cost < found.cost - STRETCHES else found
+    return again if sane and gains(DRIFT[terms], found, again, fitter) else found
+
+
+def gains(part: str, before: Fitted, after: Fitted, fitter: Fitter) -> bool:
+    """Whether a part that was added lowers chi-square, that of held-out pulses, too."""
+    if after.cost > before.cost - ADDS:
+        return False
+    cases = [(found.problem.response, ()) for found in (before, after)]
+    gain = held_out_gain(cases, before.problem.bands, fitter)
+    fitter.gains[part] = f"{'kept' if gain.best else 'left out'}; {gain}"
+    return gain.best > 0
 
 
 def drift_if_needed(found: Fitted, fitter: Fitter) -> Fitted:
@@ -126,13 +140,13 @@ def drift_if_needed(found: Fitted, fitter: Fitter) -> Fitted:
         return found
     simulated = problem.of(with_drift_terms(problem.response, 0))
     again = fitter.fit(simulated, coarse=False)
-    return again if again.cost < found.cost + STRETCHES else found
+    return again if again.cost < found.cost + ADDS else found
 
 
 def free_decay_if_better(found: Fitted, fitter: Fitter) -> Fitted:
-    """Free the time of a fast decay if that explains much of the remaining chi-square."""
+    """Free the time of a fast decay if that gains."""
     again = with_free_decay(found.problem, fitter)
-    return found if again is None or again.cost >= RINGS * found.cost else again
+    return again if again is not None and gains(DECAY, found, again, fitter) else found
 
 
 def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
@@ -149,7 +163,7 @@ def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
         _free_decay_start(problem, free, us, share, decay)
         for us, share in _decays(problem, decay)
     ]
-    return fitter.fit(min(starts, key=_cost))
+    return fitter.fit(min(starts, key=_cost), coarse=False)
 
 
 def _free_decay_start(
@@ -161,13 +175,15 @@ def _free_decay_start(
 ) -> ResponseProblem:
     """The comparison for a fast and a main decay that together match the data's tails.
 
-    The bandwidth found without the fast decay is about right if the tails are.
+    Bandwidth and slow parts found without the fast decay are about right if the tails are.
     """
     dt_ns, slope = float(problem.response.dt_ns), problem.slope
     if decay is None:
         slope += 1e-3 * dt_ns * share * _fast_slope(problem, fast_us)
     response = start_response(config, dt_ns, 1.0, slope, decay)
     response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
+    kept = [tau in config.slow_ns for tau in problem.response.config.slow_ns]
+    response.slow_weights.data.copy_(problem.response.slow_weights.data[kept])
     if response.drift is not None and problem.response.drift is not None:
         response.drift.load_state_dict(problem.response.drift.state_dict())
     response.log_fast_decays_us.data.fill_(math.log(fast_us))
@@ -219,7 +235,7 @@ def ringing_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     for coarse in (False, True):
         rings = problem.of(copy.deepcopy(response))
         again = fitter.fit(rings, coarse=coarse)
-        if again.cost < RINGS * best.cost:
+        if again.cost < RINGS * best.cost and gains(RINGING, found, again, fitter):
             best = again
         if not best.poor:
             break

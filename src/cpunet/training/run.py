@@ -80,6 +80,7 @@ class FitInfo(InfoPart):
     errors: dict[str, float] = {}
     covariance: list[list[float]] = []
     pulls: dict[str, float] = {}
+    gains: dict[str, str] = {}
     noise: dict[str, float] = {}
     in_no_band: dict[str, int] = {}
     tails: TailsInfo | None = None

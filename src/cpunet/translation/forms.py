@@ -340,7 +340,7 @@ def _height(ren: REN) -> float:
 def drawn_kev(
     tails: DrawnTails | None, n: int, generator: torch.Generator | None
 ) -> npt.NDArray[np.float64] | None:
-    """Remains of `n` pulses in keV, drawn from the random generator of the noise."""
+    """Pile-up tails of `n` pulses in keV, drawn from the random generator of the noise."""
     return None if tails is None else tails.draw_kev(n, rng_of(generator))
 
 
