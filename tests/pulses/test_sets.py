@@ -100,7 +100,11 @@ def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     [
         ([], [], ["run7.lh5", "no pulses"]),
         ([50.0] * 9, [], ["9 energy_outside_selection", "calibration"]),
-        ([1000.0] * 5 + [50.0], [0, 1, 2, 3, 4], ["5 nan, 1 energy_outside", "write them again"]),
+        (
+            [1000.0] * 5 + [50.0],
+            [0, 1, 2, 3, 4],
+            ["5 nan, 1 energy_outside", "write them again"],
+        ),
         ([np.nan] * 3, [], ["3 energy_unknown", "calibrated energies"]),
     ],
 )

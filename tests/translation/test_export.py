@@ -54,7 +54,9 @@ def written_report(folder: Path) -> tuple[Path, dict[str, float]]:
     scores = load_recipe("fast").scores.model_copy(update={"bootstraps": 20})
     compared = compare(data, {"ren": ren}, scores, seed=1)
     folder.mkdir()
-    write_report(folder, {"peaks": {"SEP": {"parameters": compared, "two_sample": {}}}}, {}, [])
+    write_report(
+        folder, {"peaks": {"SEP": {"parameters": compared, "two_sample": {"ren": {}}}}}, {}, []
+    )
     overlaps = compared["drift_time"]["iou"]
     assert 50 < overlaps["ren"] <= 100
     return folder, overlaps
