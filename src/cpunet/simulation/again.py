@@ -68,7 +68,7 @@ class SameHits:
         mode
             ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` merges more hits
             and takes longer steps, for differences between two sets of physics: its errors
-            are nearly equal in both. See docs/simulation.md for accuracy and speed.
+            are nearly equal in both. See benchmarks/same_hits.py for accuracy and speed.
 
         Raises
         ------
