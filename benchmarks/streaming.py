@@ -1,7 +1,7 @@
 """Translate a long file, and record its memory: rate, peak, and a figure over time.
 
 Run with ``python benchmarks/streaming.py``; ``--pulses 1000000`` for a million,
-``--picture docs/pictures/streaming-memory.png`` for the figure.  The run is an untrained
+``--picture memory.png`` for the figure.  The run is an untrained
 readout chain: neither rate nor memory depends on its parameters.  Pulses are analytic.
 """
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import tomllib
+from collections import Counter
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
 PICTURES = Path(__file__).parents[1] / "pictures"
+ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "src" / "cpunet"
+ROOMS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["cpunet"]["rooms"]
 INK, LINE, SIM, DATA, LEARNED = "#222", "#777", "#dbe7f6", "#fde6cf", "#dff0df"
 FONT = "font-family='system-ui, sans-serif'"
 
@@ -21,9 +27,15 @@ class Drawing:
         self.parts.append(f"<rect width='{width}' height='{height}' fill='#fff'/>")
 
     def text(
-        self, x: float, y: float, words: str, size: int = 13, anchor: str = "middle"
+        self,
+        x: float,
+        y: float,
+        words: str,
+        size: int = 13,
+        anchor: str = "middle",
+        more: str = "",
     ) -> None:
-        style = f"{FONT} font-size='{size}' fill='{INK}' text-anchor='{anchor}'"
+        style = f"{FONT} font-size='{size}' fill='{INK}' text-anchor='{anchor}'{more}"
         self.parts.append(f"<text x='{x:g}' y='{y:g}' {style}>{escape(words)}</text>")
 
     def box(self, x: float, y: float, w: float, h: float, fill: str, *lines: str) -> None:
@@ -41,6 +53,23 @@ class Drawing:
         self.parts.append(
             f"<polyline points='{path}' fill='none' stroke='{LINE}' stroke-width='1.5'"
             f"{dash} marker-end='url(#head)'/>"
+        )
+
+    def bow(
+        self,
+        x: float,
+        first: float,
+        last: float,
+        reach: float,
+        ink: str,
+        width: float,
+        head: bool,
+    ) -> None:
+        """A curve from one height to another at x, out to three quarters of its reach."""
+        end = " marker-end='url(#head)'" if head else " stroke-opacity='0.55'"
+        self.parts.append(
+            f"<path d='M{x:g},{first:g} C{x + reach:g},{first:g} {x + reach:g},{last:g} "
+            f"{x:g},{last:g}' fill='none' stroke='{ink}' stroke-width='{width:.2f}'{end}/>"
         )
 
     def curve(self, x: float, y: float, w: float, h: float, values: np.ndarray) -> None:
@@ -64,35 +93,67 @@ class Drawing:
         (PICTURES / name).write_text(svg + "\n".join([head, *self.parts]) + "\n</svg>\n")
 
 
-def data_flow() -> None:
-    d = Drawing(860, 330, "From hits and traces to a translated simulation and a report")
-    d.box(10, 20, 130, 54, SIM, "hits", "Geant4, remage, own")
-    d.box(170, 20, 150, 54, SIM, "simulated pulses", "charge, noise-free")
-    d.box(10, 246, 310, 54, DATA, "measured traces", "ADC counts: LH5, FlashCam, HDF5, NumPy")
-    d.arrow((140, 47), (170, 47))
-    d.text(155, 92, "simulate", 11)
-    d.box(350, 20, 130, 54, SIM, "windows", "800 samples")
-    d.box(350, 246, 130, 54, DATA, "windows", "800 samples")
-    d.arrow((320, 47), (350, 47))
-    d.arrow((320, 273), (350, 273))
-    d.text(335, 92, "prepare", 11)
-    d.text(335, 235, "prepare", 11)
-    d.box(520, 128, 130, 64, LEARNED, "run", "REN, IREN,", "noise, recipe")
-    d.arrow((415, 74), (415, 150), (520, 150))
-    d.arrow((415, 246), (415, 170), (520, 170))
-    d.text(465, 143, "train", 11)
-    d.box(700, 20, 150, 54, SIM, "translated pulses", "like data, with noise")
-    d.arrow((480, 47), (700, 47))
-    d.arrow((585, 128), (585, 52), dashed=True)
-    d.text(545, 40, "translate", 11)
-    d.box(700, 246, 150, 54, "#eee", "report", "scores beside ceilings")
-    d.arrow((775, 74), (775, 246))
-    d.arrow((480, 273), (700, 273))
-    d.text(588, 265, "validate", 11)
-    d.text(
-        430, 322, "blue: simulated · orange: measured · green: learned from both, unpaired", 11
-    )
-    d.write("data-flow.svg")
+ROOM_WORDS = {
+    "recipes": "settings of a run, in YAML",
+    "pulses": "read, prepare, cut; parameters",
+    "simulation": "hits → fields → drift → charge",
+    "electronics": "test stands, noise, pile-up tails",
+    "networks": "chain as a layer, U-Net",
+    "training": "fit of a chain, CycleGAN, run",
+    "calibration": "detector and chain together",
+    "translation": "REN, IREN on files; ONNX, dspeed",
+    "validation": "scores, ceilings, report",
+    "legend": "pulse-shape libraries, parameters",
+}
+FLOWS = (
+    ("simulation", "pulses", "charge pulses"),
+    ("electronics", "pulses", "raw traces"),
+    ("pulses", "training", "windows of both sides"),
+    ("simulation", "calibration", "hits, detector"),
+    ("training", "translation", "run"),
+    ("calibration", "translation", "calibrated run"),
+    ("training", "legend", "run"),
+    ("translation", "validation", "translated pulses"),
+)
+
+
+def imports() -> dict[tuple[str, str], int]:
+    """Number of modules of a room that import from another one."""
+    count: Counter[tuple[str, str]] = Counter()
+    for room in ROOMS:
+        for path in (SOURCE / room).rglob("*.py"):
+            # a run imports from later rooms when it is asked to, see tests/test_rooms.py
+            tree = ast.parse(path.read_text("utf-8"))
+            nodes = tree.body if path.name == "run.py" else ast.walk(tree)
+            modules = (n.module or "" for n in nodes if isinstance(n, ast.ImportFrom))
+            others = {name.split(".")[1] for name in modules if name.startswith("cpunet.")}
+            count.update((room, other) for other in others & {*ROOMS} - {room})
+    return dict(count)
+
+
+def rooms() -> None:
+    """Rooms from top to bottom; data between them on the left, imports on the right."""
+    x, width, height, step = 300, 250, 42, 56
+    d = Drawing(860, 60 + step * len(ROOMS), "Rooms of the package: data and imports")
+    middle = {room: 50 + step * i + height / 2 for i, room in enumerate(ROOMS)}
+    d.text(150, 24, "data")
+    d.text(x + width / 2, 24, "rooms")
+    d.text(x + width + 130, 24, "imports (width: number of modules)")
+    for room, y in middle.items():
+        d.box(x, y - height / 2, width, height, SIM, room, ROOM_WORDS[room])
+    labels = []
+    for source, target, words in FLOWS:
+        first, last = middle[source] + 6, middle[target] - 6
+        reach = 40 + 0.5 * abs(last - first)
+        d.bow(x, first, last, -reach, LINE, 1.8, head=True)
+        labels.append((x - 0.75 * reach + 8, (first + last) / 2 + 4, words))
+    for (room, other), n in sorted(imports().items()):
+        first, last = middle[room] - 5, middle[other] + 5
+        reach = 30 + 0.42 * abs(last - first)
+        d.bow(x + width, first, last, reach, "#3949ab", 0.5 * n**0.5, head=False)
+    for label in labels:  # in front of all lines
+        d.text(*label, 11, "end", " stroke='#fff' stroke-width='4' paint-order='stroke'")
+    d.write("rooms.svg")
 
 
 def chain() -> None:
@@ -167,5 +228,5 @@ def networks() -> None:
 
 
 if __name__ == "__main__":
-    for draw in (data_flow, chain, networks):
+    for draw in (rooms, chain, networks):
         draw()

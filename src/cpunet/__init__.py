@@ -2,8 +2,7 @@
 
 Data flow in one direction through its subpackages: ``pulses`` → ``simulation`` →
 ``electronics`` → ``networks`` → ``training`` → ``calibration`` → ``translation`` →
-``validation`` → ``legend``; the command line is made of their public functions.  See
-``docs/design.md``.
+``validation`` → ``legend`` → ``cli``.  See ``docs/design.md``.
 """
 
 from __future__ import annotations

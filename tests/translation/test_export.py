@@ -55,7 +55,10 @@ def written_report(folder: Path) -> tuple[Path, dict[str, float]]:
     compared = compare(data, {"ren": ren}, scores, seed=1)
     folder.mkdir()
     write_report(
-        folder, {"peaks": {"SEP": {"parameters": compared, "two_sample": {"ren": {}}}}}, {}, []
+        folder,
+        {"peaks": {"SEP": {"parameters": compared, "two_sample": {"ren": {"missing": "few"}}}}},
+        {},
+        [],
     )
     overlaps = compared["drift_time"]["iou"]
     assert 50 < overlaps["ren"] <= 100

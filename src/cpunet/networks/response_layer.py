@@ -80,9 +80,17 @@ class Readout(nn.Module):
 
 
 class ElectronicsResponse(Readout):
-    """Charge pulses → noise-free records of any height, by physical parameters.
+    r"""Charge pulses → noise-free records of any height, by physical parameters.
 
-    Times are kept as logarithms, so that they stay positive and steps are relative.
+    With bandwidth poles :math:`\tau_k`, weights :math:`w_j` of slow parts of fixed times
+    :math:`T_j`, and shares :math:`a_i` of decays :math:`\tau_i` faster than the main one,
+
+    .. math:: H(s) = \prod_k \frac{1}{1 + s \tau_k}
+        \left[1 - \sum_j w_j + \sum_j \frac{w_j}{1 + s T_j}\right], \qquad
+        d(t) = \left(1 - \sum_i a_i\right) e^{-t/\tau} + \sum_i a_i e^{-t/\tau_i}
+
+    the current of a pulse is multiplied by :math:`H` and by the spectrum of :math:`d`.  Times
+    are kept as logarithms, so that they stay positive and steps are relative.
 
     Parameters
     ----------
@@ -90,6 +98,26 @@ class ElectronicsResponse(Readout):
         Number of poles, the times whose weights are free, and initial values.
     dt_ns
         Sampling period of the pulses in ns.
+
+    References
+    ----------
+    V. Radeka, Ann. Rev. Nucl. Part. Sci. 38 (1988) 217 (charge-sensitive readout).
+
+    Examples
+    --------
+    At :math:`s = i/\tau` one pole passes :math:`1/(1 + i)`, and 100 samples of 16 ns later a
+    decay of 100 µs has left :math:`e^{-1.6/100}`:
+
+    >>> from cpunet.recipes import load_recipe
+    >>> config = load_recipe("fast").generator.model_copy(
+    ...     update={"poles_ns": (64.0,), "decay_us": 100.0})
+    >>> response = ElectronicsResponse(config, dt_ns=16)
+    >>> complex(response.bandwidth(torch.tensor([1j / 64]))[0].detach())
+    (0.5-0.5j)
+    >>> step = (torch.arange(800) >= 400).float()[None]
+    >>> record = response(step)[0].detach()[PADDING_BEFORE + 400 :]
+    >>> round(float(record[200] / record[100]), 5), round(math.exp(-1.6 / 100), 5)
+    (0.98413, 0.98413)
     """
 
     slow_ns: Tensor

@@ -63,7 +63,7 @@ class SameHits:
         mode
             ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` takes longer
             steps, for differences between two sets of physics: its errors are nearly equal in
-            both. See docs/simulation.md for accuracy and speed.
+            both. See benchmarks/same_hits.py for accuracy and speed.
         most
             Number of first events to simulate; None for all.
 

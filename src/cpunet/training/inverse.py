@@ -41,7 +41,12 @@ def fit_inverse(
     *,
     seed: int,
 ) -> LinearInverse:
-    """Fit the inverse of a response with its noise.
+    r"""Fit the inverse of a response with its noise.
+
+    For measured pulses :math:`x` and charge :math:`y`, the linear map of the least mean square
+    error (Wiener filter; e.g. Kay, Fundamentals of Statistical Signal Processing I, ch. 12) is
+
+    .. math:: y = \bar y + C_{yx} (C_{xx} + C_{\mathrm{noise}} + \epsilon)^{-1} (x - \bar x)
 
     Parameters
     ----------

@@ -69,7 +69,14 @@ class Minimum(NamedTuple):
 def levenberg_marquardt(
     problem: Problem, steps: int, listener: Listener | None, *, coarse: bool = True
 ) -> Minimum:
-    """Minimise a problem from its current parameters, and set them to the minimum.
+    r"""Minimise a problem from its current parameters, and set them to the minimum.
+
+    With residuals :math:`r`, their derivatives :math:`J` and a damping :math:`\lambda`, steps
+    are
+
+    .. math:: \delta = -\left[J^T J + \lambda\, \mathrm{diag}(J^T J)\right]^{-1} J^T r
+
+    (Marquardt, J. SIAM 11 (1963) 431), and the covariance is :math:`(J^T J)^{-1}`.
 
     Parameters
     ----------

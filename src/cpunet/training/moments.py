@@ -75,7 +75,13 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """The functions whose means are compared, defined by the measured set.
+    r"""The functions whose means are compared, defined by the measured set.
+
+    Moments are the means of functions :math:`f_i` of single pulses.  With their covariance
+    :math:`V` from the data's events, two sets differ by
+
+    .. math:: \chi^2 = \Delta^T V^{-1} \Delta, \qquad
+        \Delta_i = \langle f_i \rangle_{\mathrm{sim}} - \langle f_i \rangle_{\mathrm{data}}
 
     Use `of_data`; `read` and `functions` then evaluate them for any set.
 
@@ -245,7 +251,12 @@ class Moments:
         return _window(self.config, self.preparation, self.level, last)
 
     def functions(self, readings: Readings, clip: float | None = None) -> Values:
-        """Functions of each pulse, shape (pulses, moments).
+        r"""Functions of each pulse, shape (pulses, moments).
+
+        They are the clipped linear quantities, squares of components and tail slope, and bins
+        :math:`b` of the current amplitude :math:`A`, with smooth edges:
+
+        .. math:: f_b = \exp\left[-\frac{(\ln A - c_b)^2}{2 w_b^2}\right]
 
         Parameters
         ----------
