@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
 from cpunet.outputs import folder_written_aside, refuse_existing
 from cpunet.progress import stage
-from cpunet.pulses.channels import ALL
+from cpunet.pulses.channels import ALL, CHANNEL, Outcome, Pair, each_channel, paired
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
@@ -81,7 +82,7 @@ def calibrate(
     seed: int = 0,
     read: ReadOptions = ReadOptions(),
     force: bool = False,
-) -> Calibration | Plan:
+) -> Calibration | Plan | Outcome[Calibration | Plan]:
     """Calibrate the detector and its electronics together: temperature, impurities, readout.
 
     The folder is a run like those of `cpunet.train`, and contains the calibrated
@@ -92,7 +93,8 @@ def calibrate(
     Parameters
     ----------
     sim
-        Output of cpunet simulate or stand, with its hits.
+        Output of cpunet simulate or stand, with its hits; of all channels, as
+        ``sims/{channel}.lh5``.
     data
         Measured pulses.
     out
@@ -120,8 +122,9 @@ def calibrate(
 
     Returns
     -------
-    Calibration or Plan
-        The run, with the calibrated physics; or the expected errors of the physics.
+    Calibration, Plan or Outcome
+        The run, with the calibrated physics; or the expected errors of the physics; with
+        ``data_table="all"`` those of each channel.
 
     Raises
     ------
@@ -138,29 +141,54 @@ def calibrate(
 
     cpunet calibrate --sim sim.lh5 --data raw.lh5 --plan
     """
-    if read.data_table == ALL:
-        raise CpunetError(
-            f"`data_table` {ALL}: each channel is a detector with physics of its own",
-            "calibrate one after another, with `data_table` CHANNEL and the `sim` of each",
-        )
     if out is None and not plan:
         raise CpunetError("give `out`, the run folder to make, or `plan`")
-    files = pulse_file(sim, read.sim), pulse_file(data, read.data)
-    inputs = [*files[0].files, *files[1].files]
-    inputs += [] if isinstance(recipe, Recipe) else [recipe]
-    if out is not None:
-        refuse_existing(Path(out), *inputs, force=force)
+    sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
-    job = _Job(*files, settings, Freedom.of(free, fix, prior), peak, events, require_seed(seed))
+    freedom = Freedom.of(free, fix, prior)
+    job = partial(
+        _Job,
+        recipe=settings,
+        freedom=freedom,
+        peak=peak,
+        events=events,
+        seed=require_seed(seed),
+    )
+    inputs = [] if isinstance(recipe, Recipe) else [recipe]
+    target = None if out is None else Path(out)
+    if sides[1].table != ALL:
+        return _calibrated(job, plan, force, inputs, "", sides, target)
+    if target is None or CHANNEL not in str(sides[0].path):
+        raise CpunetError(
+            f"`data_table` {ALL}: each channel is a detector with physics of its own",
+            f"give `out`, and the simulation of each as `sim` sims/{CHANNEL}.lh5",
+        )
+    act = partial(_calibrated, job, plan, force, inputs)
+    return each_channel(paired(*sides), target, act)
+
+
+def _calibrated(
+    make: Callable[[PulseFile, PulseFile], _Job],
+    plan: bool,
+    force: bool,
+    inputs: Sequence[Path | str],
+    _name: str,
+    pair: Pair,
+    out: Path | None,
+) -> Calibration | Plan:
+    """Calibrate one channel, or plan to."""
+    if out is not None:
+        refuse_existing(out, *pair[0].files, *pair[1].files, *inputs, force=force)
+    job = make(*pair)
     if plan:
         planned = job.plan()
         if out is not None:
             planned.save(out, force=force)
         return planned
     assert out is not None
-    with folder_written_aside(Path(out), RUN, force=force) as folder:
-        job.run(folder, Path(out))
+    with folder_written_aside(out, RUN, force=force) as folder:
+        job.run(folder, out)
     return Calibration.load(out)
 
 

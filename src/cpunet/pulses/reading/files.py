@@ -25,7 +25,7 @@ class FileOptions:
     Parameters
     ----------
     table
-        Table of the pulses, if the file has several; ``all``: one after another.
+        Table of the pulses, if the file has several; ``all``: each for itself.
     energy
         Energy column, or ``FILE:path/to/column``, as of a hit tier.
     kev_per_adc
@@ -50,7 +50,7 @@ class ReadOptions:
     Parameters
     ----------
     data_table
-        Table of the measured pulses, if the file has several; ``all``: one after another.
+        Table of the measured pulses, if the file has several; ``all``: each for itself.
     data_energy
         Energy column of the data, or ``FILE:path/to/column``, as of a hit tier.
     kev_per_adc
