@@ -18,7 +18,7 @@ from cpunet.training.fitter import Fitter
 from cpunet.training.moments import Rows
 from cpunet.training.response_problem import Band, Comparison, ResponseProblem
 
-Case = tuple[Readout, Sequence[Band]]
+Case = tuple[Readout, int | None]
 
 RESAMPLED, SURE = 200, 2.0
 
@@ -42,11 +42,6 @@ class Gain:
         found = np.array(self.mismatch)
         sure = found[0] - found > SURE * np.array(self.error)
         return int(np.argmin(np.where(sure, found, found[0])))
-
-    @property
-    def lost(self) -> bool:
-        """Whether the last of the fits is worse than the first, beyond `SURE` errors."""
-        return self.mismatch[-1] - self.mismatch[0] > SURE * self.error[-1]
 
     def __str__(self) -> str:
         first, last, error = self.mismatch[0], self.mismatch[-1], self.error[-1]
@@ -130,19 +125,19 @@ def held_out_gain(cases: Sequence[Case], bands: Sequence[Band], fitter: Fitter) 
     Parameters
     ----------
     cases
-        Each a response near its minimum, and further bands that it is fitted to.
+        Each a response near its minimum, and to how many of the bands it is fitted (None: all).
     bands
-        Bands that are divided.
+        Bands that are divided, and on all of which the fits are compared.
     fitter
         Fitter of the responses, which are left as they are.
     """
     halves = split(bands, 0.5, np.random.default_rng(fitter.seed))
     fits = []
-    for response, further in cases:
+    for response, n_fitted in cases:
         parts = []
         for known, held in (halves, halves[::-1]):
             fitted = copy.deepcopy(response)
-            fitter.follow(ResponseProblem(fitted, [*known, *further], draws=1))
+            fitter.follow(ResponseProblem(fitted, known[:n_fitted], draws=1))
             parts.append(HeldOut(held, known, fitted))
         fits.append(parts)
     return compared(fits, fitter.seed)

@@ -122,7 +122,7 @@ def gains(part: str, before: Fitted, after: Fitted, fitter: Fitter) -> bool:
     """Whether a part that was added lowers chi-square, that of held-out pulses, too."""
     if after.cost > before.cost - ADDS:
         return False
-    cases = [(found.problem.response, ()) for found in (before, after)]
+    cases = [(found.problem.response, None) for found in (before, after)]
     gain = held_out_gain(cases, before.problem.bands, fitter)
     fitter.gains[part] = f"{'kept' if gain.best else 'left out'}; {gain}"
     return gain.best > 0
