@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from cpunet.calibration import other_chains
-from cpunet.calibration.other_chains import NEEDED, decaying_chain
-from cpunet.calibration.search import Search
+from cpunet.calibration.other_chains import NEEDED, decaying_chain, other_chain
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 
@@ -69,11 +68,12 @@ def test_each_kind_of_chain_is_tried_in_its_round_and_at_the_end():
         tried.append("ever")
         return OTHER
 
-    search, kinds = SimpleNamespace(recipe=RECIPE, sets=SETS), {never: 1, ever: 2}
+    kinds = {never: 1, ever: 2}
 
     def other(number, *, settled=False):
         tried.clear()
-        return Search._other_chain(search, None, kinds, number, settled=settled), tried.copy()
+        found = other_chain(None, SETS, None, kinds, number, settled=settled)
+        return found, tried.copy()
 
     assert other(1) == (None, ["never"])
     assert other(2) == (OTHER, ["ever"])

@@ -10,8 +10,7 @@ import pytest
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.result import described, doubts, notes
-from cpunet.calibration.search import Calibrated
+from cpunet.calibration.result import Calibrated, described, doubts, notes
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration import search
+from cpunet.calibration.identifiability import Selection
 from cpunet.calibration.inputs import Freedom, known_depletion, require_depletion
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.search import ROUNDS, Search, _relaxed
-from cpunet.calibration.selection import Selection
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -73,7 +73,11 @@ def test_after_the_last_round_nothing_is_simulated(monkeypatch):
     endless._tell = lambda *_: None
     endless._problem = lambda *_, **__: SimpleNamespace(parameters=parameters)
     endless._first_free = lambda *_: [0]
-    endless._other_chain = lambda *_, **__: None
+    endless.recipe, endless.sets = (
+        SimpleNamespace(matching=SimpleNamespace(training=None)),
+        None,
+    )
+    monkeypatch.setattr(search, "other_chain", lambda *_, **__: None)
     endless._moved = lambda *words: (moved.append(words), nearby)[1]
     endless._ended = lambda *words, **more: ended.append((words[-1], more))
     endless.run()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.calibration.identifiability import Information
+from cpunet.calibration.identifiability import Information, Selection
 from cpunet.calibration.nuisances import named
-from cpunet.calibration.selection import Selection
 
 ROWS, ACTS = 200, 2
 

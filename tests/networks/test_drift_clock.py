@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.networks.drift_clock import DriftClock
+from cpunet.networks.response_layer import DriftClock
 
 DT_NS, END = 16.0, 400
 

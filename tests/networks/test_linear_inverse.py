@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
+from cpunet.networks.generators import LinearInverse, Sizes, stretch
 from cpunet.recipes import load_recipe
 
 SIZES = Sizes(length=60, before=12, after=8, baseline=(-12, -8), level=(12, 20))

@@ -17,14 +17,17 @@ from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.training.chain_description import chain_of
-from cpunet.training.closed_forms import learned_chain, true_chain_of, true_parameters
+from cpunet.training.closed_forms import (
+    learned_chain,
+    response_figure,
+    true_chain_of,
+    true_parameters,
+)
 from cpunet.training.response import Response, response
-from cpunet.training.response_figure import response_figure
 from cpunet.training.run import Run
 from synthetic import write_run
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
-from cpunet.training.energy_bands import (
+from cpunet.training.pulse_sets import (
     HEAVIEST,
     LEAST,
     WIDEST,

@@ -10,9 +10,17 @@ import pytest
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
-from cpunet.training import held_out, response_starts
-from cpunet.training.fitter import Fitted, Fitter
-from cpunet.training.held_out import Gain, HeldOut, compared, held_out_gain, split
+from cpunet.training import fitter as fitter_module
+from cpunet.training import response_starts
+from cpunet.training.fitter import (
+    Fitted,
+    Fitter,
+    Gain,
+    HeldOutPulses,
+    compared,
+    held_out_gain,
+    split,
+)
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from unpaired import CHAIN, DT_NS, measured_with
@@ -47,7 +55,7 @@ def test_only_what_held_out_pulses_gain_is_kept(gain, best):
     of = SimpleNamespace(whiten=np.eye(3), sigma=np.full(3, 200**-0.5))
     held = []
     for part in (1.0, 0.5, 0.0):
-        one = object.__new__(HeldOut)
+        one = object.__new__(HeldOutPulses)
         off = part * gain if gain > 0 else (part - 1) * gain
         sides = ((values, np.ones(200)) for values in (sim + off, data))
         one.sides, one.comparisons, one.scales = [tuple(sides)], [of], [1.0]
@@ -89,4 +97,4 @@ def test_what_lowers_chi_square_is_kept_only_if_held_out_pulses_gain(monkeypatch
         assert fitter.gains["a ringing"].startswith("kept" if kept else "left out")
     assert str(gain) == "chi-square of held-out pulses 2.00 → 1.90 ± 0.10 per moment"
     assert not response_starts.gains("a ringing", after, before, fitter)
-    assert held_out.SURE == 2.0
+    assert fitter_module.SURE == 2.0

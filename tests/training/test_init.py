@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses

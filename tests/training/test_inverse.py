@@ -11,9 +11,7 @@ import torch
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.linear_inverse import LinearInverse
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, LinearInverse, ResponseGenerator
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude

@@ -16,12 +16,11 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
 from cpunet.training import optimal_weights
-from cpunet.training.misfit import amplitude_shift
+from cpunet.training.diagnosis import amplitude_shift
 from cpunet.training.moments import Moments
 from cpunet.training.optimal_weights import ConditionalFunctions, refine
-from cpunet.training.response_problem import Band, Parameters, ResponseProblem
-from cpunet.training.smooth_parameters import SmoothParameters
-from cpunet.training.translated import Noise, Translated
+from cpunet.training.response_problem import Band, Parameters, ResponseProblem, SmoothParameters
+from cpunet.training.translated import Noise, SimulatedSide
 from synthetic import drifting, two_sites
 
 DT_NS, KEV, N = 16.0, 2614.5, 800
@@ -63,7 +62,7 @@ def band_behind(poles_ns: tuple[float, float]) -> Band:
     ).windows
     moments = Moments.of_data(data, TRAINING, RECIPE.preparation)
     noise = Noise.draw(WHITE, energies, record_length(800), 2, np.random.default_rng(4))
-    return Band("FEP", Translated(charge(2), noise, moments, np.ones(N)), np.arange(N))
+    return Band("FEP", SimulatedSide(charge(2), noise, moments, np.ones(N)), np.arange(N))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
-from cpunet.training.response_errors import propagated
+from cpunet.training.chain_description import propagated
 
 RESPONSE = ElectronicsResponse(
     load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"]).matching[0],

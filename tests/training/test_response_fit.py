@@ -27,7 +27,7 @@ from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
 from cpunet.training.response_starts import drift_if_needed, with_drift_terms
-from cpunet.training.translated import Noise, Translated
+from cpunet.training.translated import Noise, SimulatedSide
 from unpaired import (
     CHAIN,
     DT_NS,
@@ -288,7 +288,7 @@ def asked(problem: Problem) -> ResponseProblem:
     length = record_length(few.waveforms.shape[1])
     drawn = Noise.draw(problem.noise, few.energy_kev, length, 2, np.random.default_rng(0))
     moments = Moments.of_data(problem.data.waveforms, training, recipe.preparation)
-    band = Band("all", Translated(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))
+    band = Band("all", SimulatedSide(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))
     return ResponseProblem(ElectronicsResponse(generator, DT_NS), [band])
 
 

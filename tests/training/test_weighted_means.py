@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cpunet.training.moments import Values
-from cpunet.training.weighted_means import Parts, Sums, WeightedMeans, jackknife_bias
+from cpunet.training.optimal_weights import Parts, Sums, WeightedMeans, jackknife_bias
 
 PARTS, IN_PART, FUNCTIONS = 10, 40, 40
 # How the functions, whose means are 1, change with each of two coordinates: where by chance

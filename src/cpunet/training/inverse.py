@@ -18,8 +18,7 @@ from torch import Tensor
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
-from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import LinearInverse, ResponseGenerator, Sizes, stretch
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare

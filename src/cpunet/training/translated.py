@@ -18,10 +18,10 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_tails import DrawnTails
-from cpunet.networks.drift_clock import DriftClock
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,
+    DriftClock,
     Readout,
     padded_length,
     record_length,
@@ -133,7 +133,7 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class Translated:
+class SimulatedSide:
     """A set of simulated pulses, the noise they get, and the functions they are compared by.
 
     Parameters
@@ -171,14 +171,14 @@ class Translated:
         """Sample of a record after all half maxima."""
         return PADDING_BEFORE + self.moments.preparation.samples_before + DELAY
 
-    def first(self, n: int) -> Translated:
+    def first(self, n: int) -> SimulatedSide:
         """The first `n` pulses, with their noise."""
         return self.of(slice(n))
 
-    def of(self, rows: Rows | slice) -> Translated:
+    def of(self, rows: Rows | slice) -> SimulatedSide:
         """Some of the pulses, with their noise."""
         noise = self.noise.of(rows)
-        return Translated(self.sim[rows], noise, self.moments, self.weights[rows])
+        return SimulatedSide(self.sim[rows], noise, self.moments, self.weights[rows])
 
     def sums(
         self,
