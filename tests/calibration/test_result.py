@@ -54,18 +54,6 @@ def calibrated(values=(), given=None) -> Calibrated:
     )
 
 
-def test_a_prior_is_told_as_it_was_given():
-    """Wherever the fit ends."""
-    given = {"impurity_factor": (1.1, 0.03), "cloud_fwhm_mm": (0.5, 0.02)}
-    told = described(calibrated((85.0, 1.4, 0.9), given))["parameters"]
-    for name, (value, error) in given.items():
-        prior = told[name]["prior"]
-        assert (prior["value"], prior["error"]) == pytest.approx((value, error))
-        assert prior["source"] == "given"
-    default = described(calibrated((85.0, 1.4, 0.9)))["parameters"]["impurity_factor"]["prior"]
-    assert (default["value"], default["error"]) == pytest.approx((1.0, 0.1))
-
-
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_a_parameter_at_its_bound_is_told(factor):
     """Rounding in a coordinate does not hide it."""
