@@ -30,10 +30,10 @@ from cpunet.tables import counted, percent, with_std
 from cpunet.training.closed_forms import (
     Chain,
     Numbers,
-    align_ns,
     chain_numbers,
     learned_chain,
     noise_numbers,
+    reaches_ns,
     slow_numbers,
     with_noise,
 )
@@ -271,7 +271,9 @@ def _noise_error(found: _Response) -> Numbers:
     if not error or not rms or chain.noise_kev2_per_mhz is None:
         return {}
     preparation = run.recipe.preparation
-    end_ns = align_ns(chain, preparation) + preparation.samples_after * run.dt_ns
+    end_ns = (
+        reaches_ns(chain, preparation.align_fraction) + preparation.samples_after * run.dt_ns
+    )
     sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
     kev = noise_numbers(chain)["noise_rms_kev"]
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}

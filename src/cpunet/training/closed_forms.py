@@ -74,7 +74,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
         ``droop_…_us``: fraction that has decayed.  ``noise_rms_kev`` and
         ``noise_corner_mhz``, the frequency at which the noise power falls to half.
     """
-    end_ns = align_ns(chain, preparation) + preparation.samples_after * dt_ns
+    end_ns = reaches_ns(chain, preparation.align_fraction) + preparation.samples_after * dt_ns
     time_ns = np.arange(0, max(end_ns, _SHORTEST_NS), _FINE_NS)
     step, undecayed = chain.whole.step(time_ns), chain.undecayed.step(time_ns)
     numbers = {
@@ -94,19 +94,9 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     return numbers | noise_numbers(chain)
 
 
-def align_ns(chain: Chain, preparation: PreparationConfig) -> float:
-    """Time in ns at which a step response reaches the alignment level of prepared pulses."""
-    step = chain.whole.step(np.arange(0, _SHORTEST_NS, _FINE_NS))
-    return _reaches_ns(step, preparation.align_fraction)
-
-
-def half_height_ns(chain: Chain) -> float:
-    """Time in ns after the step at which its response reaches half of its maximum."""
-    time_ns = np.arange(0.0, STEP_NS, GRID_NS)
-    step = chain.whole.step(time_ns)
-    half = 0.5 * step.max()
-    after = int((step >= half).argmax())
-    return float(np.interp(half, step[after - 1 : after + 1], time_ns[after - 1 : after + 1]))
+def reaches_ns(chain: Chain, fraction: float) -> float:
+    """Time in ns after a step at which its response reaches a fraction of its maximum."""
+    return _reaches_ns(chain.whole.step(np.arange(0, _SHORTEST_NS, _FINE_NS)), fraction)
 
 
 @styled
@@ -150,7 +140,7 @@ def response_figure(
 def _responses(
     panels: dict[str, Axes], chain: Chain, colour: str, width: float, tail_ns: float
 ) -> None:
-    half_ns = half_height_ns(chain)
+    half_ns = reaches_ns(chain, 0.5)
     long_ns = np.arange(-100.0, STEP_NS, GRID_NS)
     short_ns = np.arange(-150.0, IMPULSE_NS, GRID_NS)
     tail = np.geomspace(100.0, tail_ns, _POINTS)
@@ -164,9 +154,9 @@ def _residuals(
     axes: Axes, chains: Sequence[Chain], truth: Chain | None, shades: Sequence[str]
 ) -> None:
     time_ns = np.arange(-100.0, STEP_NS, GRID_NS)
-    steps = [chain.whole.step(time_ns + half_height_ns(chain)) for chain in chains]
+    steps = [chain.whole.step(time_ns + reaches_ns(chain, 0.5)) for chain in chains]
     if truth is not None:
-        reference, name = truth.whole.step(time_ns + half_height_ns(truth)), "truth"
+        reference, name = truth.whole.step(time_ns + reaches_ns(truth, 0.5)), "truth"
     else:
         reference, name = np.mean(steps, axis=0), "mean"
     for i, step in enumerate(steps):
@@ -297,7 +287,7 @@ def with_noise(
     noise = network.noise
     # height of a full charge whose tail has the level of prepared pulses
     tail = preparation.samples_after - 0.5 * preparation.tail_samples
-    tail_ns = align_ns(chain, preparation) + tail * noise.dt_ns
+    tail_ns = reaches_ns(chain, preparation.align_fraction) + tail * noise.dt_ns
     height = preparation.tail_level / float(chain.whole.step(tail_ns))
     dt_us = 1e-3 * noise.dt_ns
     return Chain(

@@ -232,7 +232,7 @@ class DifferentiableSet:
         for first in range(0, len(self.sim), size):
             spectra = torch.from_numpy(self.sim.spectrum(response, first, size))
             clean, moved = self.records(spectra, transfer), self.records(spectra, slopes)
-            for draw in self._draws[:draws]:
+            for draw in range(len(self.sim.noise.factor))[:draws]:
                 noise = self.noise(draw, first, len(clean))
 
                 def of(records: Tensor, noise: Tensor = noise) -> Tensor:
@@ -248,10 +248,6 @@ class DifferentiableSet:
                 # the values are the same along all directions
                 values, columns = torch.func.vmap(along, out_dims=(None, 0))(moved)  # type: ignore[arg-type]
                 yield first, values, columns, self.weights[first : first + size]
-
-    @property
-    def _draws(self) -> range:
-        return range(len(self.sim.noise.factor))
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:
         """Noise of `n` pulses from the first one on, shape (n, samples)."""

@@ -211,6 +211,12 @@ class ResponseProblem:
         prior = (vector - self.parameters.centre) / self.parameters.widths
         return np.concatenate([self.deviations(vector), prior])
 
+    @property
+    def cost(self) -> float:
+        """Sum of the squared residuals where the response is."""
+        residuals = self.residuals(self.parameters.vector())
+        return float(residuals @ residuals)
+
     def jacobian(self, vector: Values, residuals: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters)."""
         derivatives = self.derivatives(vector, residuals[: self.moments], range(len(vector)))

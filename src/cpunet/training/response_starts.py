@@ -114,7 +114,7 @@ def from_known(
     starts = [first.of(start)]
     if fitter.decay is None:
         starts.append(first.of(copy.deepcopy(known)))
-    problem = min(starts, key=_cost)
+    problem = min(starts, key=lambda start: start.cost)
     for coarse in (False, True):
         found = fitter.fit(problem, coarse=coarse)
         if not found.poor:
@@ -216,7 +216,7 @@ def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
         _free_decay_start(problem, free, us, share, decay)
         for us, share in _decays(problem, decay)
     ]
-    return fitter.fit(min(starts, key=_cost), coarse=False)
+    return fitter.fit(min(starts, key=lambda start: start.cost), coarse=False)
 
 
 def _free_decay_start(
@@ -268,11 +268,6 @@ def _fast_slope(problem: ResponseProblem, fast_us: float) -> float:
     us = 1e-3 * float(problem.response.dt_ns)
     middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * us
     return math.exp(-middle_us / fast_us) / fast_us
-
-
-def _cost(problem: ResponseProblem) -> float:
-    residuals = problem.residuals(problem.parameters.vector())
-    return float(residuals @ residuals)
 
 
 def ringing_if_better(found: Fitted, fitter: Fitter) -> Fitted:
