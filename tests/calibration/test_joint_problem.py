@@ -39,8 +39,8 @@ class Pairs:
     def __len__(self):
         return len(self.sim)
 
-    def first(self, n):
-        return Pairs(self.sim[:n], self.weights[:n])
+    def of(self, rows):
+        return Pairs(self.sim[rows], self.weights[rows])
 
     def sums(self, response, of, *, cut=True, draws=None):
         readings = Readings(self.sim, np.zeros(len(self)), self.weights)

@@ -214,7 +214,13 @@ class _Job:
             search = self._search(sides, bar.update)
             bar.total = search.simulations
             calibrated = search.run()
-        self._require_hope(calibrated, sides)
+        per = calibrated.chi_square / calibrated.problem.moments
+        if per > HOPELESS:
+            raise CpunetError(
+                f"{self.data.path}: no physics near those of {sides.stored.detector.name} "
+                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
+                "of another detector, or of other energies (`peak`)?"
+            )
         content = self._content(calibrated, sides)
         if len(calibrated.alternatives) > 1:
             self._compare(calibrated, sides, content)
@@ -296,15 +302,6 @@ class _Job:
             known=known_depletion(physics, given.get(DEPLETION)),
             free=None if free is None else list(range(len(free))),
         )
-
-    def _require_hope(self, calibrated: Calibrated, sides: CalibrationInputs) -> None:
-        per = calibrated.chi_square / calibrated.problem.moments
-        if per > HOPELESS:
-            raise CpunetError(
-                f"{self.data.path}: no physics near those of {sides.stored.detector.name} "
-                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
-                "of another detector, or of other energies (`peak`)?"
-            )
 
     def _compare(
         self, calibrated: Calibrated, sides: CalibrationInputs, content: dict[str, Any]

@@ -290,7 +290,7 @@ class JointProblem:
 
     def _covariance(self, band: Band, functions: SlicedFunctions) -> Values:
         """Covariance of the functions over the simulated pulses of a band."""
-        some = band.sim.first(FOR_COVARIANCE)
+        some = band.sim.of(slice(FOR_COVARIANCE))
         waveforms = self.prepared(self.nearby.centre).waveforms[band.rows[: len(some)]]
 
         def of(readings: Readings) -> tuple[Values, ...]:
@@ -343,7 +343,7 @@ class JointProblem:
         translated = []
         for band in self.bands:
             n_rows = len(band.rows) if most is None else np.searchsorted(band.rows, most)
-            some = band.sim.first(int(n_rows))
+            some = band.sim.of(slice(int(n_rows)))
             translated.append(replace(some, sim=waveforms[band.rows[: len(some)]]))
         self._translated[most] = self.nearby, coordinates.copy(), translated
         return translated

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
+from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import LearnedConfig, ResponseConfig
@@ -242,11 +242,6 @@ class ResponseGenerator(KeptNoise):
     def noise_dt_ns(self) -> float:
         """Current sampling period of the response in ns."""
         return float(self.response.dt_ns)
-
-    @property
-    def trace_noise(self) -> TraceNoise:
-        """The noise, and tails if there are any."""
-        return TraceNoise(self.noise, self.tails)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""

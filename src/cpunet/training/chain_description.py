@@ -9,7 +9,6 @@ along each of its axes.
 from __future__ import annotations
 
 import copy
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -25,7 +24,6 @@ from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import SideInfo
 from cpunet.recipes.network_settings import ResponseConfig
-from cpunet.recipes.schema import PreparationConfig
 from cpunet.tables import counted, percent, with_std
 from cpunet.training.closed_forms import (
     Chain,
@@ -72,10 +70,7 @@ def propagated(
     moved = copy.deepcopy(response)
     parameters = Parameters(moved)
     centre = parameters.vector()
-    try:
-        matrix = np.asarray(covariance, float)
-    except ValueError:  # rows of different lengths
-        return {}
+    matrix = np.asarray(covariance, float)
     if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
         return {}
     variances, axes = np.linalg.eigh(matrix)
@@ -153,7 +148,25 @@ def describe_chain(run: Run) -> dict[str, Any]:
     CpunetError
         If the run has no response in closed form.
     """
-    return _told(_response(run))
+    found = _response(run)
+    parameters = found.parameters
+    slow = {n: w for n, w in parameters.items() if n.startswith("slow_")}
+    values = {n: v for n, v in parameters.items() if n not in slow}
+    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
+    values |= chain_numbers(found.chain, run.recipe.preparation, run.dt_ns)
+    if run.fit is not None and run.fit.chi_square_per_moment is not None:
+        values["chi_square_per_moment"] = run.fit.chi_square_per_moment
+    return {
+        "path": run.name,
+        "recipe": run.recipe.name,
+        "peak": run.peak,
+        "seed": run.seed,
+        "values": values,
+        "errors": {n: e for n, e in found.errors.items() if n in values} | _noise_error(found),
+        "parameters": parameters,
+        "parameter_errors": found.errors,
+        "doubts": _doubts(found),
+    }
 
 
 def chain_of(run: Run) -> Chain:
@@ -190,19 +203,6 @@ def _response(run: Run) -> _Response:
             "`cpunet validate`"
         )
     network = run.fill("ren", ResponseGenerator(recipe.generator, run.dt_ns))
-    try:
-        found = _described(run, network)
-    except (ArithmeticError, ValueError, LookupError, RuntimeError) as error:
-        raise CpunetError(
-            f"{run.name}: its weights make no response of electronics ({error}); train again"
-        ) from error
-    wrong = [name for name, value in found.parameters.items() if not math.isfinite(value)]
-    if wrong:
-        raise CpunetError(f"{run.name}: {wrong[0]} of its response is no number; train again")
-    return found
-
-
-def _described(run: Run, network: ResponseGenerator) -> _Response:
     response, preparation, fit = network.response, run.recipe.preparation, run.fit or FitInfo()
     chain = learned_chain(response, Path(run.name).name)
     if int(network.n_baselines):
@@ -211,42 +211,14 @@ def _described(run: Run, network: ResponseGenerator) -> _Response:
     if len(response.ringing):
         parameters["ringing"] = response.ringing.norm().item()
     errors = fitted_errors(response, fit.errors)
-    errors |= propagated(
-        response,
-        fit.covariance,
-        lambda moved: _shape_numbers(moved, preparation, run.dt_ns),
-    )
+
+    def derived(moved: ElectronicsResponse) -> Numbers:
+        slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
+        numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
+        return slow_numbers(slow) | numbers
+
+    errors |= propagated(response, fit.covariance, derived)
     return _Response(run, chain, parameters, errors)
-
-
-def _shape_numbers(
-    response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
-) -> Numbers:
-    """Derived numbers of a response, which are not parameters of the fit."""
-    slow = list(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
-    numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
-    return slow_numbers(slow) | numbers
-
-
-def _told(found: _Response) -> dict[str, Any]:
-    run, parameters = found.run, found.parameters
-    slow = {n: w for n, w in parameters.items() if n.startswith("slow_")}
-    values = {n: v for n, v in parameters.items() if n not in slow}
-    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
-    values |= chain_numbers(found.chain, run.recipe.preparation, run.dt_ns)
-    if run.fit is not None and run.fit.chi_square_per_moment is not None:
-        values["chi_square_per_moment"] = run.fit.chi_square_per_moment
-    return {
-        "path": run.name,
-        "recipe": run.recipe.name,
-        "peak": run.peak,
-        "seed": run.seed,
-        "values": values,
-        "errors": {n: e for n, e in found.errors.items() if n in values} | _noise_error(found),
-        "parameters": parameters,
-        "parameter_errors": found.errors,
-        "doubts": _doubts(found),
-    }
 
 
 def _doubts(found: _Response) -> list[str]:

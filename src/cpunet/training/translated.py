@@ -165,10 +165,6 @@ class SimulatedSide:
         """Sample of a record after all half maxima."""
         return PADDING_BEFORE + self.moments.preparation.samples_before + DELAY
 
-    def first(self, n: int) -> SimulatedSide:
-        """The first `n` pulses, with their noise."""
-        return self.of(slice(n))
-
     def of(self, rows: Rows | slice) -> SimulatedSide:
         """Some of the pulses, with their noise."""
         noise = self.noise.of(rows)
