@@ -147,14 +147,8 @@ def calibrate(
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
     freedom = Freedom.of(free, fix, prior)
-    job = partial(
-        _Job,
-        recipe=settings,
-        freedom=freedom,
-        peak=peak,
-        events=events,
-        seed=require_seed(seed),
-    )
+    seed = require_seed(seed)
+    job = partial(_Job, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed)
     inputs = [] if isinstance(recipe, Recipe) else [recipe]
     target = None if out is None else Path(out)
     if sides[1].table != ALL:
