@@ -37,7 +37,7 @@ from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
-from cpunet.training.translated import Noise, Translated
+from cpunet.training.translated import Noise, SimulatedSide
 from cpunet.translation.translator import REN
 
 RECIPE = load_recipe("fast")
@@ -97,7 +97,7 @@ def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
     length = record_length(sim.waveforms.shape[1])
     drawn = Noise.draw(noise, sim.energy_kev, length, TRAINING.noise_sets, rng)
     rows = np.arange(len(sim))
-    return Band("FEP", Translated(sim.waveforms, drawn, moments, np.ones(len(sim))), rows)
+    return Band("FEP", SimulatedSide(sim.waveforms, drawn, moments, np.ones(len(sim))), rows)
 
 
 def readings(band: Band, response: ElectronicsResponse) -> torch.Tensor:

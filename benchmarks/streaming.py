@@ -21,7 +21,7 @@ import torch
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe

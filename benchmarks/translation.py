@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.translation.backends import Drawn, NetworkBackend, ResponseBackend
 

@@ -18,7 +18,7 @@ from cpunet.pulses.description import trace_properties
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.training import run_words
+from cpunet.training import chain_description
 from synthetic import write_run
 
 RECIPE = load_recipe("fast")
@@ -245,7 +245,7 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
     fit = {"noise": {"rms": 1.6, "baselines": 9}}
     write_run(run, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
     assert dict(info(run).lines)["noise"] == "of 9 baselines"
-    monkeypatch.setattr(run_words, "noise_kev", lambda _: (1.95, 0.05))
+    monkeypatch.setattr(chain_description, "noise_kev", lambda _: (1.95, 0.05))
     assert dict(info(run).lines)["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"
 
 

@@ -15,7 +15,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.readout import coloured_noise
-from cpunet.networks.linear_inverse import stretch
+from cpunet.networks.generators import stretch
 from cpunet.networks.response_layer import Readout
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses

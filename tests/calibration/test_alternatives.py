@@ -55,10 +55,3 @@ def test_slower_holes_drift_longer_and_that_decides(hits):
     assert ratio == pytest.approx(1 / 0.8, abs=0.04)
     assert slower["SEP_current_amplitude"] < here["SEP_current_amplitude"]
     assert deciding == ["SEP"]
-
-
-def test_what_predicts_the_same_is_not_told_apart(hits):
-    used = parse_selection("FEP", RECIPE.peaks)
-    (one, other), deciding = side_by_side([(physics(1.0), 0.0)] * 2, hits, RECIPE, used)
-    assert one == other
-    assert not deciding

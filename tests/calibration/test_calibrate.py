@@ -7,7 +7,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
@@ -190,19 +189,3 @@ def test_too_few_pulses_tell_nothing(stand, tmp_path):
         cpunet.CpunetError, match=r"tell nothing of the physics.*; give more files"
     ):
         cpunet.calibrate(*sides, tmp_path / "run", peak="DEP")
-
-
-def test_one_of_two_channels_of_a_name_must_be_chosen(stand, tmp_path):
-    data = tmp_path / "data.lh5"
-    with h5py.File(stand / "data.lh5") as one, h5py.File(data, "w") as two:
-        for top in ("left", "right"):
-            one.copy("geds", two.create_group(top))
-    for table in (None, "geds"):
-        read = cpunet.ReadOptions(data_table=table)
-        with pytest.raises(cpunet.CpunetError, match=r"left/geds/raw, right/geds/raw"):
-            cpunet.calibrate(stand / "sim.lh5", data, tmp_path / "run", read=read)
-
-
-def test_an_input_is_not_overwritten(stand):
-    with pytest.raises(cpunet.CpunetError, match="holds the input"):
-        cpunet.calibrate(stand / "sim.lh5", stand / "data.lh5", stand, force=True)

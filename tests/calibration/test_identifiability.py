@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cpunet.calibration.identifiability import Information, together
+from cpunet.calibration.identifiability import Information, Selection, together
 from cpunet.calibration.nuisances import named
 
 NUISANCES = tuple(named(name) for name in ("temperature", "hole_velocity_low", "cloud"))
@@ -62,3 +62,73 @@ def test_a_degenerate_pair_is_told_as_its_known_combination(correlation, n):
 def test_errors_follow_the_number_of_pulses(alike):
     ratio = alike.errors([0]) / alike.for_pulses(4000).errors([0])
     assert ratio == pytest.approx(2, rel=0.01)
+
+
+ROWS, ACTS = 200, 2
+
+
+def selection(seed=0, size=6.0, begun=0.0) -> Selection:
+    """A chain of one column, and four of physics, of which the third acts with a size."""
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(ROWS, 5)) / np.sqrt(ROWS)
+    effect = size * columns[:, 1 + ACTS]
+    # a half varies twice as much as all pulses, which are the mean of both halves
+    halves = effect + np.sqrt(2) * rng.normal(size=(2, ROWS))
+    weak = 1e-6 * np.eye(5)  # priors
+    at = np.array([0.0, begun, 0.0, 0.0])
+    return Selection(
+        np.concatenate([columns, weak]),
+        np.concatenate([halves.mean(axis=0), np.zeros(5)]),
+        halves,
+        at,
+    )
+
+
+def test_the_one_that_acts_describes_held_out_pulses_better():
+    """On average by the fall of chi-square of all pulses, less the price of 2."""
+    gains = np.array(
+        [
+            [one.score([]) - one.score([i]) for i in range(4)]
+            for one in map(selection, range(200))
+        ]
+    )
+    error = gains.std(axis=0) / np.sqrt(len(gains))
+    expected = np.array([-2.0, -2.0, 36.0 - 2.0, -2.0])
+    assert np.abs(gains.mean(axis=0) - expected) == pytest.approx(0, abs=0.1 * 36)
+    assert (np.abs(gains.mean(axis=0) - expected)[[0, 1, 3]] < 4 * error[[0, 1, 3]]).all()
+
+
+def test_costs_are_those_of_a_direct_fit():
+    one = selection(begun=0.7)
+    cost, there = one.cost([ACTS])
+    # the one that had moved, and is not chosen, goes back to where it was simulated
+    begun = one.residuals - 0.7 * one.jacobian[:, 2]
+    columns = one.jacobian[:, [0, 1 + ACTS]]
+    move = np.linalg.lstsq(columns, -begun)[0]
+    assert cost == pytest.approx(float(np.sum((begun + columns @ move) ** 2)))
+    assert there == pytest.approx([0, 0, move[1], 0])
+
+
+def test_what_is_told_begins_with_what_held_out_pulses_need():
+    """Of two parameters that act alike, only the first taken is determined."""
+    nuisances = tuple(named(name) for name in ("temperature", "hole_velocity_low"))
+    widths = np.array([n.prior for n in nuisances])
+    rng = np.random.default_rng(2)
+    common, other = rng.normal(size=(2, ROWS))
+    # alike, but the second one describes the pulses
+    columns = np.stack([common, common + 0.05 * other], axis=1)
+    deviation = 30 * columns[:, 1]
+    halves = deviation + rng.normal(size=(2, ROWS))
+    one = Selection(
+        np.concatenate([columns / widths, np.diag(1 / widths)]),
+        np.concatenate([halves.mean(axis=0), np.zeros(2)]),
+        halves,
+        np.zeros(2),
+    )
+    alike = Information(nuisances, np.full((2, 2), 100.0) / np.outer(widths, widths), widths, 1)
+    assert one.begin(alike, [0, 1]) == [1]
+    assert one.begin(alike, [0]) == [0]
+
+
+def test_other_sets_lack_or_exchange_one():
+    assert list(selection().others([1])) == [[], [0], [2], [3]]

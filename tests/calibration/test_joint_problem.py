@@ -39,8 +39,8 @@ class Pairs:
     def __len__(self):
         return len(self.sim)
 
-    def first(self, n):
-        return Pairs(self.sim[:n], self.weights[:n])
+    def of(self, rows):
+        return Pairs(self.sim[rows], self.weights[rows])
 
     def sums(self, response, of, *, cut=True, draws=None):
         readings = Readings(self.sim, np.zeros(len(self)), self.weights)
@@ -150,17 +150,6 @@ def test_derivatives_are_of_steps_in_which_the_functions_are_linear(sides):
     assert found == pytest.approx(true, rel=0.05)
 
 
-def test_another_chain_is_compared_with_the_same_weights(sides):
-    sim, data = sides
-    both = problem(sim, data)
-    moved = both.parameters.vector()
-    moved[-2:] = 0.1, 0.05
-    cost = both.chi_square(moved)
-    other = both.of_chain(ElectronicsResponse(RECIPE.matching[0], 16.0))
-    assert other.parameters.free == []
-    assert other.chi_square(other.parameters.vector()) == pytest.approx(cost)
-
-
 def test_far_from_the_data_only_their_covariance_counts(sides):
     sim, data = sides
     held = problem(sim, data, held=True)
@@ -231,16 +220,3 @@ def test_what_is_not_free_stays(sides):
     one.pulls(vector)
     assert parameters.coordinates[0] == 1.0
     assert parameters.coordinates[1] == pytest.approx(np.log(PHYSICS.nuisances[1].highest))
-
-
-def test_pulses_are_prepared_once_for_all_derivatives_of_the_chain(sides):
-    both = problem(*sides)
-    asked = []
-    prepared = both.prepared
-    both.prepared = lambda at, most=None: (asked.append(tuple(at)), prepared(at, most))[1]
-    vector = both.parameters.vector()
-    both.jacobian(vector, np.empty(0))
-    assert len(asked) == 3  # here, and for either parameter of the physics
-    here = both.pulls(vector)
-    both.nearby = Nearby(both.nearby.simulator, both.nearby.centre, sides[1], {})
-    assert not np.allclose(both.pulls(vector), here)  # other pulses at the same place

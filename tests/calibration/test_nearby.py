@@ -62,21 +62,6 @@ def test_derivatives_follow_the_edge(simulator):
     assert followed < 0.5 * stale
 
 
-def test_derivatives_are_simulated_again_if_edges_have_moved(simulator):
-    nearby = Nearby.about(simulator, np.zeros(3), [2])
-    reach = np.array([1.5, 0.03, 0.9])
-    for kelvin, outdated in ((0.02, []), (1.2, [2])):
-        moved = nearby.moved(np.array([kelvin, 0.0, 0.0]))
-        assert moved.outdated([2], reach) == moved.unknown([2]) == outdated
-
-
-def test_each_derivative_takes_two_more_simulations(simulator, monkeypatch):
-    told = []
-    monkeypatch.setattr(simulator, "_simulated", lambda: told.append(1))
-    Nearby.about(simulator, np.zeros(3), range(3))
-    assert len(told) == 1 + 1 + 2 * 3
-
-
 def test_at_its_centre_nothing_is_added(simulator):
     centre = np.array([1.0, 0.0, 0.0])
     nearby = Nearby.about(simulator, centre, [])

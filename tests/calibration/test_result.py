@@ -10,8 +10,7 @@ import pytest
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.result import described, doubts, notes
-from cpunet.calibration.search import Calibrated
+from cpunet.calibration.result import Calibrated, described, doubts, notes
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
@@ -53,18 +52,6 @@ def calibrated(values=(), given=None) -> Calibrated:
         rounds=1,
         settled=True,
     )
-
-
-def test_a_prior_is_told_as_it_was_given():
-    """Wherever the fit ends."""
-    given = {"impurity_factor": (1.1, 0.03), "cloud_fwhm_mm": (0.5, 0.02)}
-    told = described(calibrated((85.0, 1.4, 0.9), given))["parameters"]
-    for name, (value, error) in given.items():
-        prior = told[name]["prior"]
-        assert (prior["value"], prior["error"]) == pytest.approx((value, error))
-        assert prior["source"] == "given"
-    default = described(calibrated((85.0, 1.4, 0.9)))["parameters"]["impurity_factor"]["prior"]
-    assert (default["value"], default["error"]) == pytest.approx((1.0, 0.1))
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

@@ -9,12 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration import search
+from cpunet.calibration import other_chains, search
+from cpunet.calibration.identifiability import Selection
 from cpunet.calibration.inputs import Freedom, known_depletion, require_depletion
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.search import ROUNDS, Search, _relaxed
-from cpunet.calibration.selection import Selection
+from cpunet.calibration.other_chains import NEEDED, decaying_chain, other_chain
+from cpunet.calibration.search import Search, _relaxed
 from cpunet.errors import CpunetError
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.superposition import solve
@@ -46,39 +49,6 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
     assert known(np.array([np.log(1.1), 0.01]))[0] == pytest.approx(0, abs=1.5)
     assert known(np.zeros(2))[0] < -5
     assert not len(known_depletion(physics, None)(np.zeros(2)))
-
-
-@pytest.mark.parametrize("prior", ["impurity=0±0.1", "impurity=-1±0.1", "temperature=200±1"])
-def test_a_prior_beyond_what_can_be_is_refused(prior):
-    with pytest.raises(CpunetError, match=r"^`prior` .* can be .*; give a value between"):
-        Freedom.of("", "", [prior])
-    assert Freedom.of("", "", ["self_repulsion=0±0.5"]).priors
-
-
-def test_after_the_last_round_nothing_is_simulated(monkeypatch):
-    """A search that never settles moves between its rounds only."""
-    ended, moved = [], []
-    parameters = SimpleNamespace(
-        chain=SimpleNamespace(response="chain"), coordinates=np.ones(1), free=[0], n_chain=0
-    )
-    nearby = SimpleNamespace(centre=np.zeros(1))
-    monkeypatch.setattr(search.Nearby, "about", lambda *_: nearby)
-    found = SimpleNamespace(covariance=np.eye(1))
-    monkeypatch.setattr(search, "levenberg_marquardt", lambda *_, **__: found)
-    physics = SimpleNamespace(nuisances=(named("temperature"),))
-    endless = Search.__new__(Search)
-    endless.simulator = SimpleNamespace(physics=physics)
-    endless._first = [0]
-    endless._chain = lambda: "chain"
-    endless._tell = lambda *_: None
-    endless._problem = lambda *_, **__: SimpleNamespace(parameters=parameters)
-    endless._first_free = lambda *_: [0]
-    endless._other_chain = lambda *_, **__: None
-    endless._moved = lambda *words: (moved.append(words), nearby)[1]
-    endless._ended = lambda *words, **more: ended.append((words[-1], more))
-    endless.run()
-    assert ended == [(ROUNDS, {"settled": False})]
-    assert len(moved) == ROUNDS - 1
 
 
 def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
@@ -170,3 +140,73 @@ def test_what_is_free_and_what_is_not():
             Freedom.of(free, fixed, ["li_thickness=1±0.1"])
     some = Freedom.of("li_thickness,bias", "bias", [])
     assert [nuisance.name for nuisance in some.looked_at] == ["li_thickness_mm"]
+
+
+RECIPE = load_recipe("fast")
+CHAIN, OTHER = (ElectronicsResponse(RECIPE.matching[0], 16.0) for _ in range(2))
+
+
+def compared(chi_square, chain=CHAIN, after=None):
+    """A comparison with a chi-square, and that of another chain."""
+    return SimpleNamespace(
+        parameters=SimpleNamespace(
+            chain=SimpleNamespace(response=chain), vector=lambda: np.empty(0)
+        ),
+        chi_square=lambda vector: chi_square,
+        by_chance=(100.0, 10.0),
+        of_chain=lambda chain: compared(after, chain),
+    )
+
+
+@pytest.fixture
+def decay_free(monkeypatch):
+    """Stubs of the fits; what they are called with."""
+    called = []
+
+    def fit(plain, fitter):
+        called.append(fitter.decay)
+        return SimpleNamespace(problem=SimpleNamespace(response=OTHER))
+
+    monkeypatch.setattr(other_chains, "_at_these_physics", lambda *_: None)
+    monkeypatch.setattr(other_chains, "with_free_decay", fit)
+    monkeypatch.setattr(other_chains, "levenberg_marquardt", lambda *_, **__: None)
+    return called
+
+
+SETS = SimpleNamespace(tails=SimpleNamespace(known_decay="that of the tails"))
+
+
+def test_what_chance_may_leave_needs_no_other_chain(decay_free):
+    assert decaying_chain(compared(139.0), SETS, RECIPE.matching[1]) is None
+    assert not decay_free
+
+
+@pytest.mark.parametrize(("fall", "kept"), [(NEEDED - 1, False), (NEEDED + 1, True)])
+def test_a_decay_of_free_time_is_kept_if_chi_square_falls(decay_free, fall, kept):
+    found = decaying_chain(compared(141.0, after=141.0 - fall), SETS, RECIPE.matching[1])
+    assert found is (OTHER if kept else None)
+    assert decay_free == ["that of the tails"]
+
+
+def test_each_kind_of_chain_is_tried_in_its_round_and_at_the_end():
+    tried = []
+
+    def never(problem, sets, training):
+        tried.append("never")
+
+    def ever(problem, sets, training):
+        tried.append("ever")
+        return OTHER
+
+    kinds = {never: 1, ever: 2}
+
+    def other(number, *, settled=False):
+        tried.clear()
+        found = other_chain(None, SETS, None, kinds, number, settled=settled)
+        return found, tried.copy()
+
+    assert other(1) == (None, ["never"])
+    assert other(2) == (OTHER, ["ever"])
+    assert other(3) == (None, [])
+    assert other(4, settled=True) == (None, ["never"])
+    assert not kinds

@@ -21,7 +21,7 @@ import yaml
 from torch import nn
 
 from cpunet.cli import main
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.outputs import folder_written_aside
 from cpunet.recipes import load_recipe
 from cpunet.training.run import RUN

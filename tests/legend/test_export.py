@@ -15,7 +15,7 @@ from torch import nn
 from cpunet.errors import CpunetError
 from cpunet.legend.export import export_legend
 from cpunet.legend.make_library import make_library
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import write_run

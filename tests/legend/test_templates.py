@@ -9,7 +9,7 @@ import pytest
 from torch import nn
 
 from cpunet.legend.templates import TemplateTranslator
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.recipes import load_recipe
 from cpunet.translation.translator import REN
 from synthetic import after_pole_and_decay, sampled, write_run

@@ -119,12 +119,6 @@ def test_a_blur_adds_its_variance(variance):
     torch.testing.assert_close(added, torch.full_like(added, variance), rtol=0.02, atol=0)
 
 
-def test_half_of_a_unet_is_half_of_what_it_does():
-    network = drift(0.1)
-    network.share.fill_(0.5)
-    torch.testing.assert_close(network(edges()), drift(0.05)(edges()), atol=1e-5, rtol=0)
-
-
 def test_the_effect_is_told_in_times_and_variances_of_each_pulse():
     pulses = edges()
     before_ns, longer, blur_ns2 = drift(0.05, variance=2.0).effect(pulses)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
+from cpunet.networks.generators import LinearInverse, Sizes, stretch
 from cpunet.recipes import load_recipe
 
 SIZES = Sizes(length=60, before=12, after=8, baseline=(-12, -8), level=(12, 20))
@@ -54,27 +54,12 @@ def test_the_mean_is_put_in_place_of_what_has_no_weight(identity):
     torch.testing.assert_close(result[0, 19:39], torch.linspace(0, 1, 20))
 
 
-def test_an_edge_before_a_second_one_is_not_lost(identity):
-    pulses = edges(30)
-    pulses[:, 52:] += 0.5
-    torch.testing.assert_close(identity(pulses), edges(30))
-
-
 def test_a_window_that_is_no_pulse_has_nothing_to_say_to_others(identity):
     pulses = edges(25, 30, 33)
     pulses[1] = float("nan")
     result = identity(pulses)
     assert result[1].isnan().any()
     torch.testing.assert_close(result[[0, 2]], edges(25, 33))
-
-
-def test_weights_go_through_a_file(identity, tmp_path):
-    torch.save(identity.state_dict(), tmp_path / "iren.pt")
-    loaded = LinearInverse(SIZES)
-    loaded.load_state_dict(torch.load(tmp_path / "iren.pt"))
-    pulses = edges(25, 30)
-    torch.testing.assert_close(loaded(pulses), identity(pulses))
-    assert not list(loaded.parameters())
 
 
 def test_sizes_of_a_recipe_fit_its_windows():

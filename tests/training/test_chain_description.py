@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,17 @@ from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
-from cpunet.training.chain_description import chain_of
-from cpunet.training.closed_forms import learned_chain, true_chain_of, true_parameters
+from cpunet.training.chain_description import propagated
+from cpunet.training.closed_forms import (
+    learned_chain,
+    response_figure,
+    true_chain_of,
+)
+from cpunet.training.diagnosis import beyond, diagnosis, parts_off
 from cpunet.training.response import Response, response
-from cpunet.training.response_figure import response_figure
 from cpunet.training.run import Run
 from synthetic import write_run
 
@@ -116,35 +120,6 @@ def test_a_single_pole_and_a_single_decay(tmp_path):
     assert decaying["droop_5_us"] == pytest.approx(1 - np.exp(-5 / 54.6), rel=0.03)
 
 
-def test_an_overshoot_is_found_without_the_decays(tmp_path):
-    numbers = values(
-        write_response(
-            tmp_path / "a", "generator.poles_ns=[1]", "generator.decay_us=20", slow={4: -0.1}
-        )
-    )
-    assert numbers["overshoot"] == pytest.approx(0.1, abs=2e-3)
-    assert numbers["slow_share"] == pytest.approx(-0.1)
-    assert numbers["slow_time_ns"] == pytest.approx(1600)
-
-
-def test_parts_of_the_same_time_add_up(tmp_path):
-    time_ns = np.array([50.0, 200.0, 600.0])
-    found = [
-        chain_of(
-            Run.load(
-                write_response(tmp_path / name, f"generator.slow_ns={slow_ns}", slow=weights)
-            )
-        ).undecayed.step(time_ns)
-        for name, slow_ns, weights in (
-            ("a", [400], {0: 0.06}),
-            ("b", [400, 400.001], {0: 0.04, 1: 0.02}),
-        )
-    ]
-    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
-    both = electronics(overshoot={"fraction": 0.02, "tau_ns": 400})
-    assert true_parameters(both)["slow_share"] == pytest.approx(0.065 - 0.02)
-
-
 def test_noise_is_told_in_kev(tmp_path):
     """A full charge is 0.8 e^(t/tau) high in prepared pulses; power falls by half at 8 MHz."""
     frequency_mhz = np.linspace(0, 500 / DT_NS, NOISE_BINS)
@@ -190,27 +165,6 @@ def test_errors_go_with_the_poles_they_belong_to(run):
     assert told["parameter_errors"]["slow_400_ns"] == 0.004
     assert told["parameters"]["slow_400_ns"] == pytest.approx(0.065)
     assert told["values"]["chi_square_per_moment"] == 1.5
-
-
-def test_differences_in_units_of_the_error(run):
-    truth = response(run, truth=electronics(bandwidth_poles_ns=[50, 35])).content["truth"]
-    assert truth["difference"]["pole_1_ns"] == pytest.approx(5)
-    assert truth["sigma"]["pole_1_ns"] == pytest.approx(5 / 2.75)
-
-
-def test_mean_and_spread_of_several_runs(tmp_path):
-    runs = [
-        write_response(
-            tmp_path / f"run{tau}", f"generator.poles_ns=[{tau}]", "generator.decay_us=80"
-        )
-        for tau in (48, 50, 55)
-    ]
-    told = response(*runs, truth=electronics(bandwidth_poles_ns=[50])).content
-    assert told["mean"]["pole_1_ns"] == pytest.approx(51)
-    assert told["spread"]["pole_1_ns"] == pytest.approx(np.std([48, 50, 55], ddof=1))
-    # the runs share their data, so that without errors of the fit nothing says how far it is
-    assert told["truth"]["difference"]["pole_1_ns"] == pytest.approx(1)
-    assert told["truth"]["sigma"] == {}
 
 
 def test_seeds_that_agree_by_their_data_are_not_far_from_the_truth(tmp_path):
@@ -305,12 +259,6 @@ def test_the_figure_shows_every_chain_beside_the_truth():
             assert len(residual.lines) == residuals + 1  # and the line at 0
         assert (residual is None) == (residuals == 0)  # no panel is empty
         assert all(len(axes.lines) == len(step.lines) for axes in rest)
-    # half height is at 0, and a residual that of the chains at half height
-    figure = response_figure(others[:1], others[0], tail_ns=6400)
-    step, residual, *_ = _panels(figure)
-    time, height = step.lines[0].get_data()
-    assert np.interp(0, time, height) == pytest.approx(0.5 * height.max(), rel=1e-3)
-    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-9
 
 
 def _panels(figure):
@@ -332,14 +280,6 @@ def test_the_truth_of_a_stand(run, tmp_path):
         one_line(lambda: response(run, truth=stand), f"stand.json: {fault}")
     (stand / "stand.json").unlink()
     one_line(lambda: response(run, truth=stand), "stand.json: cannot be read")
-
-
-def test_a_result_shows_itself(run):
-    shown = response(run, truth=electronics())
-    assert repr(shown) == "<Response of run, beside known>"
-    assert list(shown.values) == [str(run), "truth"]
-    assert shown.values.loc["pole_1_ns", "truth"] == 55
-    assert shown.plot().axes
 
 
 @pytest.mark.parametrize("also", [{}, {"ringing_mhz": 5.0}, {"free_decays": True}])
@@ -407,17 +347,6 @@ def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, monkeypatch, 
     assert "…" not in printed
 
 
-def test_decays_of_free_times_are_printed(tmp_path, monkeypatch, capsys):
-    run = write_response(tmp_path / "run", "generator.free_decays=true", fast={0: 0.05})
-    monkeypatch.setattr(sys, "argv", ["cpunet", "response", str(run)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 0
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["fast", "decay", "1", "[µs]", "4"] in printed
-    assert ["share", "of", "fast", "decay", "1", "[%]", "5"] in printed
-
-
 def test_a_poor_fit_is_doubted(run, tmp_path):
     info = json.loads((run / "run.json").read_text())
 
@@ -437,3 +366,79 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
     (said,) = response(early).content["runs"][0]["doubts"]
     assert said.startswith("60 % of the charge would arrive too early")
+
+
+RESPONSE = ElectronicsResponse(
+    load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"]).matching[0],
+    16.0,
+)
+
+
+def numbers(response: ElectronicsResponse) -> dict[str, float]:
+    first, second = response.log_poles_ns.tolist()
+    return {"sum": first + second, "difference": first - second}
+
+
+def test_what_is_known_together_has_a_small_error() -> None:
+    covariance = np.diag([0.04, 0.04, 1.0, 1.0])
+    covariance[0, 1] = covariance[1, 0] = -0.0399
+    found = propagated(RESPONSE, covariance.tolist(), numbers)
+    assert found["sum"] == pytest.approx(np.sqrt(2e-4))
+    assert found["difference"] == pytest.approx(np.sqrt(0.08 + 2 * 0.0399))
+
+
+def test_a_number_that_is_not_always_defined_has_no_error() -> None:
+    """Along the other axes its error would be too small."""
+
+    def partly(response: ElectronicsResponse) -> dict[str, float]:
+        found = numbers(response)
+        return found if response.slow_weights.item() > -0.1 else {"sum": found["sum"]}
+
+    found = propagated(RESPONSE, np.diag([0.04, 0.04, 1.0, 1.0]).tolist(), partly)
+    assert list(found) == ["sum"]
+
+
+@pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((4, 4), np.nan).tolist()])
+def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]]) -> None:
+    assert propagated(RESPONSE, covariance, numbers) == {}
+
+
+EDGES = [-100, -60, -40, -25, -15, -8, 0, 8, 15, 22, 30, 40, 52, 66, 84, 110, 140, 300]
+QUIET = {f"samples {a} to {b}": 0.5 for a, b in pairwise(EDGES)}
+QUIET |= {f"current amplitude, bin {i}": -0.5 for i in range(1, 9)} | {"tail slope": 0.3}
+
+
+def off(size: float, *starts: str) -> dict[str, float]:
+    return {name: size if name.startswith(starts) else pull for name, pull in QUIET.items()}
+
+
+def test_nothing_is_off_by_chance():
+    assert parts_off(QUIET) == {}
+    assert diagnosis(QUIET) == []
+
+
+def test_each_part_is_named():
+    assert list(parts_off(off(12, "tail", "samples 110", "samples 140"))) == ["tail"]
+    assert list(parts_off(off(-9, "current"))) == ["amplitude"]
+    assert list(parts_off(off(20, "samples 22", "samples 30"))) == ["top"]
+    (line,) = diagnosis(off(-30, "samples -60", "samples -40"))
+    assert line.startswith("the onset is off by 19 σ: no readout shapes it")
+    assert "cpunet calibrate" in line
+
+
+def test_physics_come_first_though_more_is_off_elsewhere():
+    pulls = dict(QUIET)
+    pulls |= {name: 40.0 for name in pulls if name.startswith("current")}
+    pulls |= {name: 15.0 for name in pulls if name.startswith("samples -")}
+    assert list(parts_off(pulls)) == ["onset", "amplitude"]
+
+
+def test_bands_are_taken_together():
+    pulls = {f"{band}: {name}": 9.0 for band in ("FEP", "1000-1580 keV") for name in QUIET}
+    assert set(parts_off(pulls)) == {"onset", "edge", "top", "tail", "amplitude"}
+
+
+def test_shares_that_no_readout_has():
+    assert beyond({"slow_100_ns": 0.04, "slow_400_ns": -0.06, "pole_1_ns": 40}) == []
+    assert "79 % of the charge would arrive too early" in beyond({"slow_100_ns": -0.79})[0]
+    assert "60 % of the charge would arrive late" in beyond({"slow_100_ns": 0.6})[0]

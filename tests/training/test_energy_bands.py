@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
-from cpunet.training.energy_bands import (
+from cpunet.training.pulse_sets import (
     HEAVIEST,
     LEAST,
     WIDEST,
-    EnergyBand,
     _continuum,
     energy_bands,
 )
@@ -37,12 +36,6 @@ def test_lines_and_continua_are_kept_apart() -> None:
     np.testing.assert_array_equal(fep.weights, 1)
     assert len(others) == 2
     assert sum(len(band.sim) for band in others) == pytest.approx(3000, abs=5)
-
-
-def test_a_line_with_few_pulses_is_part_of_its_continuum() -> None:
-    kev = np.sort(np.r_[continuum(4000, 1500, 1700, 1, 3), np.full(LEAST - 50, 1592.5)])
-    bands = energy_bands(kev, kev, PEAKS)
-    assert [band.name for band in bands] != ["DEP"]
 
 
 def test_spectra_are_made_alike_within_a_band() -> None:
@@ -110,9 +103,3 @@ def test_lines_of_other_energies_are_no_spectrum_in_common() -> None:
     data = np.r_[np.full(300, 1000.0), np.full(300, 1200.0)]
     with pytest.raises(CpunetError, match=r"^300 simulated and 600 measured pulses; 200 of"):
         energy_bands(sim, data, PEAKS)
-
-
-def test_a_band_is_named_by_its_energies() -> None:
-    (band,) = energy_bands(np.linspace(1000, 1200, 500), np.linspace(1000, 1200, 400), {})
-    assert isinstance(band, EnergyBand)
-    assert band.name == "1000-1200 keV"

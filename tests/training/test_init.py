@@ -11,12 +11,13 @@ from safetensors.torch import load_file
 from torch import nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
+from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.translator import REN
 from synthetic import SMALL_NETWORK, after_pole, decay, phased_edges, write_run
@@ -84,6 +85,31 @@ def network(files, tmp_path_factory) -> Path:
 def poles(run: Path) -> list[float]:
     fit = json.loads((run / "run.json").read_text())["fit"]
     return [v for name, v in fit["parameters"].items() if name.startswith("pole")]
+
+
+def test_a_run_tells_of_its_fit(chain) -> None:
+    fit = json.loads((chain / "run.json").read_text())["fit"]
+    assert Run.load(chain).fit.model_dump(exclude_unset=True) == fit
+    assert fit["chi_square"] < 1.6 * fit["moments"] == 1.6 * len(fit["pulls"])
+    assert fit["in_no_band"] == {"sim": 0, "data": 0}
+    assert np.hypot(*poles(chain)) == pytest.approx(4 * 16, rel=0.05)
+    assert fit["parameters"]["decay_us"] == pytest.approx(64, rel=0.02)
+    # prepared pulses are 0.8 where a step has come down for 400 samples
+    noise = 0.8 * np.exp(0.1) * 2614.5 * 20 / 26000
+    assert fit["noise"]["rms"] == pytest.approx(noise, rel=0.1)
+    assert fit["tails"]["rate_khz"] == 0
+    records = [json.loads(x) for x in (chain / "losses.jsonl").read_text().splitlines()]
+    assert [record["iteration"] for record in records] == list(range(1, fit["steps"] + 1))
+    assert records[-1]["losses"]["chi_square"] == pytest.approx(fit["chi_square"])
+
+
+def test_pulses_that_cannot_be_compared_leave_nothing(files, tmp_path) -> None:
+    few = write(tmp_path / "few.lh5", 1, None, n=40)
+    with pytest.raises(CpunetError, match=r"^40 simulated and \d+ measured pulses; 200 of"):
+        train(few, files["one"], tmp_path / "run", recipe=FAST)
+    with pytest.raises(CpunetError, match=r"neither has a pulse of 300-400 that can be used"):
+        train(files["sim"], files["one"], tmp_path / "run", recipe=FAST, peak="FEP,300-400")
+    assert [path.name for path in tmp_path.iterdir()] == ["few.lh5"]
 
 
 @pytest.mark.slow

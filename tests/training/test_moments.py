@@ -80,14 +80,6 @@ def test_the_datas_own_windows_in_records_have_the_datas_own_values(moments, win
     assert difference.mean() < 0.05
 
 
-def test_every_moment_has_a_name_of_its_own(moments) -> None:
-    assert len(set(moments.names)) == len(moments.names)
-    stretches = len(CONFIG.segments) - 1
-    assert len(moments.names) == (
-        stretches + CONFIG.components + 1 + CONFIG.squares + 1 + CONFIG.amplitude_bins
-    )
-
-
 def test_stretches_are_deviations_in_robust_standard_deviations(moments, windows) -> None:
     aligned = at_half_maximum(
         torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
@@ -161,20 +153,6 @@ def test_pulses_that_are_not_whole_or_not_alone_are_left_out(moments, windows) -
     )
 
 
-@pytest.mark.parametrize(
-    ("short", "segments"),
-    [({"before": 40}, (-40, 0, 300)), ({"after": 40, "level_samples": 20}, (-100, 0, 40))],
-)
-def test_a_window_that_ends_near_the_edge_has_amplitudes_too(windows, short, segments) -> None:
-    config = CONFIG.model_copy(update={**short, "segments": segments})
-    found = Moments.of_data(windows, config, PREPARATION)
-    aligned = at_half_maximum(
-        torch.from_numpy(windows), found.level, 401, config, PREPARATION.tail_level
-    )
-    wanted = np.median(np.log(current_amplitude(aligned.numpy())))
-    assert np.median(found.data.log_amplitude) == pytest.approx(wanted, abs=0.01)
-
-
 @pytest.mark.parametrize("first", ["steep", "slow"])
 def test_the_order_of_the_data_does_not_leave_pulses_out(first: str) -> None:
     """Pulses are read in blocks, and most of one block can be much steeper than the rest."""
@@ -189,11 +167,6 @@ def test_too_few_pulses_are_refused(windows, n: int) -> None:
         CpunetError, match=rf"^{n} measured pulses can be used; {MIN_PULSES} or more"
     ):
         Moments.of_data(windows[:n], CONFIG, PREPARATION)
-
-
-def test_pulses_without_a_number_are_none(windows) -> None:
-    with pytest.raises(CpunetError, match=r"^0 measured pulses can be used"):
-        Moments.of_data(np.full_like(windows, np.nan), CONFIG, PREPARATION)
 
 
 def test_the_peak_of_single_sites_does_not_depend_on_the_mixture(moments) -> None:

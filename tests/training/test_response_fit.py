@@ -11,29 +11,24 @@ import pytest
 import torch
 
 from cpunet.electronics.chain import Electronics
-from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import (
-    PADDING_AFTER,
-    PADDING_BEFORE,
     ElectronicsResponse,
     record_length,
 )
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
-from cpunet.training import response_starts, translated
+from cpunet.training import response_starts
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
 from cpunet.training.response_starts import drift_if_needed, with_drift_terms
-from cpunet.training.translated import Noise, Translated
+from cpunet.training.translated import Noise, SimulatedSide
 from unpaired import (
     CHAIN,
     DT_NS,
     N,
     Unpaired,
-    at_half_maximum,
     charge,
     edge_errors,
     faster,
@@ -130,17 +125,6 @@ def test_the_errors_cover_the_truth(request, which: str) -> None:
     assert errors["slow_weights.1"] < 0.002
 
 
-@pytest.mark.slow
-def test_seeds_and_starts_agree(near: Told, far: Told) -> None:
-    first, second = near.response.describe(), far.response.describe()
-    assert learned_rise_ns(near.response) == pytest.approx(
-        learned_rise_ns(far.response), rel=0.005
-    )
-    assert first["decay_us"] == pytest.approx(second["decay_us"], rel=1e-3)
-    assert first["slow_400_ns"] == pytest.approx(second["slow_400_ns"], abs=1e-3)
-    assert first != second  # other noise was drawn
-
-
 def test_edges_are_those_of_the_true_chain(near: Told) -> None:
     errors = edge_errors(near.response)
     assert np.median(errors) < 1e-3
@@ -170,16 +154,6 @@ def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
     assert first[0].describe() == again[0].describe()
     assert first[1] == again[1]
     assert first[0].describe() != other[0].describe()
-
-
-@pytest.mark.thorough
-def test_other_physics_is_seen_in_chi_square(problem: Problem, near: Told) -> None:
-    other = simulated(charge(N, seed=1, longest=60, steepest=7))
-    short = ("training.start_factors=[1]", "training.steps=10", "training.ringing_mhz=[]")
-    _, fit = problem.fit(0, *short, sim=other)
-    per_moment = fit.chi_square / fit.moments
-    assert per_moment > 2 * GOOD_FIT
-    assert per_moment > 3 * near.fit.chi_square / near.fit.moments
 
 
 DRIFT = ("training.drift_terms=2", "training.start_factors=[1]", "training.ringing_mhz=[]")
@@ -224,46 +198,6 @@ def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> 
     assert fit == near.fit
 
 
-@pytest.mark.slow  # the next but one finds one, too
-def test_a_ringing_is_found_where_there_is_one() -> None:
-    ringing = {"frequency_MHz": 6.0, "fraction": 0.25, "damping_ns": 160.0}
-    chain = Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing})
-    rings = Problem(*measured_with(chain))
-    response, fit = rings.fit(0, "training.start_factors=[1]")
-    numbers, errors = response.describe(), fit.errors
-    assert fit.chi_square < GOOD_FIT * fit.moments
-    assert numbers["ringing_mhz"] == pytest.approx(6.0, rel=0.02)
-    assert numbers["ringing_sine"] == pytest.approx(0.25, rel=0.2)  # with its damping
-    # the bandwidth; each pole is known to its error only, beside a ringing
-    true_rise = rise_ns(chain.step_response(np.arange(4000.0)))
-    assert learned_rise_ns(response) == pytest.approx(true_rise, rel=0.02)
-    poles = np.sort(response.log_poles_ns.detach().numpy())
-    pole_errors = sorted((errors["log_poles_ns.1"], errors["log_poles_ns.2"]), reverse=True)
-    assert (np.abs(poles - np.log([35, 55])) < 4 * np.array(pole_errors)).all()
-    assert max(pole_errors) < 0.1
-    assert numbers["decay_us"] == pytest.approx(80, rel=0.02)
-
-
-@pytest.mark.slow
-def test_a_fast_decay_gets_a_time_of_its_own() -> None:
-    """That of the paper's stand: fixed times of 4 and 16 us do not follow 2.9.
-
-    A ringing would imitate it, if the fit from the fixed ones were left with that.
-    """
-    decays = [{"fraction": 0.95, "tau_us": 54.6}, {"fraction": 0.05, "tau_us": 2.9}]
-    fast = Problem(
-        *measured_with(CHAIN.model_validate(CHAIN.model_dump() | {"decays": decays}))
-    )
-    fixed = "generator.fast_decays_us=[4, 16]"
-    response, fit = fast.fit(0, fixed, "training.start_factors=[1]")
-    assert response.config.free_decays
-    numbers = response.describe()
-    assert "ringing_mhz" not in numbers
-    assert numbers["fast_decay_1_us"] == pytest.approx(2.9, rel=0.3)
-    assert numbers["fast_decay_1_share"] == pytest.approx(0.05, rel=0.3)
-    assert fit.chi_square < GOOD_FIT * fit.moments
-
-
 def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:
     assert "ringing_mhz" not in near.response.describe()
 
@@ -288,15 +222,8 @@ def asked(problem: Problem) -> ResponseProblem:
     length = record_length(few.waveforms.shape[1])
     drawn = Noise.draw(problem.noise, few.energy_kev, length, 2, np.random.default_rng(0))
     moments = Moments.of_data(problem.data.waveforms, training, recipe.preparation)
-    band = Band("all", Translated(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))
+    band = Band("all", SimulatedSide(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))
     return ResponseProblem(ElectronicsResponse(generator, DT_NS), [band])
-
-
-def test_derivatives_leave_the_response_as_it_is(asked: ResponseProblem) -> None:
-    vector = asked.parameters.vector()
-    columns = asked.derivatives(vector, asked.deviations(vector), [0, 2])
-    assert columns.shape == (asked.moments, 2)
-    np.testing.assert_array_equal(asked.parameters.vector(), vector)
 
 
 def test_records_are_stretched_as_the_layer_stretches(asked: ResponseProblem) -> None:
@@ -335,14 +262,6 @@ def test_a_needless_stretch_is_taken_out(asked: ResponseProblem) -> None:
     assert drift_if_needed(simulated, Fitter(RECIPE.training)) is simulated
 
 
-def test_threads_do_not_change_a_bit(asked: ResponseProblem, monkeypatch) -> None:
-    monkeypatch.setattr(translated, "BLOCK", 16)
-    vector = asked.parameters.vector()
-    alone = asked.pulls(vector)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    np.testing.assert_array_equal(asked.pulls(vector), alone)
-
-
 @pytest.mark.parametrize(("beyond", "share"), [(0.19, 0.81), (0.21, 1.0)])
 def test_blocks_do_not_decide_which_tails_are_excluded(
     asked: ResponseProblem, beyond: float, share: float
@@ -371,55 +290,3 @@ def test_blocks_do_not_decide_which_tails_are_excluded(
     assert used[0] / len(sim) == pytest.approx(share, abs=0.005)
     for total in totals[1:]:
         np.testing.assert_allclose(total, totals[0], rtol=1e-4, atol=1e-4 * used[0])
-
-
-def test_records_are_those_of_the_response(asked: ResponseProblem) -> None:
-    """What is read of translated pulses, against the layer and the alignment in torch."""
-    band, response = asked.bands[0], asked.response
-    moments = band.moments
-    with torch.no_grad():
-        records = response(torch.from_numpy(band.sim.sim)).numpy()
-    plateau = records[:, -PADDING_AFTER : -PADDING_AFTER + 100].mean(axis=1, keepdims=True)
-    records = records * (RECIPE.preparation.tail_level / plateau)
-    records = band.sim.noise.add(np.float32(records), 0, 0)
-    last = PADDING_BEFORE + RECIPE.preparation.samples_before + translated.DELAY
-    config, level = RECIPE.matching.training, RECIPE.preparation.tail_level
-    aligned = at_half_maximum(torch.from_numpy(records), moments.level, last, config, level)
-    expected = (aligned - torch.from_numpy(moments.mean)) @ torch.from_numpy(moments.components)
-    amplitude = np.log(current_amplitude(aligned.numpy()))
-    seen: list[Readings] = []
-    band.sim.sums(response, lambda r: (seen.append(r), (np.zeros(1),))[1], draws=1)
-    first = len(config.segments) - 1
-    places = slice(first, first + config.components)
-    found = seen[0].linear[:, places] * moments.spreads[places] + moments.centres[places]
-    np.testing.assert_allclose(found, expected.numpy(), atol=2e-3)
-    np.testing.assert_allclose(seen[0].log_amplitude, amplitude, atol=2e-5)
-
-
-def test_too_few_pulses_are_refused(problem: Problem) -> None:
-    few = Problem(problem.sim[:199], problem.data, problem.noise)
-    with pytest.raises(
-        CpunetError, match=r"^199 simulated and 600 measured pulses; 200 of each"
-    ):
-        few.fit(0)
-    few = Problem(problem.sim, problem.data[:150], problem.noise)
-    with pytest.raises(CpunetError, match=r"^600 simulated and 150 measured pulses; 200 of"):
-        few.fit(0)
-
-
-def test_energies_are_needed(problem: Problem) -> None:
-    unknown = Pulses.of(problem.sim.waveforms, dt_ns=DT_NS)
-    with pytest.raises(CpunetError, match="pulse 0 has an energy of nan keV"):
-        problem.fit(0, sim=unknown)
-
-
-def test_steps_of_several_fits_are_one_count(asked: ResponseProblem) -> None:
-    told: list[int] = []
-    fitter = Fitter(
-        RECIPE.training.model_copy(update={"steps": 2}),
-        listener=lambda step, _chi_square: told.append(step),
-    )
-    for _ in range(2):
-        fitter.fit(asked.of(copy.deepcopy(asked.response)), coarse=False)
-    assert told == list(range(1, fitter.steps + 1))
-    assert fitter.steps > 2

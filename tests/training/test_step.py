@@ -9,10 +9,21 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cpunet.training.cyclegan import CycleGan, Step, mean_square_slope, real_loss
+from cpunet.recipes import load_recipe
+from cpunet.training.cyclegan import (
+    CycleGan,
+    Step,
+    fake_loss,
+    real_loss,
+    window_weights,
+)
 from synthetic import LOSS_NAMES
 
-pytestmark = pytest.mark.usefixtures("same_random_numbers")
+pytestmark = [
+    pytest.mark.usefixtures("same_random_numbers"),
+    # torch's own compiler uses what it deprecates
+    pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning"),
+]
 
 GENERATOR_LOSSES = LOSS_NAMES[:6]
 
@@ -26,7 +37,6 @@ def make_step(recipe) -> Step:
     return Step(CycleGan(recipe).train(), recipe.cyclegan.training)
 
 
-@pytest.mark.thorough
 def test_rates_rise_from_zero_where_the_start_is_near(tiny, batches):
     recipe = tiny(
         "generator.width=4", "training.iterations=8", "training.decay_start=4",
@@ -73,29 +83,6 @@ def test_the_adversarial_loss_alone_reaches_every_generator_parameter(tiny, batc
     assert all(p.grad is None for p in other.parameters())
 
 
-def test_the_published_discriminator_lets_all_through_but_the_offset(tiny, batches):
-    step = make_step(tiny("generator.width=4"))  # min-max of each pulse: blind to offsets
-    losses, _ = step.generator_losses(*batches)
-    (losses["adversarial_ren"] + losses["adversarial_iren"]).backward()
-    for network in (step.model.ren, step.model.iren):
-        largest = {n: float(p.grad.abs().max()) for n, p in network.named_parameters()}
-        offset = largest.pop("outlet.bias")
-        assert min(largest.values()) > 0
-        assert offset < 1e-4 * max(largest.values())
-
-
-def test_the_adversarial_weight_changes_the_generators_gradients(tiny, batches):
-    def gradients(weight: float) -> Tensor:
-        torch.manual_seed(1)
-        step = make_step(tiny(f"training.losses.adversarial_weight={weight}"))
-        losses, _ = step.generator_losses(*batches)
-        step.total(losses).backward()
-        return torch.cat([p.grad.flatten() for p in step.model.generator_parameters()])
-
-    without, adversarial = gradients(0), gradients(9)
-    assert float((adversarial - without).norm() / without.norm()) > 1e-5
-
-
 @pytest.mark.parametrize("penalty", [0.0, 0.3])
 def test_every_discriminator_parameter_learns(tiny, batches, penalty):
     step = make_step(tiny(f"training.losses.gradient_penalty={penalty}"))
@@ -127,14 +114,6 @@ def test_discriminators_change_at_their_interval_only(tiny, batches):
         assert set(losses) == set(GENERATOR_LOSSES if iteration % 3 else LOSS_NAMES)
 
 
-def test_after_a_step_all_networks_are_ready_for_the_next(tiny, batches):
-    step = make_step(tiny("training.discriminator_interval=2"))
-    for iteration in range(2):
-        step(iteration, *batches)
-        assert all(module.training for module in step.model.modules())
-        assert all(p.requires_grad for p in step.model.parameters())
-
-
 def test_while_judging_only_the_norm_is_in_evaluation(tiny, batches):
     # cuDNN's GRU has a backward pass in training mode only
     step = make_step(tiny("training.discriminator_interval=2"))
@@ -147,27 +126,6 @@ def test_while_judging_only_the_norm_is_in_evaluation(tiny, batches):
     step(1, *batches)
     # judged, trained, judged
     assert modes == [(True, False), (True, True), (True, False)]
-
-
-def test_discriminator_rates_follow_the_iterations(tiny, batches):
-    recipe = tiny(
-        "training.iterations=11",
-        "training.decay_start=4",
-        "training.discriminator_interval=5",
-    )
-    step = make_step(recipe)
-    rates = []
-    for iteration in range(11):
-        rates.append([o.param_groups[0]["lr"] for o in step.optimisers])
-        step(iteration, *batches)
-    start = np.array(
-        [recipe.training.rate_generators, *2 * [recipe.training.rate_discriminators]]
-    )
-    expected = np.minimum(1, (11 - np.arange(11)) / 7)[:, None] * start
-    np.testing.assert_allclose(rates, expected)
-    # their last update, at iteration 10, is taken at 1/7 of the first rate
-    assert rates[10][1] == pytest.approx(recipe.training.rate_discriminators / 7)
-    assert step.discriminators["data"].param_groups[0]["lr"] == 0
 
 
 def l1_by_hand(pulses: Tensor, others: Tensor, losses) -> float:
@@ -220,24 +178,6 @@ def test_the_total_is_the_papers_weighted_sum(tiny):
     assert float(step.total(values)) == 5 * (1 + 10) + 20 * (100 + 1000) + 9 * (1e4 + 1e5)
 
 
-@pytest.mark.thorough
-def test_the_gradient_penalty_by_finite_differences(tiny, batches):
-    sim, data = (b.double() for b in batches)
-    judge = CycleGan(tiny()).discriminator_data.double()
-    judge.norm.eval()  # so that pulses do not influence each other
-    judge.value_range = (-0.5, 1.5)
-    pulses = torch.cat([data[:2], sim[:2]]).requires_grad_()
-    penalty = mean_square_slope(judge(pulses), pulses)
-    squares = 0.0
-    for pulse in (*data[:2], *sim[:2]):
-        for sample in range(pulse.shape[1]):
-            shift = torch.zeros_like(pulse)
-            shift[0, sample] = 1e-6
-            slope = (judge((pulse + shift)[None]) - judge((pulse - shift)[None])) / 2e-6
-            squares += float(slope.detach()) ** 2
-    assert float(penalty.detach()) == pytest.approx(squares / 4, rel=1e-3)
-
-
 def test_judges_see_the_instance_noise_and_it_fades(tiny, batches, monkeypatch):
     sim, data = batches
     recipe = tiny(
@@ -263,26 +203,56 @@ def test_judges_see_the_instance_noise_and_it_fades(tiny, batches, monkeypatch):
         assert float(noise) == pytest.approx(0.3 * (10 - iteration) / 10, rel=0.25)
 
 
-@pytest.mark.slow
-def test_steps_bring_the_networks_nearer(tiny, batches):
-    recipe = tiny("training.iterations=60", "training.decay_start=60", "training.batch_size=4")
-    step = make_step(recipe)
-    losses = [step(i, *batches) for i in range(60)]
-    cycles = [float(x["cycle_forward"] + x["cycle_backward"]) for x in losses]
-    assert np.mean(cycles[-10:]) < 0.7 * np.mean(cycles[:10])
+PAPER = load_recipe("paper").training.losses
 
 
-def test_a_generator_that_only_listens_to_its_judge_convinces_it(tiny, batches):
-    """The published training lacks this: its adversarial losses only rise."""
-    sim, _ = batches
-    model = CycleGan(tiny("discriminator.value_range=[-10, 10]", "generator.dropout=0"))
-    judge = model.discriminator_data.eval().requires_grad_(False)
-    optimiser = torch.optim.Adam(model.ren.parameters(), 3e-3)
-    losses = []
-    for _ in range(30):
-        loss = real_loss(judge(model.ren(sim)))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < losses[0] - 0.01
+def test_the_papers_windows():
+    weights = window_weights(PAPER)
+    assert weights.shape == (800,)
+    expected = [3 / 200] * 200 + [10 / 250] * 250 + [7 / 350] * 350
+    assert weights.tolist() == pytest.approx(expected)
+
+
+def test_a_confident_error_is_finite():
+    assert float(real_loss(torch.tensor([-1e4]))) == 1e4
+    assert float(fake_loss(torch.tensor([1e4]))) == 1e4
+
+
+def quiet(model: CycleGan) -> CycleGan:
+    """Without latent noise, whose draws a compiled pass makes in another way."""
+    for network in (model.ren, model.iren):
+        nn.init.zeros_(network.latent_log_variance.weight)
+        nn.init.constant_(network.latent_log_variance.bias, -200.0)
+    return model
+
+
+def outcome(tiny, sets, *settings: str) -> tuple[Tensor, Tensor]:
+    """Translations, and the gradient of the identity losses."""
+    recipe = tiny("generator.width=4", "generator.dropout=0", *settings)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        model = quiet(CycleGan(recipe).train())
+        step = Step(model, recipe.cyclegan.training)
+        losses, fakes = step.generator_losses(
+            *(torch.from_numpy(pulses[:8, None]) for pulses in sets)
+        )
+        (losses["identity_data"] + losses["identity_sim"]).backward()
+    gradient = torch.cat([p.grad.flatten() for p in model.generator_parameters()])
+    return fakes["data"].detach(), gradient
+
+
+@pytest.mark.slow  # minutes of compiling
+@pytest.mark.filterwarnings("ignore")  # torch's compiler warns of what it does itself
+def test_a_compiled_pass_is_the_plain_one(tiny, sets):
+    for found, expected in zip(
+        outcome(tiny, sets, "training.compiled=true"), outcome(tiny, sets), strict=True
+    ):
+        assert torch.allclose(found, expected, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_bf16_has_the_direction_of_the_gradient(tiny, sets):
+    found, expected = outcome(tiny, sets, "training.precision=bf16"), outcome(tiny, sets)
+    assert all(value.dtype == torch.float32 for value in found)
+    assert float((found[0] - expected[0]).norm() / expected[0].norm()) < 0.05
+    assert torch.cosine_similarity(found[1], expected[1], dim=0) > 0.95
+    assert not torch.equal(found[1], expected[1])

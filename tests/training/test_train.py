@@ -10,27 +10,21 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
     require_same_sampling,
 )
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.translation import file_translation
-from cpunet.translation.translate import translate
 from synthetic import (
     KEV,
     SMALL_NETWORK,
     Files,
-    prepared_truth,
     write_files,
     write_run,
 )
@@ -80,22 +74,6 @@ def test_provenance_counts_and_fingerprints(files, sim_set):
     assert told.sha256 == hashlib.sha256(content).hexdigest()
 
 
-def test_measured_pulses_are_cut_and_simulated_ones_are_not(files):
-    selection = parse_selection("FEP", RECIPE.peaks)
-    told = load_pulses(files[1], "measured", RECIPE, selection).provenance()
-    assert {window.name for window in told.cuts.windows} >= {"tail_slope", "baseline"}
-
-
-def test_measured_pulses_given_as_simulated_ones_are_doubted(files, caplog):
-    selection = parse_selection("FEP", RECIPE.peaks)
-    load_pulses(files[1], "simulated", RECIPE, selection)
-    assert caplog.messages[0].startswith("data.lh5: these pulses decay")
-    caplog.clear()
-    load_pulses(files[0], "simulated", RECIPE, selection)
-    load_pulses(files[1], "measured", RECIPE, selection)
-    assert not caplog.messages
-
-
 def test_sets_of_different_sampling(sim_set, files):
     other = InputSet(sim_set.prepared, 10.0, Path("other.lh5"), sim_set.energies_kev)
     require_same_sampling(sim_set, sim_set)
@@ -114,34 +92,12 @@ def test_devices():
             resolve_device(name)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-@pytest.mark.parametrize("name", ["cuda", "cuda:1"])
-def test_a_gpu_that_is_not_there(name):
-    with pytest.raises(CpunetError, match="no GPU was found; use `device` cpu"):
-        resolve_device(name)
-
-
 def test_a_gpu_beyond_the_last(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert resolve_device("cuda:1") == "cuda:1"
     with pytest.raises(CpunetError, match="'cuda:2': the last of 2 GPUs is cuda:1"):
         resolve_device("cuda:2")
-
-
-def test_truth_is_that_of_the_pulses_in_use(tmp_path, sim_set):
-    response = np.zeros((N, 1200), np.float16)
-    response[:, 600:] = 1
-    response[4, 300:] = 0.5  # an earlier start, so that one row differs
-    response[5] = np.nan
-    np.savez(tmp_path / "truth.npz", response=response)
-    truth = prepared_truth(tmp_path / "truth.npz", sim_set, RECIPE.preparation)
-    used = np.flatnonzero(np.arange(N) % 3)
-    assert truth.shape == (len(used), 800)
-    assert np.isnan(truth[used == 5]).all()
-    assert np.isfinite(truth[used != 5]).all()
-    # prepared like data: aligned at sample 400, the tail at 0.8
-    np.testing.assert_allclose(truth[used == 8][0], 0.8 * (np.arange(800) >= 400), atol=1e-6)
 
 
 def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
@@ -167,29 +123,3 @@ def test_a_range_of_energies(files, tmp_path, caplog):
     assert [note for note in caplog.messages if "trained on" in note] == [told]
     assert made.peak == "1500-2200"
     assert made.sim.used == 20
-
-
-@pytest.mark.parametrize("inverse", [False, True])
-def test_blocks_do_not_matter(files, run, tmp_path, monkeypatch, stages, inverse):
-    source = files[1] if inverse else files[0]
-    options = {"inverse": inverse, "noise": False}
-    whole = translate(run, source, tmp_path / "whole.lh5", **options).counts
-    monkeypatch.setattr(file_translation, "BLOCK_SIZE", 7)
-    stages.clear()
-    parts = translate(run, source, tmp_path / "parts.lh5", **options).counts
-    assert whole == parts == {"read": N, "translated": N, "rejections": {}}
-    assert stages == {"Translating": [N, 7, 7, 7, 7, 2]}
-    found = [open_pulses(tmp_path / name).read() for name in ("whole.lh5", "parts.lh5")]
-    np.testing.assert_allclose(found[0].waveforms, found[1].waveforms, atol=1e-5)
-    assert found[0].event_number.tolist() == found[1].event_number.tolist() == list(range(N))
-
-
-def test_a_failed_translation_leaves_the_old_file(files, run, tmp_path):
-    out = tmp_path / "out.lh5"
-    out.write_bytes(b"old")
-    constant = tmp_path / "constant.lh5"
-    write_pulses(constant, Pulses.of(np.ones((3, 225)), dt_ns=16))
-    with pytest.raises(CpunetError, match=r"none of 3 pulses can be translated \(3 constant\)"):
-        translate(run, constant, out, force=True)
-    assert out.read_bytes() == b"old"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["constant.lh5", "out.lh5"]

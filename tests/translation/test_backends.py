@@ -11,8 +11,7 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe

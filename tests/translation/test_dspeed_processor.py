@@ -16,8 +16,7 @@ from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation.dspeed_processor import ren

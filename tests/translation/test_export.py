@@ -12,9 +12,7 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.linear_inverse import LinearInverse, Sizes
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, LinearInverse, ResponseGenerator, Sizes
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe

@@ -22,8 +22,8 @@ from torch import nn
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import SIZES_KEV
 from cpunet.errors import CpunetError
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.processes import outcomes
 from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses

@@ -30,16 +30,16 @@ from cpunet.calibration.figures import calibration_figures
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.inputs import (
     DEPLETION,
+    CalibrationInputs,
     Freedom,
-    Sides,
     known_depletion,
     read_sides,
     require_depletion,
 )
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, known_before, titled
-from cpunet.calibration.result import described, doubts
-from cpunet.calibration.search import Calibrated, Search
+from cpunet.calibration.result import Calibrated, described, doubts
+from cpunet.calibration.search import Search
 from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
@@ -54,7 +54,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.simulate import simulate
-from cpunet.training.chain import train_chain
+from cpunet.training.fit import train_chain
 from cpunet.training.job import TrainingJob
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run import RUN
@@ -147,14 +147,8 @@ def calibrate(
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
     freedom = Freedom.of(free, fix, prior)
-    job = partial(
-        _Job,
-        recipe=settings,
-        freedom=freedom,
-        peak=peak,
-        events=events,
-        seed=require_seed(seed),
-    )
+    seed = require_seed(seed)
+    job = partial(_Job, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed)
     inputs = [] if isinstance(recipe, Recipe) else [recipe]
     target = None if out is None else Path(out)
     if sides[1].table != ALL:
@@ -214,7 +208,13 @@ class _Job:
             search = self._search(sides, bar.update)
             bar.total = search.simulations
             calibrated = search.run()
-        self._require_hope(calibrated, sides)
+        per = calibrated.chi_square / calibrated.problem.moments
+        if per > HOPELESS:
+            raise CpunetError(
+                f"{self.data.path}: no physics near those of {sides.stored.detector.name} "
+                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
+                "of another detector, or of other energies (`peak`)?"
+            )
         content = self._content(calibrated, sides)
         if len(calibrated.alternatives) > 1:
             self._compare(calibrated, sides, content)
@@ -267,10 +267,10 @@ class _Job:
             }
         )
 
-    def _sides(self) -> Sides:
+    def _sides(self) -> CalibrationInputs:
         return read_sides(self.sim, self.data, self.recipe, self.peak, self.events, self.seed)
 
-    def _search(self, sides: Sides, simulated: Callable[[], None]) -> Search:
+    def _search(self, sides: CalibrationInputs, simulated: Callable[[], None]) -> Search:
         """The search, ready to start."""
         measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
         preparation = self.recipe.preparation
@@ -297,16 +297,9 @@ class _Job:
             free=None if free is None else list(range(len(free))),
         )
 
-    def _require_hope(self, calibrated: Calibrated, sides: Sides) -> None:
-        per = calibrated.chi_square / calibrated.problem.moments
-        if per > HOPELESS:
-            raise CpunetError(
-                f"{self.data.path}: no physics near those of {sides.stored.detector.name} "
-                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
-                "of another detector, or of other energies (`peak`)?"
-            )
-
-    def _compare(self, calibrated: Calibrated, sides: Sides, content: dict[str, Any]) -> None:
+    def _compare(
+        self, calibrated: Calibrated, sides: CalibrationInputs, content: dict[str, Any]
+    ) -> None:
         """Add the physics that explain the data about as well, and what would decide."""
         fits, hits = calibrated.alternatives, sides.stored.hits
         rows, decide = side_by_side(fits, hits, self.recipe, sides.selection)
@@ -317,7 +310,7 @@ class _Job:
         told = f"{len(rows) - 1} other physics explain {self.peak} as well"
         content["notes"].append(f"{told} (alternatives): {remedy}")
 
-    def _content(self, calibrated: Calibrated, sides: Sides) -> dict[str, Any]:
+    def _content(self, calibrated: Calibrated, sides: CalibrationInputs) -> dict[str, Any]:
         compared = calibrated.problem.bands
         return {
             "cpunet": cpunet.__version__,
@@ -334,7 +327,11 @@ class _Job:
 
 
 def _simulate_calibrated(
-    calibrated: Calibrated, sides: Sides, folder: Path, seed: int, found: Mapping[str, Any]
+    calibrated: Calibrated,
+    sides: CalibrationInputs,
+    folder: Path,
+    seed: int,
+    found: Mapping[str, Any],
 ) -> None:
     """Write the calibrated physics, and all events simulated with it."""
     parameters = calibrated.problem.parameters

@@ -29,7 +29,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.superposition import solve
-from cpunet.training.energy_bands import LEAST
+from cpunet.training.pulse_sets import LEAST
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class Freedom:
 
 
 @dataclass(frozen=True, eq=False)
-class Sides:
+class CalibrationInputs:
     """Both sides, read and prepared, and the physics of the simulated side.
 
     Parameters
@@ -126,7 +126,7 @@ class Sides:
 
 def read_sides(
     sim: PulseFile, data_file: PulseFile, recipe: Recipe, peak: str, events: int, seed: int
-) -> Sides:
+) -> CalibrationInputs:
     """Read and prepare both sides, see `cpunet.calibrate`.
 
     Raises
@@ -151,7 +151,7 @@ def read_sides(
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
     some = replace(simulated, prepared=simulated.prepared[rows])
-    return Sides(some, data, stored, selection)
+    return CalibrationInputs(some, data, stored, selection)
 
 
 def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]) -> None:

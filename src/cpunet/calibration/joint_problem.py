@@ -18,7 +18,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.moments import Readings
 from cpunet.training.response_problem import Band, Parameters
-from cpunet.training.translated import Translated
+from cpunet.training.translated import SimulatedSide
 
 RIDGE = 0.05  # fraction of the identity in the correlation matrix of the functions
 # Residual that keeps a step within the reach of the derivatives: its size at the reach.
@@ -145,7 +145,7 @@ class JointProblem:
         # those of the residuals: along weak directions the sampling error of some of the events
         # is as large as the derivative itself.
         self.few = fewest(self.bands) if held else None
-        self._translated: dict[int | None, tuple[Nearby, Values, list[Translated]]] = {}
+        self._translated: dict[int | None, tuple[Nearby, Values, list[SimulatedSide]]] = {}
         self._weigh(None)
 
     @property
@@ -290,7 +290,7 @@ class JointProblem:
 
     def _covariance(self, band: Band, functions: SlicedFunctions) -> Values:
         """Covariance of the functions over the simulated pulses of a band."""
-        some = band.sim.first(FOR_COVARIANCE)
+        some = band.sim.of(slice(FOR_COVARIANCE))
         waveforms = self.prepared(self.nearby.centre).waveforms[band.rows[: len(some)]]
 
         def of(readings: Readings) -> tuple[Values, ...]:
@@ -328,7 +328,7 @@ class JointProblem:
             found.append((total / max(n, 1e-9) - self._wanted[i]) / self._sigma[i])
         return found
 
-    def _simulated(self, coordinates: Values, most: int | None) -> list[Translated]:
+    def _simulated(self, coordinates: Values, most: int | None) -> list[SimulatedSide]:
         """Pulses of each band at some coordinates, from the first `most` events.
 
         The last ones are kept: all derivatives of the chain use the same pulses, whose
@@ -343,7 +343,7 @@ class JointProblem:
         translated = []
         for band in self.bands:
             n_rows = len(band.rows) if most is None else np.searchsorted(band.rows, most)
-            some = band.sim.first(int(n_rows))
+            some = band.sim.of(slice(int(n_rows)))
             translated.append(replace(some, sim=waveforms[band.rows[: len(some)]]))
         self._translated[most] = self.nearby, coordinates.copy(), translated
         return translated

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -286,8 +286,7 @@ class Physics:
         return Physics(self.detector, self.settings, tuple(nuisances))
 
 
-@dataclass(frozen=True)
-class Prior:
+class Prior(NamedTuple):
     """Prior of a coordinate: centre and standard deviation."""
 
     centre: float

@@ -8,6 +8,7 @@ more self-repulsion.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 
 from cpunet.calibration.joint_problem import JointProblem
@@ -62,6 +63,31 @@ def decaying_chain(
     tried = problem.of_chain(other.problem.response)
     levenberg_marquardt(tried, STEPS, None, coarse=False)
     return None if _cost(tried) > _cost(problem) - NEEDED else tried.parameters.chain.response
+
+
+OtherChain = Callable[[JointProblem, PulseSets, MatchingConfig], ElectronicsResponse | None]
+# The round in which each is first tried: no physics can replace the ringing of a readout, but
+# early decays are visible only when the physics are about right.
+OTHER_CHAINS: dict[OtherChain, int] = {ringing_chain: 1, decaying_chain: 2}
+
+
+def other_chain(
+    problem: JointProblem,
+    sets: PulseSets,
+    training: MatchingConfig,
+    kinds: dict[OtherChain, int],
+    number: int,
+    *,
+    settled: bool,
+) -> ElectronicsResponse | None:
+    """Another chain if the data need one in this round. Each kind is used at most once."""
+    for kind in [kind for kind, first in kinds.items() if settled or number == first]:
+        chain = kind(problem, sets, training)
+        if settled or chain is not None:
+            del kinds[kind]
+        if chain is not None:
+            return chain
+    return None
 
 
 def _cost(problem: JointProblem) -> float:

@@ -1,17 +1,18 @@
-"""Results of a calibration as plain numbers for storage and figures."""
+"""Result of a calibration, and its plain numbers for storage and figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from cpunet.calibration.identifiability import together
+from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.joint_problem import JointParameters, JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values, known_before
 from cpunet.calibration.other_chains import BEYOND_CHANCE
-from cpunet.calibration.search import Calibrated
+from cpunet.networks.response_layer import ElectronicsResponse
 
 # Offsets of a profile in errors, and steps in which the other parameters are minimised.
 OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
@@ -24,6 +25,58 @@ ADVICE = {
 }
 # Minimum decrease of chi-square that is reported for a further parameter.
 WORTH_TELLING = 9.0
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """Chain and physics that explain the data.
+
+    Parameters
+    ----------
+    problem
+        Comparison at the end of the search: chain, coordinates, functions, pulses.
+    covariance
+        Covariance of its parameters, multiplied by the square of `scale`.
+    chi_square_before, pulls_before
+        Chi-square and pulls with the chain alone, for the physics as simulated.
+    chi_square
+        Chi-square with chain and physics.
+    scale
+        Factor of the errors from imperfect agreement, see `JointProblem.by_chance`.
+    information
+        Information on all physics.
+    promised
+        Expected decrease of chi-square for each fixed parameter if it were free, by position.
+    rounds, settled
+        Number of rounds, and whether the physics was unchanged in the last one.
+    alternatives
+        All physics that explain the data about as well, these first, and by how much
+        chi-square with priors is larger.
+    """
+
+    problem: JointProblem
+    covariance: Values
+    chi_square_before: float
+    pulls_before: Values
+    chi_square: float
+    scale: float
+    information: Information
+    promised: dict[int, float]
+    rounds: int
+    settled: bool
+    alternatives: Sequence[tuple[JointProblem, float]] = ()
+
+    @property
+    def response(self) -> ElectronicsResponse:
+        """The chain."""
+        chain: ElectronicsResponse = self.problem.parameters.chain.response
+        return chain
+
+    @property
+    def errors(self) -> Values:
+        """Standard errors of the free coordinates."""
+        n = self.problem.parameters.n_chain
+        return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
 
 
 def described(calibrated: Calibrated) -> dict[str, Any]:

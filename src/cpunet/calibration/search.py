@@ -15,24 +15,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cpunet.calibration.functions import SlicedFunctions
-from cpunet.calibration.identifiability import Information
+from cpunet.calibration.identifiability import Information, Selection
 from cpunet.calibration.joint_problem import JointParameters, JointProblem, fewest
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
-from cpunet.calibration.other_chains import decaying_chain, ringing_chain
-from cpunet.calibration.selection import Selection
+from cpunet.calibration.other_chains import OTHER_CHAINS, other_chain
+from cpunet.calibration.result import Calibrated
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
-from cpunet.recipes.training_settings import MatchingConfig
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import start_response
 
 log = logging.getLogger(__name__)
-
-OtherChain = Callable[[JointProblem, PulseSets, MatchingConfig], ElectronicsResponse | None]
 
 ROUNDS, STEPS, FIRST_STEPS = 8, 12, 20
 # The search ends when all coordinates move by less than this fraction of their error.
@@ -46,64 +43,9 @@ NEEDED, MAX_MORE = 25.0, 3
 # Other sets of parameters are fitted if chi-square would rise by less than this in a linear
 # forecast, and are alternatives if it does so by less than the second; most, and their rounds.
 LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
-# Other chains, and the round in which each is first tried: no physics can replace the ringing
-# of a readout, but early decays are visible only when the physics are about right.
-OTHER_CHAINS: dict[OtherChain, int] = {ringing_chain: 1, decaying_chain: 2}
 USUAL_ROUNDS = 4  # of most searches, for the remaining time
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
-
-
-@dataclass(frozen=True, eq=False)
-class Calibrated:
-    """Chain and physics that explain the data.
-
-    Parameters
-    ----------
-    problem
-        Comparison at the end of the search: chain, coordinates, functions, pulses.
-    covariance
-        Covariance of its parameters, multiplied by the square of `scale`.
-    chi_square_before, pulls_before
-        Chi-square and pulls with the chain alone, for the physics as simulated.
-    chi_square
-        Chi-square with chain and physics.
-    scale
-        Factor of the errors from imperfect agreement, see `JointProblem.by_chance`.
-    information
-        Information on all physics.
-    promised
-        Expected decrease of chi-square for each fixed parameter if it were free, by position.
-    rounds, settled
-        Number of rounds, and whether the physics was unchanged in the last one.
-    alternatives
-        All physics that explain the data about as well, these first, and by how much
-        chi-square with priors is larger.
-    """
-
-    problem: JointProblem
-    covariance: Values
-    chi_square_before: float
-    pulls_before: Values
-    chi_square: float
-    scale: float
-    information: Information
-    promised: dict[int, float]
-    rounds: int
-    settled: bool
-    alternatives: Sequence[tuple[JointProblem, float]] = ()
-
-    @property
-    def response(self) -> ElectronicsResponse:
-        """The chain."""
-        chain: ElectronicsResponse = self.problem.parameters.chain.response
-        return chain
-
-    @property
-    def errors(self) -> Values:
-        """Standard errors of the free coordinates."""
-        n = self.problem.parameters.n_chain
-        return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
 
 
 @dataclass(eq=False)
@@ -172,7 +114,8 @@ class Search:
             response = problem.parameters.chain.response
             moved = problem.parameters.coordinates - nearby.centre
             settled = number > 1 and _settled(problem, found, moved)
-            other = self._other_chain(problem, kinds, number, settled=settled)
+            matching = self.recipe.matching.training
+            other = other_chain(problem, self.sets, matching, kinds, number, settled=settled)
             response, settled = other or response, settled and other is None
             added = self._needed(problem) if settled and more < MAX_MORE else None
             if number == ROUNDS or (settled and added is None):
@@ -259,26 +202,11 @@ class Search:
         outdated = there.outdated(free, farthest / FARTHEST)
         return there.again(outdated) if outdated else there
 
-    def _other_chain(
-        self, problem: JointProblem, kinds: dict[OtherChain, int], number: int, *, settled: bool
-    ) -> ElectronicsResponse | None:
-        """Another chain if the data need one. Each kind is used at most once."""
-        _, training = self.recipe.matching
-        for kind, first in list(kinds.items()):
-            if not settled and number != first:
-                continue
-            chain = kind(problem, self.sets, training)
-            if settled or chain is not None:
-                del kinds[kind]
-            if chain is not None:
-                return chain
-        return None
-
     def _needed(self, problem: JointProblem) -> int | None:
         """Fixed parameter that held-out pulses need most, if significant."""
         if self.free is not None:
             return None
-        (_, selection), free = self._examined(problem)[1:], problem.parameters.free
+        selection, free = self._examined(problem)[2], problem.parameters.free
         falls = {
             i: selection.score(free) - selection.score([*free, i])
             for i in self._looked_at
@@ -301,9 +229,8 @@ class Search:
         whole.few = few
         whole.parameters.coordinates = parameters.coordinates.copy()
         information, selection = self._looked(whole)
-        free = parameters.free
-        here = selection.cost(free)[0]
-        falls = {i: here - selection.cost([*free, i])[0] for i in fixed}
+        here, _ = selection.cost(parameters.free)
+        falls = {i: here - selection.cost([*parameters.free, i])[0] for i in fixed}
         return falls, information, selection
 
     def _looked(self, problem: JointProblem) -> tuple[Information, Selection]:

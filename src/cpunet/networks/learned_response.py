@@ -20,12 +20,12 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.finishing import PADDING_BEFORE
-from cpunet.networks.drift_clock import at_times
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_layer import (
     MIN_FACTOR,
     ElectronicsResponse,
     Readout,
+    at_times,
     fast_length,
     padded_length,
 )

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from cpunet.settings import Config, Fraction, Positive, Samples, Width
 
-# parameters that stretch the simulated drift, see `cpunet.networks.drift_clock`
+# parameters that stretch the simulated drift, see `cpunet.networks.response_layer`
 DriftTerms = Annotated[int, Field(ge=0, le=2)]
 
 
@@ -29,7 +29,7 @@ class ResponseConfig(Config):
     ``ringing_ns`` are initial values of the frequency and the damping of a ringing; there is
     none if ``ringing_mhz`` is null.  With ``free_decays`` the ``fast_decays_us`` are initial
     values of free times, too.  ``drift_terms`` is the number of parameters that stretch the
-    simulated drift, see `cpunet.networks.drift_clock`; 0 for the drift as simulated.
+    simulated drift, see `cpunet.networks.response_layer`; 0 for the drift as simulated.
     """
 
     name: Literal["response"]

@@ -15,7 +15,7 @@ import numpy as np
 from cpunet.kernels import kernel
 
 
-class Window(NamedTuple):
+class RecordWindow(NamedTuple):
     """Where a record is read, as passed to the compiled loops.
 
     Parameters
@@ -93,7 +93,7 @@ def _slope(tail: Any, logs: Any) -> Any:  # pragma: no cover - compiled
 
 
 @kernel(error_model="numpy")
-def _tail_slope(record: Any, w: Window, tail: Any, logs: Any) -> Any:  # pragma: no cover
+def _tail_slope(record: Any, w: RecordWindow, tail: Any, logs: Any) -> Any:  # pragma: no cover
     """Tail slope of the window that the preparation would cut from the record."""
     first, stop = w.last - w.align_before, min(w.last + w.align_after, len(record))
     highest = _highest(record, first, stop)
@@ -130,7 +130,9 @@ def _amplitude(current: Any, first: int, stop: int, weights: Any) -> Any:  # pra
 
 
 @kernel(error_model="numpy", fastmath=FAST)
-def _normalise(record: Any, sample: int, w: Window) -> None:  # pragma: no cover - compiled
+def _normalise(
+    record: Any, sample: int, w: RecordWindow
+) -> None:  # pragma: no cover - compiled
     base = _mean(record, sample - w.base_first, sample - w.base_stop)
     tail = _mean(record, sample + w.after - w.level_samples, sample + w.after) - base
     factor, offset = np.float32(w.tail_level / tail), np.float32(base)
@@ -140,7 +142,7 @@ def _normalise(record: Any, sample: int, w: Window) -> None:  # pragma: no cover
 
 @kernel(error_model="numpy", fastmath=FAST)
 def _window(
-    record: Any, time: float, w: Window, aligned: Any
+    record: Any, time: float, w: RecordWindow, aligned: Any
 ) -> None:  # pragma: no cover - compiled
     """Window of the record around a time, by linear interpolation between samples."""
     start = math.floor(time)
@@ -159,7 +161,7 @@ def _window(
 
 @kernel(error_model="numpy")
 def read_records(
-    records: Any, w: Window, weights: Any, aligned: Any, slopes: Any, amplitudes: Any
+    records: Any, w: RecordWindow, weights: Any, aligned: Any, slopes: Any, amplitudes: Any
 ) -> None:  # pragma: no cover - compiled
     """Align and read each record; the records are normalised in place.
 

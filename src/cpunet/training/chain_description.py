@@ -1,34 +1,123 @@
-"""A fitted readout chain by physical quantities."""
+"""A trained run in physical quantities with their errors, and in words.
+
+Parameters of a fit can be degenerate: two nearly equal poles are individually unconstrained, as
+is a long decay beside a fast one, while their rise time and common decay are well known.
+Errors of derived numbers are therefore propagated with the full covariance of the parameters,
+along each of its axes.
+"""
 
 from __future__ import annotations
 
-import math
+import copy
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cpunet.electronics.pile_up_tails import tails_in_words
 from cpunet.errors import CpunetError
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.pulses.loading import SideInfo
 from cpunet.recipes.network_settings import ResponseConfig
-from cpunet.recipes.schema import PreparationConfig
+from cpunet.tables import counted, percent, with_std
 from cpunet.training.closed_forms import (
+    Chain,
+    Numbers,
+    chain_numbers,
     learned_chain,
+    noise_numbers,
+    reaches_ns,
     slow_numbers,
     with_noise,
 )
 from cpunet.training.diagnosis import beyond, stretched
-from cpunet.training.response_errors import fitted_errors, propagated
-from cpunet.training.response_figure import (
-    Chain,
-    Numbers,
-    align_ns,
-    chain_numbers,
-    noise_numbers,
-)
+from cpunet.training.response_problem import STRETCH, Parameters
 from cpunet.training.run import FitInfo, Run
+
+
+def propagated(
+    response: ElectronicsResponse,
+    covariance: Sequence[Sequence[float]],
+    numbers: Callable[[ElectronicsResponse], Numbers],
+) -> Numbers:
+    r"""Standard deviations of derived numbers of a response.
+
+    .. math:: \sigma_f^2 = \sum_k \left[ \tfrac{1}{2} \left(
+        f(p + \sigma_k e_k) - f(p - \sigma_k e_k) \right) \right]^2
+
+    with the axes :math:`\sigma_k e_k` of the error ellipsoid of the parameters :math:`p`.
+
+    Parameters
+    ----------
+    response
+        Fitted response.
+    covariance
+        Covariance of its parameters, in the order of its vector.
+    numbers
+        Function that returns the derived numbers of a response by name.
+
+    Returns
+    -------
+    dict
+        Standard deviation by name, of numbers that are defined at both ends of every axis;
+        empty if the covariance does not match the parameters.
+    """
+    moved = copy.deepcopy(response)
+    parameters = Parameters(moved)
+    centre = parameters.vector()
+    matrix = np.asarray(covariance, float)
+    if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
+        return {}
+    variances, axes = np.linalg.eigh(matrix)
+    ends = []
+    for axis in (np.sqrt(np.maximum(variances, 0)) * axes).T:
+        for end in (centre + axis, centre - axis):
+            parameters.set(end)
+            ends.append(numbers(moved))
+    errors: Numbers = {}
+    for name in ends[0]:
+        if all(name in end for end in ends):
+            values = np.array([end[name] for end in ends])
+            half = 0.5 * (values[::2] - values[1::2])
+            errors[name] = float(np.sqrt(sum(half**2)))
+    return errors
+
+
+def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
+    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
+    poles, decay = response.log_poles_ns.detach().exp(), response.log_decay_us.exp().item()
+    order = poles.argsort(descending=True).tolist()
+    sources = {
+        f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
+        for i, k in enumerate(order)
+    }
+    sources["decay_us"] = ("log_decay_us.1", decay)
+    if len(response.ringing):
+        for i, value in enumerate(response.log_ringing.detach().exp().tolist()):
+            name = ("ringing_mhz", "ringing_damping_ns")[i]
+            sources[name] = (f"log_ringing.{i + 1}", value)
+    for i, tau in enumerate(response.slow_ns.tolist()):
+        sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
+    if response.drift is not None:
+        for i, name in enumerate(response.drift.describe()):
+            sources[name] = (f"{STRETCH}.{i + 1}", 1.0)
+    free = response.config.free_decays
+    for i, tau in enumerate(response.fast_times_us.tolist()):
+        name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"
+        sources[name] = (f"decay_weights.{i + 1}", 1.0)
+        if free:
+            sources[f"fast_decay_{i + 1}_us"] = (f"log_fast_decays_us.{i + 1}", tau)
+    return {
+        name: scale * float(errors[source])
+        for name, (source, scale) in sources.items()
+        if source in errors
+    }
+
 
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
@@ -59,7 +148,25 @@ def describe_chain(run: Run) -> dict[str, Any]:
     CpunetError
         If the run has no response in closed form.
     """
-    return _told(_response(run))
+    found = _response(run)
+    parameters = found.parameters
+    slow = {n: w for n, w in parameters.items() if n.startswith("slow_")}
+    values = {n: v for n, v in parameters.items() if n not in slow}
+    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
+    values |= chain_numbers(found.chain, run.recipe.preparation, run.dt_ns)
+    if run.fit is not None and run.fit.chi_square_per_moment is not None:
+        values["chi_square_per_moment"] = run.fit.chi_square_per_moment
+    return {
+        "path": run.name,
+        "recipe": run.recipe.name,
+        "peak": run.peak,
+        "seed": run.seed,
+        "values": values,
+        "errors": {n: e for n, e in found.errors.items() if n in values} | _noise_error(found),
+        "parameters": parameters,
+        "parameter_errors": found.errors,
+        "doubts": _doubts(found),
+    }
 
 
 def chain_of(run: Run) -> Chain:
@@ -96,19 +203,6 @@ def _response(run: Run) -> _Response:
             "`cpunet validate`"
         )
     network = run.fill("ren", ResponseGenerator(recipe.generator, run.dt_ns))
-    try:
-        found = _described(run, network)
-    except (ArithmeticError, ValueError, LookupError, RuntimeError) as error:
-        raise CpunetError(
-            f"{run.name}: its weights make no response of electronics ({error}); train again"
-        ) from error
-    wrong = [name for name, value in found.parameters.items() if not math.isfinite(value)]
-    if wrong:
-        raise CpunetError(f"{run.name}: {wrong[0]} of its response is no number; train again")
-    return found
-
-
-def _described(run: Run, network: ResponseGenerator) -> _Response:
     response, preparation, fit = network.response, run.recipe.preparation, run.fit or FitInfo()
     chain = learned_chain(response, Path(run.name).name)
     if int(network.n_baselines):
@@ -117,42 +211,14 @@ def _described(run: Run, network: ResponseGenerator) -> _Response:
     if len(response.ringing):
         parameters["ringing"] = response.ringing.norm().item()
     errors = fitted_errors(response, fit.errors)
-    errors |= propagated(
-        response,
-        fit.covariance,
-        lambda moved: _shape_numbers(moved, preparation, run.dt_ns),
-    )
+
+    def derived(moved: ElectronicsResponse) -> Numbers:
+        slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
+        numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
+        return slow_numbers(slow) | numbers
+
+    errors |= propagated(response, fit.covariance, derived)
     return _Response(run, chain, parameters, errors)
-
-
-def _shape_numbers(
-    response: ElectronicsResponse, preparation: PreparationConfig, dt_ns: float
-) -> Numbers:
-    """Derived numbers of a response, which are not parameters of the fit."""
-    slow = list(zip(response.slow_ns.tolist(), response.slow_weights.tolist(), strict=True))
-    numbers = chain_numbers(learned_chain(response, ""), preparation, dt_ns)
-    return slow_numbers(slow) | numbers
-
-
-def _told(found: _Response) -> dict[str, Any]:
-    run, parameters = found.run, found.parameters
-    slow = {n: w for n, w in parameters.items() if n.startswith("slow_")}
-    values = {n: v for n, v in parameters.items() if n not in slow}
-    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
-    values |= chain_numbers(found.chain, run.recipe.preparation, run.dt_ns)
-    if run.fit is not None and run.fit.chi_square_per_moment is not None:
-        values["chi_square_per_moment"] = run.fit.chi_square_per_moment
-    return {
-        "path": run.name,
-        "recipe": run.recipe.name,
-        "peak": run.peak,
-        "seed": run.seed,
-        "values": values,
-        "errors": {n: e for n, e in found.errors.items() if n in values} | _noise_error(found),
-        "parameters": parameters,
-        "parameter_errors": found.errors,
-        "doubts": _doubts(found),
-    }
 
 
 def _doubts(found: _Response) -> list[str]:
@@ -177,7 +243,83 @@ def _noise_error(found: _Response) -> Numbers:
     if not error or not rms or chain.noise_kev2_per_mhz is None:
         return {}
     preparation = run.recipe.preparation
-    end_ns = align_ns(chain, preparation) + preparation.samples_after * run.dt_ns
+    end_ns = (
+        reaches_ns(chain, preparation.align_fraction) + preparation.samples_after * run.dt_ns
+    )
     sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
     kev = noise_numbers(chain)["noise_rms_kev"]
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
+
+
+PARTS = 8  # maximum number of deviating parts of a fit
+UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
+_OFF = 3.0  # standard deviations
+
+
+def summary(run: Run) -> list[tuple[str, str]]:
+    """Topics and texts on a run."""
+    fit = run.fit or FitInfo()
+    where = run.name
+    response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
+    when = run.started[:16].replace("T", " ")
+    known, drift = fit.tails, (fit.model_extra or {}).get("drift") or {}
+    lines = [
+        ("run", where),
+        (
+            "trained",
+            f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; "
+            f"{when}, {run.seconds:.4g} s on {run.device}",
+        ),
+        ("from", run.init or ""),
+        ("simulated", _side(run.sim)),
+        ("measured", _side(run.data)),
+        ("fit", fit.verdict),
+        ("off", _deviations(fit.pulls)),
+        *(("cause", cause) for cause in fit.causes),
+        ("response", _parameters(fit.parameters)),
+        ("drift", str(drift.get("verdict") or "")),
+    ]
+    if "baselines" in fit.noise:
+        lines.append(("noise", f"{_noise(run)}of {fit.noise['baselines']:.0f} baselines"))
+    if known is not None and "rate_khz" in known.model_fields_set:
+        lines += tails_in_words(known.model_dump())
+    versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
+    lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
+    return [(topic, text) for topic, text in lines if text]
+
+
+def _noise(run: Run) -> str:
+    with suppress(CpunetError):  # no chain
+        kev, error = noise_kev(run)
+        return f"{with_std(kev, error)} keV (RMS), "
+    return ""
+
+
+def _side(side: SideInfo) -> str:
+    if side.file is None:
+        return ""
+    read_as = ", ".join(f"{n} {v}" for n, v in side.read_as.items())
+    text = f"{side.file}" + (f" ({read_as})" if read_as else "")
+    text += f": {side.used} of {side.read} pulses used"
+    lost = counted(side.rejections)
+    return f"{text}, left out {lost}" if lost else text
+
+
+def _deviations(pulls: Mapping[str, float]) -> str:
+    """Parts of the pulses that deviate, worst first."""
+    worst = sorted(pulls, key=lambda name: -abs(pulls[name]))[:PARTS]
+    return ", ".join(f"{n} {pulls[n]:+.1f} σ" for n in worst if abs(pulls[n]) > _OFF)
+
+
+def _parameters(values: Mapping[str, float]) -> str:
+    """Parameters of a readout chain; ``slow_100_ns`` and such are shares of the charge."""
+    words = []
+    for name, value in values.items():
+        stem, _, unit = name.rpartition("_")
+        shown = f" {UNITS[unit]}" if unit in UNITS else ""
+        called = (stem if shown else name).replace("_", " ")
+        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name):
+            words.append(f"{called}{shown} {percent(100 * value)}")
+        else:
+            words.append(f"{called} {value:.4g}{shown}")
+    return ", ".join(words)

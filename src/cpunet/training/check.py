@@ -20,7 +20,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.outputs import PICTURE_FORMATS, refuse_existing, refuse_inputs, written_aside
 from cpunet.pulses.channels import ALL, Pair, paired
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
@@ -34,6 +34,7 @@ from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+from cpunet.training.moments import spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -394,14 +395,10 @@ def _amplitude(sim: InputSet, data: InputSet) -> Finding:
     )
 
 
-def _some(one: InputSet) -> Pulses:
-    pulses = one.prepared.pulses
-    return pulses[np.linspace(0, len(pulses) - 1, min(len(pulses), MAX_PULSES)).astype(int)]
-
-
 def _of_height_one(one: InputSet) -> FloatArray:
     """Some pulses scaled to height 1, whatever the level of their prepared tails."""
-    waveforms = _some(one).waveforms
+    waveforms = one.prepared.pulses.waveforms
+    waveforms = waveforms[spread(len(waveforms), MAX_PULSES)]
     return np.asarray(waveforms / waveforms.max(axis=1, keepdims=True), np.float32)
 
 

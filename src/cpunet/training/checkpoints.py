@@ -104,7 +104,13 @@ def unfinished_folder(
                 "with `force`"
             )
         yield folder
-        _put_in_place(folder, out, force=force)
+        # a copy: until it is in place, the training can be resumed from the original folder
+        try:
+            with folder_written_aside(out, RUN, force=force) as whole:
+                copy_own(folder, whole, RUN)
+        except CpunetError as error:
+            kept = "the training is kept, finish it with `resume`"
+            raise CpunetError(f"{error}; {kept}") from error
         checkpoint.unlink(missing_ok=True)
     except OSError as error:
         raise CpunetError(
@@ -114,15 +120,6 @@ def unfinished_folder(
     finally:
         if not checkpoint.exists():
             remove_own(folder, UNFINISHED)
-
-
-def _put_in_place(folder: Path, out: Path, *, force: bool) -> None:
-    # a copy: until it is in place, the training can be resumed from the original folder
-    try:
-        with folder_written_aside(out, RUN, force=force) as whole:
-            copy_own(folder, whole, RUN)
-    except CpunetError as error:
-        raise CpunetError(f"{error}; the training is kept, finish it with `resume`") from error
 
 
 class UnfinishedRun:

@@ -22,7 +22,7 @@ from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
 from cpunet.networks.discriminators import GruDiscriminator
-from cpunet.networks.kept_noise import KeptNoise
+from cpunet.networks.generators import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes.schema import Recipe
 from cpunet.recipes.training_settings import LossConfig, TrainingConfig

@@ -18,12 +18,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from cpunet.networks.generators import stretch
 from cpunet.networks.learned_response import StepResponse
-from cpunet.networks.linear_inverse import stretch
 from cpunet.networks.response_layer import PADDING_AFTER, Readout, padded_length
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.training.moments import Moments
-from cpunet.training.translated import PLATEAU, Translated
+from cpunet.training.translated import PLATEAU, SimulatedSide
 
 BLOCK = 128  # pulses at a time: each has a record for every parameter
 AGAIN = 20  # samples after the half maximum from which it is searched for again
@@ -178,7 +178,7 @@ class DifferentiableSet:
         The pulses, their noise, and the moments that they are compared by.
     """
 
-    def __init__(self, sim: Translated) -> None:
+    def __init__(self, sim: SimulatedSide) -> None:
         self.sim, self.readings = sim, DifferentiableReadings(sim.moments, sim.last)
         self.padded = padded_length(sim.length)
         self.weights = torch.from_numpy(sim.weights).float()
@@ -232,7 +232,7 @@ class DifferentiableSet:
         for first in range(0, len(self.sim), size):
             spectra = torch.from_numpy(self.sim.spectrum(response, first, size))
             clean, moved = self.records(spectra, transfer), self.records(spectra, slopes)
-            for draw in self._draws[:draws]:
+            for draw in range(len(self.sim.noise.factor))[:draws]:
                 noise = self.noise(draw, first, len(clean))
 
                 def of(records: Tensor, noise: Tensor = noise) -> Tensor:
@@ -248,10 +248,6 @@ class DifferentiableSet:
                 # the values are the same along all directions
                 values, columns = torch.func.vmap(along, out_dims=(None, 0))(moved)  # type: ignore[arg-type]
                 yield first, values, columns, self.weights[first : first + size]
-
-    @property
-    def _draws(self) -> range:
-        return range(len(self.sim.noise.factor))
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:
         """Noise of `n` pulses from the first one on, shape (n, samples)."""

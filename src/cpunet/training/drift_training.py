@@ -21,10 +21,9 @@ from torch import Tensor
 from cpunet.networks.learned_response import DriftUNet, LearnedResponse
 from cpunet.networks.response_layer import current_spectrum
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.fitter import Fitter
-from cpunet.training.held_out import HeldOut, compared, split
+from cpunet.training.fitter import Fitter, HeldOutPulses, compared, split
 from cpunet.training.moments import BLOCK
-from cpunet.training.response_problem import Band, Comparison, ResponseProblem
+from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
 
 HELD_OUT = 0.2  # fraction of the pulses
 ROUNDS, STEPS, BATCH, RATE = 4, 40, 192, 1e-3
@@ -127,7 +126,7 @@ def fit_drift(
         step.coordinates.data.copy_(torch.lerp(without, whole, share))
         if 0 < share < 1:
             fitter.follow(ResponseProblem(step, changed(known, drift), draws=1))
-        results.append([HeldOut(changed(held, drift), known, response)])
+        results.append([HeldOutPulses(changed(held, drift), known, response)])
     gain = compared(results, seed)
     chosen = gain.best
     drift.share.fill_(1.0)
@@ -154,7 +153,7 @@ class _Trained:
 
     def __init__(self, band: Band, response: LearnedResponse) -> None:
         self.band, self.response = band, response
-        comparison = Comparison(band)
+        comparison = BandComparison(band)
         self.whiten = torch.from_numpy(comparison.whiten / comparison.sigma)
         self.wanted = torch.from_numpy(comparison.wanted)
         self.mean: Tensor | None = None  # over the last batches

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
+from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
@@ -20,10 +23,14 @@ from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.loop import Record
 from cpunet.training.pulse_sets import SINGLE, Continuum
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import DRIFT, with_drift_terms
-from cpunet.training.run import FitInfo, Run
+from cpunet.training.run import FitInfo, Run, append_losses
+
+if TYPE_CHECKING:
+    from cpunet.training.job import TrainingJob
 
 log = logging.getLogger(__name__)
 
@@ -180,3 +187,24 @@ def _described(
             "rms_error": noise.rms_error,
         },
     }
+
+
+def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
+    """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    if job.init is not None:
+        known = known_response(job.init, job.recipe)
+    with stage("Matching") as bar:  # how many steps a fit needs is not known
+
+        def listen(step: int, chi_square: float) -> None:
+            losses = {"chi_square": chi_square}
+            record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
+            append_losses(job.folder, [record])
+            bar.update(1)
+            bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
+
+        found = match(job.sim, job.data, job.recipe, job.seed, listen, known, job.continuum)
+    found.log()
+    seconds = time.perf_counter() - clock
+    began = started.isoformat(timespec="seconds")
+    return job.run(found.model, found.recipe, began, seconds, fit=found.info)

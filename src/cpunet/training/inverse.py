@@ -15,11 +15,10 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
-from cpunet.networks.linear_inverse import LinearInverse, Sizes, stretch
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import LinearInverse, ResponseGenerator, Sizes, stretch
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
@@ -69,10 +68,14 @@ def fit_inverse(
     Raises
     ------
     CpunetError
-        If there are too few pulses, or an energy is not a positive number.
+        If there are too few pulses.
     """
     _, training = recipe.matching
-    _check(sim, energy_kev)
+    if len(sim) < MIN_PULSES:
+        raise CpunetError(
+            f"{len(sim)} simulated pulses for the inverse; {MIN_PULSES} or more are needed: "
+            "select more energies (`peak`) or simulate more"
+        )
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(len(sim), min(len(sim), MAX_PULSES), replace=False))
     windows, delay, used = _translated(generator, sim[rows], recipe)
@@ -88,20 +91,6 @@ def fit_inverse(
     noise *= float(np.mean(energy_kev[rows] ** -2.0)) / float(level.mean()) ** 2
     _regress(inverse, measured, wanted, noise)
     return inverse
-
-
-def _check(sim: FloatArray, energy_kev: Values) -> None:
-    if len(sim) < MIN_PULSES:
-        raise CpunetError(
-            f"{len(sim)} simulated pulses for the inverse; {MIN_PULSES} or more are needed: "
-            "select more energies (`peak`) or simulate more"
-        )
-    if energy_kev.shape != (len(sim),):
-        raise CpunetError(
-            f"the inverse of {len(sim)} pulses needs {len(sim)} energies; "
-            f"energy_kev has shape {energy_kev.shape}"
-        )
-    require_energies(energy_kev)
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,14 +29,13 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.training.chain import train_chain
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.checkpoints import unfinished_folder, unfinished_name
 from cpunet.training.devices import peak_memory_mb
-from cpunet.training.energy_bands import continuum
+from cpunet.training.fit import train_chain
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks
-from cpunet.training.pulse_sets import Continuum
+from cpunet.training.pulse_sets import Continuum, continuum
 from cpunet.training.run import INFO, RUN, Run, RunLike, as_run, read_losses, versions
 
 log = logging.getLogger(__name__)
@@ -72,37 +71,6 @@ class TrainingJob:
     init: Run | None = None
     resume: bool = False
     continuum: Continuum | None = None
-
-    @classmethod
-    def of(
-        cls,
-        pair: Pair,
-        folder: Path | str,
-        recipe: Recipe,
-        peak: str,
-        init: Run | None,
-        seed: int,
-        device: str,
-        resume: bool,
-    ) -> Self:
-        """Read and prepare both sides, and warn of what makes a training on them doubtful."""
-        selection = parse_selection(peak, recipe.peaks)
-        sim = load_pulses(pair[0], "simulated", recipe, selection)
-        data = load_pulses(pair[1], "measured", recipe, selection)
-        require_same_sampling(sim, data)
-        require_both_sides(sim, data, selection)
-        for finding in compare_sides(sim, data, selection):
-            if finding.level != Level.FINE:
-                log.warning(finding)
-        away, beside = continuum(recipe), None
-        there = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
-        if there >= MIN_PULSES and not selection.ranges_kev:
-            beside = partial(_continuum, pair, recipe, away)
-        if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
-            kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-            raise CpunetError(f"{init.name}: {kinds}; resample them")
-        place = Path(folder)
-        return cls(recipe, peak, seed, device, sim, data, place, init, resume, beside)
 
     def trained(self, out: Path | None) -> Run:
         """Train, and write the folder of the job, which becomes `out`."""
@@ -189,10 +157,28 @@ class Training:
         """Read, train and write a run."""
         files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
         with workplace(out, files, self.recipe, go_on, self.force) as folder:
-            job = TrainingJob.of(
-                pair, folder, self.recipe, self.peak, start, self.seed, self.device, go_on
-            )
-            return job.trained(out)
+            return self._job(pair, Path(folder), start, go_on).trained(out)
+
+    def _job(self, pair: Pair, folder: Path, init: Run | None, resume: bool) -> TrainingJob:
+        """Read and prepare both sides, and warn of what makes a training on them doubtful."""
+        recipe, selection = self.recipe, parse_selection(self.peak, self.recipe.peaks)
+        sim = load_pulses(pair[0], "simulated", recipe, selection)
+        data = load_pulses(pair[1], "measured", recipe, selection)
+        require_same_sampling(sim, data)
+        require_both_sides(sim, data, selection)
+        for finding in compare_sides(sim, data, selection):
+            if finding.level != Level.FINE:
+                log.warning(finding)
+        away, beside = continuum(recipe), None
+        there = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
+        if there >= MIN_PULSES and not selection.ranges_kev:
+            beside = partial(_continuum, pair, recipe, away)
+        if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
+            kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
+            raise CpunetError(f"{init.name}: {kinds}; resample them")
+        return TrainingJob(
+            recipe, self.peak, self.seed, self.device, sim, data, folder, init, resume, beside
+        )
 
 
 def workplace(

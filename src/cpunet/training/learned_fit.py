@@ -104,20 +104,14 @@ def _from_afar(
     for factor in fitter.training.start_factors:
         problem = ResponseProblem(StepResponse(config, dt_ns), far, draws=1)
         problem.response.set_base(factor * POLE_NS, problem.slope)
+        problem.clip = FIRST_CLIPS[-1]  # far from the data, all would be clipped
         problems.append(problem)
-    best = min(problems, key=_distance)
+    best = min(problems, key=lambda problem: problem.cost)
     fitter.fit(best)
     response = LearnedResponse(config, dt_ns)
     response.step = best.response
     found = fitter.fit(ResponseProblem(response.step, near, draws=1), coarse=False)
     return response, found
-
-
-def _distance(problem: ResponseProblem) -> float:
-    """Cost far from the data, where all would be clipped."""
-    problem.clip = FIRST_CLIPS[-1]
-    residuals = problem.residuals(problem.parameters.vector())
-    return float(residuals @ residuals)
 
 
 def _determined(step: StepResponse, bands: Sequence[Band], fitter: Fitter) -> Values:

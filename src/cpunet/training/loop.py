@@ -102,11 +102,8 @@ def train(
     Raises
     ------
     CpunetError
-        If a set is empty, or a loss becomes NaN or infinite.
+        If a loss becomes NaN or infinite.
     """
-    for name, pulses in (("simulated", sim), ("measured", data)):
-        if not len(pulses):
-            raise CpunetError(f"no {name} pulses to train on")
     config = recipe.cyclegan.training
     with _seeded(seed, device):
         model = CycleGan(recipe, outside).to(device).train()

@@ -23,7 +23,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.recipes.training_settings import MatchingConfig
-from cpunet.training._record_kernels import Window, project, read_records
+from cpunet.training._record_kernels import RecordWindow, project, read_records
 
 Values = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
@@ -246,7 +246,7 @@ class Moments:
             ),
         )
 
-    def window(self, last: int) -> Window:
+    def window(self, last: int) -> RecordWindow:
         """Where records are read whose half maxima are before a sample."""
         return _window(self.config, self.preparation, self.level, last)
 
@@ -297,7 +297,7 @@ class Moments:
         return float(self.centres[-1])
 
     def _of_windows(
-        self, windows: FloatArray, whole: Rows, window: Window, least: float
+        self, windows: FloatArray, whole: Rows, window: RecordWindow, least: float
     ) -> Readings:
         """Readings of the prepared measured pulses that are used."""
         linear, log_amplitude = [], []
@@ -319,8 +319,8 @@ def spread(n: int, most: int) -> Rows:
 
 def _window(
     config: MatchingConfig, preparation: PreparationConfig, level: float, last: int
-) -> Window:
-    return Window(
+) -> RecordWindow:
+    return RecordWindow(
         level=level,
         last=last,
         before=config.before,
@@ -337,7 +337,7 @@ def _window(
     )
 
 
-def _aligned(records: FloatArray, window: Window) -> tuple[FloatArray, Values, Values]:
+def _aligned(records: FloatArray, window: RecordWindow) -> tuple[FloatArray, Values, Values]:
     """Aligned pulses, tail slopes and logarithms of the current amplitude of records."""
     n = len(records)
     aligned = np.empty((n, window.before + window.after), np.float32)
@@ -347,7 +347,7 @@ def _aligned(records: FloatArray, window: Window) -> tuple[FloatArray, Values, V
 
 
 def _read_windows(
-    windows: FloatArray, window: Window, preparation: PreparationConfig
+    windows: FloatArray, window: RecordWindow, preparation: PreparationConfig
 ) -> tuple[FloatArray, Values, Values]:
     """Like `_aligned`, for prepared windows, whose tails are where the preparation put them."""
     records = np.array(windows, np.float32)  # a copy, to be changed in place

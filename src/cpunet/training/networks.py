@@ -33,7 +33,9 @@ _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 def train_networks(job: TrainingJob) -> Run:
     """Train the networks of a CycleGAN, or resume their training."""
     recipe = job.recipe
-    run = UnfinishedRun(job.folder, _fingerprint(job), _environment(job))
+    threads = torch.get_num_threads()  # as device and version, it changes the last bits
+    environment = {"device": job.device, "threads": threads, "torch": torch.__version__}
+    run = UnfinishedRun(job.folder, _fingerprint(job), environment)
     state = run.begin(resume=job.resume)
     outside, fit = outside_noise(job.sim, job.data, recipe)
     left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
@@ -133,12 +135,3 @@ def _fingerprint(job: TrainingJob) -> dict[str, Any]:
     if job.init is not None:
         settings["init"] = job.init.weights_sha256
     return settings | {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
-
-
-def _environment(job: TrainingJob) -> dict[str, Any]:
-    """Environment that affects the last bits of the weights."""
-    return {
-        "device": job.device,
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-    }

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cpunet.electronics.drawn_tails import TraceNoise
 from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE
-from cpunet.networks.linear_inverse import stretch
+from cpunet.networks.generators import stretch
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig

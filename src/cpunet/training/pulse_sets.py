@@ -1,21 +1,170 @@
-"""Two sets of pulses, divided into bands of energy for comparison."""
+"""Two sets of pulses, divided into bands of energy in which they are compared.
+
+Lines and continua have different mixtures of single-site and multi-site events, and noise
+scales as 1/energy.  Pulses of a line are therefore compared with those of the same line, and a
+continuum is compared in bands narrow enough for a constant mixture.  If the spectra of the two
+sides differ within such a band, the simulated pulses are weighted to match the data.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.recipes.schema import Recipe
-from cpunet.training.energy_bands import EnergyBand, energy_bands, spectrum_weights
+from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
+from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.moments import Moments, Rows, TooFewPulsesError, Values
 from cpunet.training.response_problem import Band
-from cpunet.training.translated import Noise, Translated
+from cpunet.training.translated import Noise, SimulatedSide
+
+# Ratio of the limits of a band; the next is used only if no band of the one before is possible.
+WIDEST = (1.3, 2.0, 4.0, np.inf)
+LEAST = 200  # minimum number of pulses of each side in a band
+# Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
+SLICES, IN_SLICE = 32, 50
+# The continuum begins where noise is small, and ends well before a line and its sidebands.
+CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
+HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyBand:
+    """Pulses of both sides that are compared with each other.
+
+    Parameters
+    ----------
+    name
+        A line, or a range in keV.
+    sim, data
+        Rows of the two sides.
+    weights
+        Weights of the simulated pulses, with a mean of 1.
+    """
+
+    name: str
+    sim: Rows
+    data: Rows
+    weights: Values
+
+
+def energy_bands(
+    sim_kev: Values, data_kev: Values, peaks: Mapping[str, PeakConfig]
+) -> list[EnergyBand]:
+    """Divide two sets of pulses into bands of energy.
+
+    Parameters
+    ----------
+    sim_kev, data_kev
+        Energies of the pulses to be compared, on the two sides.
+    peaks
+        Known lines.
+
+    Returns
+    -------
+    list of EnergyBand
+        Lines first.  Energies with too few pulses of one side are in no band.
+
+    Raises
+    ------
+    CpunetError
+        If no band has enough pulses of both sides.
+
+    Examples
+    --------
+    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
+    >>> sim = np.r_[np.full(500, 2614.5), np.linspace(1000, 1200, 900)]
+    >>> data = np.r_[np.full(400, 2614.0), np.linspace(1000, 1200, 800)]
+    >>> [(b.name, len(b.sim), len(b.data)) for b in energy_bands(sim, data, lines)]
+    [('FEP', 500, 400), ('1000-1200 keV', 900, 800)]
+    """
+    labels = [label_peaks(side, peaks) for side in (sim_kev, data_kev)]
+    bands = []
+    for name in peaks:
+        sim, data = (np.flatnonzero(of == name) for of in labels)
+        if min(len(sim), len(data)) >= LEAST:
+            bands.append(EnergyBand(name, sim, data, np.ones(len(sim))))
+    inside = {band.name for band in bands}
+    sim, data = (np.flatnonzero(~np.isin(of, [*inside])) for of in labels)
+    for widest in WIDEST:
+        bands += _continuum(sim_kev, data_kev, sim, data, widest)
+        if bands:
+            break
+    else:
+        raise CpunetError(
+            f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {LEAST} of each at "
+            "the same energies are needed: select more energies (`peak`), simulate more, or "
+            "give more files"
+        )
+    return bands
+
+
+def _continuum(
+    sim_kev: Values, data_kev: Values, sim: Rows, data: Rows, widest: float
+) -> list[EnergyBand]:
+    """Bands of the pulses that are not in a line, from the highest energy down."""
+    bands, energies = [], (sim_kev, data_kev)
+    rows = [side[np.argsort(-e[side])] for side, e in zip((sim, data), energies, strict=True)]
+    while min(map(len, rows)):
+        top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
+        rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
+        counts = [
+            int((e[r] >= top / widest).sum()) for r, e in zip(rows, energies, strict=True)
+        ]
+        left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
+        if min(counts) >= LEAST and min(left) < LEAST and max(left) < 2 * LEAST:
+            counts = [len(r) for r in rows]  # include a small remainder
+        parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
+        if min(counts) >= LEAST:
+            low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
+            weights = spectrum_weights(sim_kev[parts[0]], data_kev[parts[1]])
+            if weights.any():
+                name = f"{low:.0f}-{top:.0f} keV"
+                bands.append(EnergyBand(name, parts[0], parts[1], weights))
+        rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
+    return bands
+
+
+def continuum(recipe: Recipe) -> EnergySelection:
+    """Energies below the highest line, away from all lines and from what scores look at.
+
+    Examples
+    --------
+    >>> from cpunet.recipes import load_recipe
+    >>> continuum(load_recipe("fast")).name
+    '1000-1543,1643-2004,2154-2565'
+    """
+    centres = [line.energy_kev for line in recipe.peaks.values()]
+    used = [(kev - CLEAR_KEV, kev + CLEAR_KEV) for kev in centres]
+    used += recipe.scores.continuum_kev.values()
+    ranges, first = [], CONTINUUM_FROM_KEV
+    for low, stop in sorted(used):
+        if low > first:
+            ranges.append(f"{first:.0f}-{low:.0f}")
+        first = max(first, stop)
+    return parse_selection(",".join(ranges), recipe.peaks)
+
+
+def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
+    """Weights of simulated pulses that give them the data's spectrum, with a mean of 1.
+
+    All are 0 if the spectra do not overlap.
+    """
+    slices = max(2, min(SLICES, min(len(sim_kev), len(data_kev)) // IN_SLICE))
+    edges = np.quantile(data_kev, np.linspace(0, 1, slices + 1)[1:-1])
+    of_sim, of_data = np.searchsorted(edges, sim_kev), np.searchsorted(edges, data_kev)
+    counts = [np.bincount(of, minlength=slices) for of in (of_sim, of_data)]
+    ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
+    weights = np.minimum(ratio, HEAVIEST)[of_sim]
+    return np.asarray(weights / max(weights.mean(), 1e-9))
+
 
 # Minimum number of pulses of a band if only some of a set are taken.
 MIN_OF_BAND = 400
@@ -114,10 +263,10 @@ class PulseSets:
 
     def _translated(
         self, sim: Pulses, moments: Moments, weights: Values, draws: int
-    ) -> Translated:
+    ) -> SimulatedSide:
         length = record_length(sim.waveforms.shape[1])
         drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
-        return Translated(sim.waveforms, drawn, moments, weights)
+        return SimulatedSide(sim.waveforms, drawn, moments, weights)
 
 
 def _taken(waveforms: FloatArray, rows: Rows) -> FloatArray:

@@ -20,8 +20,14 @@ from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import checked, read_json
 from cpunet.tables import text_table
 from cpunet.training.chain_description import chain_of, describe_chain
-from cpunet.training.closed_forms import true_chain_of, true_parameters
-from cpunet.training.response_figure import Chain, Numbers, chain_numbers, response_figure
+from cpunet.training.closed_forms import (
+    Chain,
+    Numbers,
+    chain_numbers,
+    response_figure,
+    true_chain_of,
+    true_parameters,
+)
 from cpunet.training.run import Run, RunLike, as_run
 
 if TYPE_CHECKING:

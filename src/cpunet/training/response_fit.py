@@ -19,11 +19,10 @@ from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
+from cpunet.training.diagnosis import amplitude_shift
 from cpunet.training.drift_training import DriftFit
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
-from cpunet.training.held_out import held_out_gain
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
 from cpunet.training.levenberg_marquardt import Listener
-from cpunet.training.misfit import amplitude_shift
 from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets
@@ -75,7 +74,7 @@ class Fit:
         Energies compared, with the pulses of each side.
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
-        the data's, see `cpunet.training.misfit`.
+        the data's, see `cpunet.training.diagnosis`.
     drift
         What a U-Net before a learned readout gains, if one was trained.
     gains
@@ -149,7 +148,7 @@ def fit_response(
     ----------
     sim, data
         Prepared pulses with their energies: noise scales as 1/energy, and pulses are compared
-        in bands of energy, see `cpunet.training.energy_bands`.
+        in bands of energy, see `cpunet.training.pulse_sets`.
     noise
         Noise of the data's baselines.
     recipe

@@ -2,14 +2,14 @@
 
 A fit only finds the minimum of the valley that it starts in.  There are therefore several
 starts and, if the fit is poor, a stretch of the simulated drift, a fast decay with a free time
-and a ringing.  Each is kept only if held-out pulses gain, see `cpunet.training.held_out`.
+and a ringing.  Each is kept only if held-out pulses gain, see `cpunet.training.fitter`.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -18,10 +18,63 @@ import torch
 from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
-from cpunet.training.held_out import held_out_gain
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
 from cpunet.training.response_problem import STRETCH, ResponseProblem
-from cpunet.training.ringing import most_promising_ringing
+
+
+def most_promising_ringing(
+    problem: ResponseProblem, frequencies_mhz: Sequence[float]
+) -> tuple[ElectronicsResponse | None, float]:
+    """Look for the ringing that would lower chi-square most.
+
+    A fit does not find the frequency of a ringing from a distant start: chi-square as a
+    function of the frequency has many valleys.  But pulses depend nearly linearly on the two
+    weights of the ringing.  The best weights for each frequency on a grid, and the expected
+    chi-square, therefore follow from the derivatives at zero weights.
+
+    Parameters
+    ----------
+    problem
+        Problem of a fitted response without ringing.
+    frequencies_mhz
+        Frequencies to try.
+
+    Returns
+    -------
+    response
+        A copy of the response with a ringing of the best frequency and zero weights; None if
+        there are no frequencies.
+    promised
+        Chi-square expected with it, to first order.
+    """
+    vector = problem.parameters.vector()
+    problem.clip = None
+    deviations = problem.deviations(vector)
+    known = problem.derivatives(vector, deviations, range(len(vector)))
+    best: tuple[ElectronicsResponse | None, float] = (None, float(deviations @ deviations))
+    for frequency in frequencies_mhz:
+        response = _ringing_copy(problem.response, frequency)
+        tried = problem.of(response)
+        weights = [i for i, label in enumerate(tried.parameters.labels) if label == "ringing"]
+        slopes = tried.derivatives(tried.parameters.vector(), deviations, weights)
+        columns = np.concatenate([known, slopes], axis=1)
+        move = np.linalg.lstsq(columns, deviations)[0]
+        left = deviations - columns @ move
+        response.ringing.data.zero_()  # the derivatives moved it
+        if float(left @ left) < best[1]:
+            best = response, float(left @ left)
+    return best
+
+
+def _ringing_copy(response: ElectronicsResponse, frequency_mhz: float) -> ElectronicsResponse:
+    """A copy of a response with a ringing of a given frequency and zero weights."""
+    config = response.config.model_copy(update={"ringing_mhz": frequency_mhz})
+    rings = ElectronicsResponse(config, float(response.dt_ns))
+    state = {n: v for n, v in response.state_dict().items() if "ringing" not in n}
+    rings.load_state_dict(state, strict=False)
+    rings.decay_known = response.decay_known
+    return rings
+
 
 # Chi-square per moment of another detector; in a wrong valley it is about three.
 HOPELESS_FIT = 20.0
@@ -61,7 +114,7 @@ def from_known(
     starts = [first.of(start)]
     if fitter.decay is None:
         starts.append(first.of(copy.deepcopy(known)))
-    problem = min(starts, key=_cost)
+    problem = min(starts, key=lambda start: start.cost)
     for coarse in (False, True):
         found = fitter.fit(problem, coarse=coarse)
         if not found.poor:
@@ -163,7 +216,7 @@ def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
         _free_decay_start(problem, free, us, share, decay)
         for us, share in _decays(problem, decay)
     ]
-    return fitter.fit(min(starts, key=_cost), coarse=False)
+    return fitter.fit(min(starts, key=lambda start: start.cost), coarse=False)
 
 
 def _free_decay_start(
@@ -215,11 +268,6 @@ def _fast_slope(problem: ResponseProblem, fast_us: float) -> float:
     us = 1e-3 * float(problem.response.dt_ns)
     middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * us
     return math.exp(-middle_us / fast_us) / fast_us
-
-
-def _cost(problem: ResponseProblem) -> float:
-    residuals = problem.residuals(problem.parameters.vector())
-    return float(residuals @ residuals)
 
 
 def ringing_if_better(found: Fitted, fitter: Fitter) -> Fitted:

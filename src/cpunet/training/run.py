@@ -309,7 +309,7 @@ class Run(InfoPart):
             If a run of networks contains no losses.
         """
         from cpunet.training.chain_description import chain_of
-        from cpunet.training.response_figure import response_figure
+        from cpunet.training.closed_forms import response_figure
         from cpunet.validation.run_figures import loss_curves
 
         if self.recipe.generator.name != "response":
@@ -335,7 +335,7 @@ class Run(InfoPart):
 
     def summary(self) -> list[tuple[str, str]]:
         """What was trained, on what, and how well it fits: topics and texts."""
-        from cpunet.training.run_words import summary
+        from cpunet.training.chain_description import summary
 
         return summary(self)
 

@@ -16,12 +16,12 @@ import numpy.typing as npt
 import scipy.fft
 import torch
 
-from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import DrawnTails
-from cpunet.networks.drift_clock import DriftClock
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,
+    DriftClock,
     Readout,
     padded_length,
     record_length,
@@ -82,14 +82,8 @@ class Noise:
 
         Every second draw is the one before it with opposite sign, so that the contribution of
         noise to a mean cancels.
-
-        Raises
-        ------
-        CpunetError
-            If an energy is not a positive number.
         """
         n, pairs = len(energy_kev), -(-draws // 2)
-        require_energies(energy_kev)
         kept = min(NOISE_TRACES, n * pairs)
         traces = noise.draw(np.ones(kept), 2 * length, rng)
         # each trace is used before any is used again
@@ -133,7 +127,7 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class Translated:
+class SimulatedSide:
     """A set of simulated pulses, the noise they get, and the functions they are compared by.
 
     Parameters
@@ -171,14 +165,10 @@ class Translated:
         """Sample of a record after all half maxima."""
         return PADDING_BEFORE + self.moments.preparation.samples_before + DELAY
 
-    def first(self, n: int) -> Translated:
-        """The first `n` pulses, with their noise."""
-        return self.of(slice(n))
-
-    def of(self, rows: Rows | slice) -> Translated:
+    def of(self, rows: Rows | slice) -> SimulatedSide:
         """Some of the pulses, with their noise."""
         noise = self.noise.of(rows)
-        return Translated(self.sim[rows], noise, self.moments, self.weights[rows])
+        return SimulatedSide(self.sim[rows], noise, self.moments, self.weights[rows])
 
     def sums(
         self,
@@ -219,7 +209,9 @@ class Translated:
         draws: int | None = None,
     ) -> list[Total]:
         """Same as `sums`, for each block of `size` pulses in their order."""
-        transfer = self._transfer(response)
+        with torch.no_grad():
+            transfer = response.transfer(padded_length(self.length)).numpy()
+        transfer = np.asarray(transfer, np.complex64)
         drift = response.drift
         stretch = drift.stretch.tolist() if isinstance(drift, DriftClock) else []
         if stretch != self._stretch:
@@ -251,11 +243,6 @@ class Translated:
         return [
             _added(within if exclude else within + outside) for within, outside, _ in blocks
         ]
-
-    def _transfer(self, response: Readout) -> npt.NDArray[np.complex64]:
-        with torch.no_grad():
-            transfer = response.transfer(padded_length(self.length))
-        return np.asarray(transfer.numpy(), np.complex64)
 
     def _block(
         self,

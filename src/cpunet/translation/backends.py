@@ -15,10 +15,8 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.electronics.finishing import PADDING_BEFORE, extended, finish, with_room
 from cpunet.electronics.in_trace_pile_up import InTracePileUp
-from cpunet.networks.kept_noise import KeptNoise
-from cpunet.networks.linear_inverse import LinearInverse, Sizes
+from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.network_settings import PunetConfig

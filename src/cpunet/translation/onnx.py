@@ -21,9 +21,9 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.drift_clock import DriftClock
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.response_layer import DriftClock
 
 # Version of the operators, and the lowest version of the file format that holds them: what a
 # runtime older than the exporter reads.

@@ -1,19 +1,84 @@
-"""The inverse of a readout chain as one linear map about the half maximum.
-
-Of all linear functions of a measured pulse it is the one that comes closest to the charge
-pulse on average (the Wiener filter of these pulses in this noise).  Windows are aligned at
-half maximum by whole samples: shifts by fractions of a sample would smooth the steep part, and
-degrade the map.
-"""
+"""Between simulation and data: a readout chain with its noise, and the linear inverse."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
+from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.networks.learned_response import LearnedResponse
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.recipes.network_settings import LearnedConfig, ResponseConfig
 from cpunet.recipes.training_settings import MatchingConfig
+
+NOISE_BINS = 4097  # in a spectrum as measured by `BaselineNoise`
+
+
+class KeptNoise(nn.Module):
+    """Spectra of noise as buffers.
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period in ns.
+    """
+
+    noise_continua: Tensor
+    noise_lines: Tensor
+    noise_shares: Tensor
+    n_baselines: Tensor
+
+    def __init__(self, dt_ns: float) -> None:
+        super().__init__()
+        self._dt_ns = float(dt_ns)
+        # (prepared units x keV)^2, see `BaselineNoise`; kinds that are absent have a share of 0
+        for name in ("noise_continua", "noise_lines"):
+            self.register_buffer(name, torch.zeros(KINDS, NOISE_BINS))
+        self.register_buffer("noise_shares", torch.zeros(KINDS, dtype=torch.float64))
+        self.register_buffer("n_baselines", torch.zeros((), dtype=torch.long))
+
+    @property
+    def noise_dt_ns(self) -> float:
+        """Sampling period of the noise in ns."""
+        return self._dt_ns
+
+    def set_noise(self, noise: BaselineNoise) -> None:
+        """Store a measured spectrum."""
+        one = noise.density_of(2 * (NOISE_BINS - 1))[np.newaxis]
+        continua = one if noise.kinds is None else noise.kinds
+        lines = np.zeros_like(continua) if noise.lines is None else noise.lines
+        shares = np.ones(1) if noise.shares is None else noise.shares
+        for buffer, values in (
+            (self.noise_continua, continua),
+            (self.noise_lines, lines),
+            (self.noise_shares, shares),
+        ):
+            buffer.zero_()
+            buffer[: len(values)] = torch.from_numpy(values).to(buffer)
+        self.n_baselines.fill_(noise.n_baselines)
+
+    @property
+    def noise(self) -> BaselineNoise:
+        """The noise, to be drawn from."""
+        there = self.noise_shares.cpu().numpy() > 0
+        continua, lines, shares = (
+            buffer.cpu().numpy()[there].astype(float)
+            for buffer in (self.noise_continua, self.noise_lines, self.noise_shares)
+        )
+        return BaselineNoise(
+            shares @ (continua + lines),
+            2 * (NOISE_BINS - 1),
+            self.noise_dt_ns,
+            int(self.n_baselines),
+            continua,
+            lines,
+            shares,
+        )
+
 
 AFTER = 170  # samples from the half maximum until charge and slow response have arrived
 MIN_LEVEL = 1e-3  # below it, there is no pulse
@@ -53,6 +118,11 @@ class Sizes(NamedTuple):
 
 class LinearInverse(nn.Module):
     """Prepared measured windows → simulation-like, almost noise-free pulses.
+
+    Of all linear functions of a measured pulse it is the one that comes closest to the charge
+    pulse on average (the Wiener filter of these pulses in this noise).  Windows are aligned at
+    half maximum by whole samples: shifts by fractions of a sample would smooth the steep part,
+    and degrade the map.
 
     A new one holds zeros: load weights, or let `cpunet.training.inverse` fit them.
 
@@ -144,3 +214,36 @@ def stretch(pulses: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
     """
     index = sample[:, None] + torch.arange(first, stop, device=pulses.device)
     return pulses.gather(1, index.clamp(0, pulses.shape[1] - 1))
+
+
+class ResponseGenerator(KeptNoise):
+    """A response and a spectrum of noise, saved together.
+
+    Parameters
+    ----------
+    config
+        Configuration of the response.
+    dt_ns
+        Sampling period in ns.
+    """
+
+    tails: DrawnTails | None = None
+    """Pile-up tails, which are added to records with the noise."""
+
+    def __init__(self, config: ResponseConfig | LearnedConfig, dt_ns: float) -> None:
+        super().__init__(dt_ns)
+        self.response: Any = (
+            LearnedResponse(config, dt_ns)
+            if isinstance(config, LearnedConfig)
+            else ElectronicsResponse(config, dt_ns)
+        )
+
+    @property
+    def noise_dt_ns(self) -> float:
+        """Current sampling period of the response in ns."""
+        return float(self.response.dt_ns)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""
+        records: Tensor = self.response(windows)
+        return records
