@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -10,14 +12,48 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import TraceNoise
 from cpunet.electronics.finishing import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan, Step, weighted_l1, window_weights
 from cpunet.training.outside import Outside, as_measured, in_room, tolerance
+from unpaired import crossing
 
 CONFIG = load_recipe("paper").preparation
 DT_NS, RMS_KEV = 16.0, 4.0
 KEV = np.array([500.0, 1000.0, 2000.0, 4000.0])
+TINY = (
+    "discriminator.embedding_rows=20",
+    "discriminator.embedding_dim=4",
+    "discriminator.hidden=4",
+    "discriminator.samples_per_step=16",
+)
+
+Values = dict[str, torch.Tensor]
+
+
+def slopes(
+    function: Callable[[], Values], moved: torch.Tensor, along: torch.Tensor, step: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Derivatives of each value along a direction: by autograd, and by central differences."""
+
+    def values() -> Values:
+        torch.manual_seed(1)  # the same noise every time
+        return function()
+
+    found, wanted = {}, {}
+    for name, value in values().items():
+        (slope,) = torch.autograd.grad(value, moved, retain_graph=True, allow_unused=True)
+        found[name] = 0.0 if slope is None else float((slope * along).sum())
+    with torch.no_grad():
+        start = moved.clone()
+        sides = []
+        for sign in (1, -1):
+            moved.copy_(start + sign * step * along)
+            sides.append(values())
+        moved.copy_(start)
+    for name in found:
+        wanted[name] = float(sides[0][name] - sides[1][name]) / (2 * step)
+    return found, wanted
 
 
 def white(rms_kev: float = RMS_KEV) -> BaselineNoise:
@@ -40,20 +76,6 @@ def windows(n: int = 4) -> torch.Tensor:
     return torch.from_numpy(prepared.pulses.waveforms)[:, None]
 
 
-def test_gradients_of_noisy_windows_are_finite_differences(held):
-    outside, made = outside_of([500.0, 1e5] * 3), windows(6).double().requires_grad_()
-
-    def seen(pulses: torch.Tensor) -> torch.Tensor:
-        torch.manual_seed(1)  # the same noise every time
-        return outside.dress_windows(pulses, torch.arange(6))
-
-    assert torch.autograd.gradcheck(seen, (made,), fast_mode=True)
-    # the level of some windows lies in the extension, and of others does not
-    late = held[0].align_sample > PADDING_BEFORE + CONFIG.samples_before
-    assert late.any()
-    assert not late.all()
-
-
 def test_noisy_records_become_what_the_preparation_makes_of_them():
     torch.manual_seed(0)
     records = torch.from_numpy(with_room(windows()[:, 0].numpy(), CONFIG, DT_NS))
@@ -73,6 +95,110 @@ def test_windows_get_the_room_that_they_get_without_gradients():
         atol=2e-7,
         rtol=0,
     )
+
+
+def begin_late(held: list[Prepared]) -> bool:
+    """Whether the level of some windows lies in the extension, and of others does not."""
+    late = held[0].align_sample > PADDING_BEFORE + CONFIG.samples_before
+    return bool(late.any() and not late.all())
+
+
+@pytest.mark.parametrize("moved", ["gain", "shift"])
+def test_gradients_of_a_view_are_finite_differences(held, moved):
+    """Gain is divided out; a shift shifts; neither changes the tail."""
+    made = windows(16).double()
+    following = torch.cat([made[..., 1:], made[..., -1:] ** 2 / made[..., -2:-1]], dim=2)
+    numbers = {"gain": torch.ones(()).double(), "shift": torch.zeros(()).double()}
+    number = numbers[moved].requires_grad_()
+    outside = outside_of([500.0] * 16)
+    direction = torch.randn(16, 1, 800, generator=torch.Generator().manual_seed(0))
+    recipe = load_recipe("paper", TINY)  # whose discriminators scale a pulse to 0…1
+    torch.manual_seed(0)
+    judge = CycleGan(recipe).double().eval().discriminator_data
+
+    def views() -> Values:
+        early = numbers["shift"]
+        translated = numbers["gain"] * ((1 - early) * made + early * following)
+        seen = outside.dress_windows(translated, torch.arange(16))
+        time, _ = crossing(seen[:, 0], 0.5, torch.full((16,), CONFIG.samples_before))
+        tail = seen[..., -CONFIG.decay_fit_samples :].mean()
+        return {
+            "windows": (seen * direction).sum(),
+            "judged": judge(seen).mean(),
+            "tail": tail,
+            "half": time.mean(),
+        }
+
+    found, wanted = slopes(views, number, torch.ones(()), 1e-5)
+    assert begin_late(held)
+    for name, value in found.items():
+        assert value == pytest.approx(wanted[name], rel=1e-2, abs=1e-6), name
+    assert abs(found["tail"]) < 2e-3
+    assert found["half"] == pytest.approx({"gain": 0.0, "shift": -1.0}[moved], abs=0.1)
+
+
+def added_to_its_input(forward: Callable[[torch.Tensor], torch.Tensor]):
+    return lambda pulses: pulses + forward(pulses)
+
+
+def test_gradients_of_the_losses_are_finite_differences(held):
+    generators = [f"generator.{o}" for o in ("width=2", "dropout=0")]
+    heights = "discriminator.value_range=[-1,2]"  # or gains are divided out a second time
+    recipe = load_recipe("paper", ["training.noise=baselines", *TINY, *generators, heights])
+    outside = outside_of([500.0] * 6)
+    torch.manual_seed(0)
+    model = CycleGan(recipe, outside).double()
+    measured = windows(6).double()
+    simulated = measured.roll(1, dims=0) * torch.linspace(0.97, 1.03, 6)[:, None, None]
+    with torch.no_grad():
+        for network in (model.ren, model.iren):  # nearly the identity, with normal activations
+            torch.nn.init.normal_(network.outlet.weight, std=0.003)
+            torch.nn.init.zeros_(network.outlet.bias)
+            network.forward = added_to_its_input(network.forward)
+            for part in network.modules():
+                if isinstance(part, torch.nn.BatchNorm1d):
+                    part.momentum = 1.0
+            network(measured)
+    model.eval()
+    step = Step(model, recipe.cyclegan.training, outside=outside)
+
+    def losses() -> Values:
+        return step.generator_losses(simulated, measured, torch.arange(6))[0]
+
+    parameters = [
+        p
+        for network in (model.ren, model.iren)
+        for p in (network.outlet.weight, network.latent_mean.weight, network.inlet[0].weight)
+    ]
+    for n, parameter in enumerate(parameters):
+        along = torch.randn(parameter.shape, dtype=torch.float64)
+        found, wanted = slopes(losses, parameter, along / along.norm(), 1e-6)
+        for name, value in found.items():
+            assert value == pytest.approx(wanted[name], rel=1e-2, abs=1e-8), (n, name)
+    assert begin_late(held)
+
+
+def test_without_noise_a_window_is_left_as_it_is():
+    made = windows()
+    found = outside_of(rms_kev=0.0).dress_windows(made, torch.arange(4))
+    torch.testing.assert_close(found, made, atol=2e-6, rtol=0)
+
+
+def test_noise_goes_as_one_over_the_energy_of_the_pulse_that_it_is_added_to():
+    made = windows().expand(4, 1, 800).repeat(64, 1, 1)
+    rows = torch.tensor([3, 1, 0, 2]).repeat(64)
+    noisy = outside_of().dress_windows(made, rows)[:, 0, : CONFIG.baseline_samples]
+    rms = noisy.reshape(64, 4, -1).square().mean(dim=(0, 2)).sqrt().numpy()
+    np.testing.assert_allclose(rms, RMS_KEV / KEV[[3, 1, 0, 2]], rtol=0.05)
+
+
+def test_the_noise_is_that_of_the_seed():
+    drawn = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        drawn.append(outside_of().dress_windows(windows(), torch.arange(4)))
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
 
 
 def test_what_cannot_be_prepared_is_cut_where_it_lies():

@@ -1,0 +1,208 @@
+"""A matched response from files to a run folder, and from there to translated pulses."""
+
+from __future__ import annotations
+
+import logging
+from logging.handlers import QueueHandler
+from pathlib import Path
+from queue import SimpleQueue
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.tails_law import TailsLaw
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.loading import load_pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
+from cpunet.training.networks import outside_noise
+from cpunet.training.response_starts import GOOD_FIT
+from cpunet.training.run import Run
+from cpunet.training.train import train
+from cpunet.translation.translate import translate
+from cpunet.translation.translator import REN
+from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
+
+DT_NS, FINE = 16.0, 16
+POLE_NS, DECAY_US, NOISE_KEV, KEV = 70.0, 60.0, 2.0, 2614.511
+N = 420
+ONE_START = (
+    "generator.poles_ns=[50]",
+    "generator.slow_ns=[]",
+    "generator.fast_decays_us=[]",
+    "training.start_factors=[1]",
+    "training.steps=14",
+)
+SHORT = ("training.steps=4", "training.ringing_mhz=[]")
+RECIPE = load_recipe("fast", ONE_START)
+
+
+def charge(n: int, seed: int, slowest: float = 3.0, faster: float = 1.0) -> np.ndarray:
+    """Charge of two sites with logistic edges, finely sampled."""
+    rng = np.random.default_rng(seed)
+    time = 60 + faster * ((np.arange(225 * FINE) + 0.5) / FINE - 60)
+
+    def site() -> np.ndarray:
+        place = rng.uniform(60, 110, (n, 1))
+        return 1 / (1 + np.exp(-(time - place) / rng.uniform(1.5, slowest, (n, 1))))
+
+    return two_sites(rng, n, site)
+
+
+def digitised(n: int, seed: int, *, noise_kev: float = NOISE_KEV) -> FloatArray:
+    """Traces in ADC behind a pole and a decay, by recursion, with white noise."""
+    pulses = in_traces(charge(n, seed), FINE)
+    fine = after_pole_and_decay(pulses, DT_NS / FINE, POLE_NS, 1e3 * DECAY_US)
+    clean = sampled(fine, FINE).astype(np.float32)
+    noise = np.random.default_rng(seed + 100).normal(0, noise_kev, clean.shape)
+    return np.round(15_000 + 9.6 * (KEV * clean + noise)).astype(np.float32)
+
+
+def written(path: Path, waveforms: FloatArray, kev: float = KEV) -> PulseFile:
+    energies = np.full(len(waveforms), kev)
+    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies))
+    return PulseFile(path)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    folder = tmp_path_factory.mktemp("files")
+    return Files(
+        written(folder / "sim.lh5", sampled(charge(N, seed=1), FINE)),
+        written(folder / "data.lh5", digitised(N, seed=2)),
+    )
+
+
+class Trained(NamedTuple):
+    run: Run
+    told: list[logging.LogRecord]
+
+    @property
+    def folder(self) -> Path:
+        return self.run.folder
+
+
+@pytest.fixture(scope="module")
+def run(files: Files, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    folder, told = tmp_path_factory.mktemp("runs") / "run", SimpleQueue[logging.LogRecord]()
+    handler, logger = QueueHandler(told), logging.getLogger("cpunet")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    made = train(*files, folder, recipe=RECIPE, seed=3, device="cpu")
+    logger.removeHandler(handler)
+    logger.setLevel(logging.NOTSET)
+    return Trained(made, [told.get() for _ in range(told.qsize())])
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_files_are_translated_in_both_directions(
+    run: Trained, files: Files, tmp_path: Path, inverse: bool
+) -> None:
+    source = files.data if inverse else files.sim
+    out = tmp_path / "out.lh5"
+    told = translate(run.folder, source, out, inverse=inverse).counts
+    assert told == {"read": N, "translated": N, "rejections": {}}
+    windows = open_pulses(out).read()
+    assert windows.waveforms.shape == (N, 800)
+    quiet = np.sqrt((windows.waveforms[:, 210:260] ** 2).mean())
+    if inverse:
+        assert quiet < 0.5 * NOISE_KEV / KEV
+    else:
+        assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
+
+
+def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
+    sim = sampled(charge(6, seed=5), FINE)
+    energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
+    path = tmp_path / "sim.lh5"
+    write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
+    told = translate(run.folder, path, tmp_path / "a.lh5").counts
+    assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
+    told = translate(run.folder, path, tmp_path / "b.lh5", noise=False).counts
+    assert told == {"read": 6, "translated": 6, "rejections": {}}
+
+
+@pytest.mark.thorough
+def test_tails_of_earlier_pulses_are_learned_without_being_asked(
+    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "cpunet")
+    traces, rng = digitised(N, seed=2), np.random.default_rng(7)
+    law = TailsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
+    left = law.draw(N, rng)[:, np.newaxis]
+    decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
+    data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
+    made = train(files.sim, data, tmp_path / "run", recipe=RECIPE, seed=3, device="cpu")
+    fit = made.fit.model_dump()
+    assert fit["chi_square"] < 1.6 * fit["moments"]
+    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
+    assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
+    told = fit["tails"]
+    assert np.all(np.diff(told["sizes"]["percent_above"]) <= 0)
+    assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
+    assert any(note.startswith("pile-up tails: ") for note in caplog.messages)
+    ren = REN.load(tmp_path / "run")
+    assert ren.tails is not None
+    assert ren.tails.law.rate_khz == told["rate_khz"]
+    # without tails the noise is that of empty baselines
+    prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
+    assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
+    # networks with noise outside are prepared alike
+    paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
+    chosen = parse_selection("FEP", paper.peaks)
+    sim = load_pulses(files.sim, "simulated", paper, chosen)
+    measured = load_pulses(data, "measured", paper, chosen)
+    outside, entry = outside_noise(sim, measured, paper)
+    assert outside is not None
+    assert outside.noise.tails is not None
+    assert outside.noise.tails.law.rate_khz == told["rate_khz"]
+    assert entry.tails.rate_khz == told["rate_khz"]
+
+
+def test_data_without_tails_are_given_none(run: Trained) -> None:
+    assert run.run.fit.tails.rate_khz == 0
+    assert not any("pile-up tails" in record.getMessage() for record in run.told)
+    tails = REN.load(run.folder).tails
+    assert tails is not None
+    assert tails.law.rate_khz == 0
+
+
+@pytest.mark.thorough
+def test_a_simulation_of_other_physics_is_told(
+    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    # edges of many widths, as no pole makes them of the right ones
+    other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
+    recipe = load_recipe("fast", [*ONE_START, *SHORT])
+    made = train(other, files.data, tmp_path / "run", recipe=recipe, device="cpu")
+    fit = made.fit.model_dump()
+    assert fit["chi_square"] > 2 * GOOD_FIT * fit["moments"]
+    said = [note for note in caplog.messages if "poor fit" in note]
+    assert len(said) == 1
+    assert f"chi-square is {fit['chi_square'] / fit['moments']:.1f} per moment" in said[0]
+
+
+@pytest.mark.thorough
+def test_a_stretched_drift_is_told_and_translated(
+    run: Trained, files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    sim = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, faster=1.25), FINE))
+    recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
+    made = train(sim, files.data, tmp_path / "run", recipe=recipe, device="cpu")
+    fit = made.fit.model_dump()
+    assert fit["chi_square"] < GOOD_FIT * fit["moments"]
+    assert fit["parameters"]["drift_stretch"] == pytest.approx(0.25, abs=0.05)
+    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.05)
+    assert any(note.startswith("charges drift for") for note in caplog.messages)
+    assert "longer than simulated" in fit["verdict"]
+    # what is translated rises as the data do
+    clean = REN.load(tmp_path / "run").translate(
+        sampled(charge(N, 1, faster=1.25), FINE), noise=False
+    )
+    truth = REN.load(run.folder).translate(sampled(charge(N, 1), FINE), noise=False)
+    steps = [np.sort(np.diff(pulses).max(axis=1)) for pulses in (clean, truth)]
+    np.testing.assert_allclose(*steps, rtol=0.03)
