@@ -1,4 +1,4 @@
-"""Code of compiled loops: kept, made again when a module of loops changes, never mixed up."""
+"""Compiled loops: kept, made again when one changes; matrix products take one thread."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy.linalg
+from threadpoolctl import threadpool_info
 
 from cpunet import kernels
+from cpunet.matrices import one_thread_for_matrices
 
 CALLED = """
 from cpunet.numbers import N
@@ -109,3 +113,30 @@ def test_a_parallel_loop_leaves_torch_its_threads(home: Path, first: str) -> Non
     )
     begun = begin(home, program, OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="4")
     assert words(begun) == ["4", "1"]
+
+
+def threads() -> list[int]:
+    """Threads of each OpenBLAS that is loaded."""
+    return [
+        pool["num_threads"] for pool in threadpool_info() if pool["internal_api"] == "openblas"
+    ]
+
+
+def test_one_thread_within_and_all_after() -> None:
+    scipy.linalg.eigh(np.eye(2))  # both are loaded
+    before = threads()
+    with one_thread_for_matrices():
+        assert set(threads()) <= {1}
+    assert threads() == before
+
+
+def test_all_again_after_an_error() -> None:
+    before = threads()
+
+    @one_thread_for_matrices()
+    def fails() -> None:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        fails()
+    assert threads() == before

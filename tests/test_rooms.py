@@ -1,13 +1,17 @@
-"""Data flow one way through the house: no module imports from a later room."""
+"""Data flow one way through the house, and what is installed is what it says."""
 
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import cpunet
+from cpunet import installation
 
 HOUSE = Path(cpunet.__file__).parent
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
@@ -39,3 +43,53 @@ def test_no_module_imports_from_a_later_room() -> None:
             names = {n for n in imported(path) if f"{n}.".startswith(later)}
             wrong += [f"{path.relative_to(HOUSE)} imports {name}" for name in sorted(names)]
     assert not wrong
+
+
+@pytest.fixture
+def installed(monkeypatch, tmp_path):
+    """Pretend that this package lies in a folder, with another distribution beside it."""
+    monkeypatch.setattr(installation, "__file__", str(tmp_path / "cpunet" / "installation.py"))
+
+    def install(*files: str) -> None:
+        information = tmp_path / "cpunet-1.0.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text("Name: cpunet\nVersion: 1.0.0\n")
+        (information / "RECORD").write_text("".join(f"{file},,\n" for file in files))
+        installation.other_package.cache_clear()
+
+    installation.other_package.cache_clear()
+    yield install
+    installation.other_package.cache_clear()
+
+
+def test_over_this_one(installed):
+    installed("cpunet/__init__.py", "cpunet/model.py")
+    told = (
+        "the package cpunet 1.0.0 is installed over cpunet-hpge, of the same import name; "
+        "pip uninstall cpunet cpunet-hpge, then install the one you want"
+    )
+    assert installation.other_package() == told
+    with pytest.warns(UserWarning, match="installed over cpunet-hpge"):
+        assert cpunet.Pulses
+
+
+def test_the_lock_holds_what_the_constraints_say():
+    """Every dependency, in the version that is known to work, with the digest of its file."""
+    root = Path(__file__).resolve().parents[1]
+    lines = (root / "requirements.lock").read_text().splitlines()
+    locked = {}
+    for line in lines:
+        if not line.startswith("#"):
+            match = re.fullmatch(r"([a-z0-9._-]+)==(\S+) --hash=sha256:[0-9a-f]{64}", line)
+            assert match, line
+            locked[re.sub(r"[._-]+", "-", match[1])] = match[2]
+    constraints = {}
+    for line in (root / "constraints.txt").read_text().splitlines():
+        name, pinned, version = line.partition("==")
+        if pinned:
+            constraints[re.sub(r"[._-]+", "-", name.lower())] = version
+    for name, version in locked.items():
+        assert constraints.get(name, version).partition("+")[0] == version.partition("+")[0]
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    for dependency in project["dependencies"]:
+        assert re.split(r"[<>=]", dependency)[0].lower() in locked

@@ -1,4 +1,4 @@
-"""What is wrong with settings, in one line: of every kind, from files and words."""
+"""Settings of every kind: what is wrong in one line; recipes: the paper's numbers."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import yaml
 
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
+from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.settings import Config, plain, read_json, read_settings, read_values
+from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift
@@ -70,3 +71,119 @@ def test_damaged_json(tmp_path: Path, text: str) -> None:
 def test_values_of_numpy_are_plain() -> None:
     value = {1: np.arange(2), "b": (np.float32(0.5), np.nan, np.array([[np.inf]]), None, "c")}
     assert plain(value) == {"1": [0, 1], "b": [0.5, None, [[None]], None, "c"]}
+
+
+def test_the_recipe_that_matches_a_response():
+    recipe = load_recipe("fast")
+    generator, training = recipe.matching
+    assert generator.name == "response"
+    assert recipe.discriminator is None
+    # what is compared lies within a window, whose half maximum is before its middle
+    assert training.before <= training.baseline[0] <= recipe.preparation.samples_before
+    assert training.after <= recipe.preparation.samples_after
+    assert -training.before <= min(training.segments)
+    assert max(training.segments) <= training.after
+    assert list(training.segments) == sorted(set(training.segments))
+    assert training.squares <= training.components
+    with pytest.raises(CpunetError, match=r"^recipe fast: does not train a CycleGAN$"):
+        _ = recipe.cyclegan
+
+
+def test_all_recipes_see_the_same_pulses():
+    fast, *others = (load_recipe(name) for name in list_recipes())
+    for other in others:
+        assert (other.peaks, other.preparation) == (fast.peaks, fast.preparation)
+        assert (other.cuts, other.scores) == (fast.cuts, fast.scores)
+
+
+@pytest.mark.parametrize(
+    ("room", "other", "said"),
+    [
+        ("generator", "paper", "goes with training method cyclegan"),
+        ("training", "paper", "goes with training method cyclegan"),
+        ("discriminator", "paper", "a discriminator is needed for punet, and for it alone"),
+    ],
+)
+def test_parts_of_different_trainings_are_not_mixed(room, other, said):
+    fast, paper = (load_recipe(name).model_dump(mode="json") for name in ("fast", other))
+    for settings, part in ((fast, paper), (paper, fast)):
+        with pytest.raises(CpunetError, match=f"mine: .*{said}"):
+            checked(Recipe, settings | {room: part[room]}, "mine")
+
+
+def test_the_papers_numbers():
+    recipe = load_recipe("paper")
+    training, losses = recipe.training, recipe.training.losses
+    assert (training.iterations, training.decay_start, training.batch_size) == (7000, 1000, 32)
+    assert (training.rate_generators, training.rate_discriminators) == (1e-3, 1e-3)
+    assert (training.discriminator_interval, training.max_grad_norm) == (30, 100)
+    assert (losses.baseline_len, losses.rising_edge_len, losses.tail_len) == (200, 250, 350)
+    assert (losses.baseline_weight, losses.rising_edge_weight, losses.tail_weight) == (3, 10, 7)
+    weights = (losses.cycle_weight, losses.identity_weight, losses.adversarial_weight)
+    assert weights == (20, 5, 9)
+    assert (recipe.generator.width, recipe.discriminator.embedding_rows) == (40, 1000)
+    assert recipe.discriminator.samples_per_step == 1
+    energies = {name: peak.energy_kev for name, peak in recipe.peaks.items()}
+    # one and two annihilation photons of 511 keV (rounded) below the Tl-208 line
+    assert energies["FEP"] == 2614.511
+    assert energies["FEP"] - energies["SEP"] == pytest.approx(511, abs=0.01)
+    assert energies["FEP"] - energies["DEP"] == pytest.approx(1022, abs=0.01)
+
+
+def test_values_are_overridden_in_turn():
+    recipe = load_recipe(
+        "paper",
+        [
+            "training.batch_size=16",
+            "discriminator.value_range=[-0.1, 1.2]",
+            "training.batch_size=8",
+            "generator.width=8",
+        ],
+    )
+    assert recipe.training.batch_size == 8
+    assert recipe.discriminator.value_range == (-0.1, 1.2)
+    assert recipe.generator.width == 8
+    assert load_recipe("paper").training.batch_size == 32
+
+
+def message(name: str, *overrides: str) -> str:
+    with pytest.raises(CpunetError) as error:
+        load_recipe(name, overrides)
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        (
+            "training.batch_siez=16",
+            "batch_siez: no such setting; did you mean batch_size?",
+        ),
+        ("training.batch_size", "expected KEY=VALUE"),
+        ("training.batch_size=[", "not YAML"),
+        ("training.rate_generators=.nan", "training.rate_generators: "),
+        ("discriminator.value_range=[1, 0]", "discriminator: "),
+        ("discriminator.samples_per_step=7", "samples_per_step (7)"),
+        ("preparation.samples_before=300", "the loss windows cover 800 samples"),
+        ("preparation.baseline_samples=400", "baseline_samples must be fewer"),
+    ],
+)
+def test_wrong_settings_are_named(override, part):
+    assert part in message("paper", override)
+
+
+@pytest.mark.parametrize(
+    ("override", "part"),
+    [
+        ("training.method=cyclegan", "training"),
+        ("training.segments=[0.5, 1]", "training.segments.0: "),
+        ("generator.slow_ns=[100, 100.0]", "times must differ"),
+        ("training.segments=[3, 1]", "segments must be in rising order"),
+        ("search={a: {low: 1, choices: [1, 2]}}", "give either low and high, or choices"),
+        ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),
+    ],
+)
+def test_wrong_settings_of_a_matching_are_named(override, part):
+    assert part in message("fast", override)

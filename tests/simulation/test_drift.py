@@ -1,4 +1,4 @@
-"""Trajectories: a planar detector on paper, and reference paths."""
+"""Drift velocities and trajectories: reference vectors and paths, and a planar detector."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.velocity import HOLE, drift_velocity, velocity_table
+from cpunet.simulation.velocity import (
+    ELECTRON,
+    HOLE,
+    drift_velocity,
+    measured_table,
+    velocity_factor,
+    velocity_table,
+)
 
 STEPS = SimulationSettings(dt_ns=1, library_step_ns=1, length_ns=3000)
 
@@ -54,3 +63,65 @@ def test_reference_paths(reference_data: Path, reference_maps: Maps) -> None:
     assert np.nanmax(holes) < 0.005
     assert np.median(np.nanmax(electrons, axis=1)) < 0.001
     assert np.nanmax(electrons) < 0.1
+
+
+component = st.floats(-4000, 4000, allow_nan=False)
+
+
+@pytest.mark.parametrize("temperature", [77, 90])
+@pytest.mark.parametrize(("carrier", "name"), [(ELECTRON, "ve"), (HOLE, "vh")])
+def test_reference_vectors(
+    reference_data: Path, temperature: int, carrier: int, name: str
+) -> None:
+    with np.load(reference_data / "siggen" / "drift_velocity.npz") as data:
+        field, expected = data["E"], data[f"{name}_{temperature}"]
+    velocity = drift_velocity(velocity_table(temperature), field, carrier)
+    np.testing.assert_allclose(velocity, expected, atol=3e-7)
+
+
+@pytest.mark.parametrize(("axis", "column"), [((1, 0, 0), 1), ((1, 1, 0), 2), ((1, 1, 1), 3)])
+def test_along_the_axes_the_table_comes_back(axis: tuple[int, ...], column: int) -> None:
+    table = measured_table()
+    direction = np.array(axis) / np.linalg.norm(axis)
+    for carrier, sign in ((ELECTRON, -1), (HOLE, 1)):
+        velocity = drift_velocity(velocity_table(77), table[:, :1] * direction, carrier)
+        speed = table[:, column + 3 * carrier]
+        np.testing.assert_allclose(velocity, sign * speed[:, None] * direction, atol=1e-12)
+
+
+@given(component, component, component)
+def test_cubic_symmetry(x: float, y: float, z: float) -> None:
+    table = velocity_table(90)
+    for carrier in (ELECTRON, HOLE):
+        vx, vy, vz = drift_velocity(table, [[x, y, z]], carrier)[0]
+        turned = drift_velocity(table, [[-y, x, z], [y, z, x], [x, y, -z]], carrier)
+        expected = [[-vy, vx, vz], [vy, vz, vx], [vx, vy, -vz]]
+        np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_colder_crystals_are_faster_and_no_field_means_no_motion() -> None:
+    field = [[300.0, 100.0, 50.0], [0.0, 0.0, 0.0]]
+    for carrier in (ELECTRON, HOLE):
+        cold = np.linalg.norm(drift_velocity(velocity_table(77), field, carrier), axis=1)
+        warm = np.linalg.norm(drift_velocity(velocity_table(95), field, carrier), axis=1)
+        assert cold[0] > warm[0] > 0
+        assert cold[1] == warm[1] == 0
+
+
+def test_factors_hold_below_and_above_and_change_smoothly_in_between() -> None:
+    factors = ((1.0, 1.0), (0.9, 1.2))
+    own, scaled = velocity_table(90), velocity_table(90, factors)
+    directions = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1]]) / np.sqrt([[1], [2], [3]])
+    for strength, factor in ((100.0, 0.9), (500.0, 1.05), (2000.0, 1.2)):
+        for direction in directions:
+            field = strength * direction[None]
+            ratio = drift_velocity(scaled, field, HOLE) @ direction
+            ratio = ratio / (drift_velocity(own, field, HOLE) @ direction)
+            assert ratio == pytest.approx(factor, rel=1e-9)
+            np.testing.assert_array_equal(
+                drift_velocity(scaled, field, ELECTRON), drift_velocity(own, field, ELECTRON)
+            )
+    field = np.geomspace(100, 3000, 4000)
+    slope = np.diff(velocity_factor(field, 0.9, 1.2)) / np.diff(np.log(field))
+    assert slope.min() >= 0
+    assert np.abs(np.diff(slope)).max() < 0.02 * slope.max()

@@ -1,4 +1,4 @@
-"""A readout chain and its inverse as translators, against the chain's own numbers."""
+"""Chains and networks with noise outside, as translators, against their own numbers."""
 
 from __future__ import annotations
 
@@ -10,12 +10,20 @@ import torch
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
+from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
+from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
+from cpunet.training.cyclegan import CycleGan
 from cpunet.training.inverse import fit_inverse
+from cpunet.training.outside import Outside
+from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 from synthetic import after_pole_and_decay, in_traces, sampled, two_sites, write_run
 
@@ -217,3 +225,72 @@ def test_weights_of_the_other_half_are_missed(run: Path, tmp_path: Path) -> None
     REN.load(tmp_path)
     with pytest.raises(CpunetError, match="weights of another network"):
         IREN.load(tmp_path)
+
+
+NOISY = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
+DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)
+DT_NS, RMS_KEV = 16.0, 6.0
+
+
+@pytest.fixture(scope="module")
+def noisy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network that was not trained."""
+    noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), 2 * (NOISE_BINS - 1), DT_NS, 100)
+    outside = Outside(TraceNoise(noise), np.ones(1), NOISY.preparation)
+    torch.manual_seed(0)
+    model = CycleGan(NOISY, outside)
+    folder = tmp_path_factory.mktemp("run")
+    info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
+    drawn = DrawnTails(TailsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
+    fit = {"tails": {"rate_khz": 2.0, "drawn": drawn.describe()}}
+    write_run(folder, model, NOISY, info | {"seconds": 1.0, "device": "cpu", "fit": fit})
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def only_a_decay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let networks leave a pulse as it is, but for a decay."""
+    monkeypatch.setattr(PositionalUNet, "forward", lambda _, pulses, **_options: pulses * DECAY)
+
+
+@pytest.fixture(scope="module")
+def prepared_sim() -> FloatArray:
+    width = np.linspace(1.5, 5, 60)[:, np.newaxis]
+    pulses = 1 / (1 + np.exp(-(np.arange(225) - 80) / width))
+    raw = Pulses.of(pulses, dt_ns=DT_NS)
+    return prepare(raw, NOISY.preparation, "simulated").pulses.waveforms
+
+
+def test_noise_goes_as_one_over_the_energy(noisy_run, prepared_sim):
+    ren = REN.load(noisy_run)
+    for kev in (1000.0, 3000.0):
+        found = ren.translate(prepared_sim, energy_kev=kev, seed=1)
+        assert float(found[:, :200].std()) == pytest.approx(RMS_KEV / kev, rel=0.05)
+        # and they are prepared: a second preparation finds nothing to do
+        again = prepare(Pulses.of(found, dt_ns=DT_NS), NOISY.preparation, "measured")
+        assert len(again) == len(found)
+        np.testing.assert_allclose(again.pulses.waveforms, found, atol=2e-6)
+
+
+def test_other_pulses_are_added_with_the_noise(noisy_run, prepared_sim):
+    ren = REN.load(noisy_run)
+    assert ren.tails is not None
+    energies = {"energy_kev": np.full(len(prepared_sim), 2000.0)}
+    plain = ren.apply(prepared_sim, generator=ren.seeded(1), **energies)
+    left = np.full(len(prepared_sim), 500.0)
+    lifted = ren.apply(prepared_sim, generator=ren.seeded(1), tails_kev=left, **energies)
+    fall = (lifted - plain)[:, :20].mean() - (lifted - plain)[:, 180:200].mean()
+    # 500 keV begin 200 samples before the window and fall within it
+    wanted = 0.25 * np.exp(-210 * 0.016 / 50) * -np.expm1(-180 * 0.016 / 50)
+    assert fall == pytest.approx(wanted, rel=0.2)
+    piled = InTracePileUp(
+        len(prepared_sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
+    )
+    drawn = Drawn(generator=ren.seeded(1), piled=piled, **energies)
+    result, _ = ren.apply_with_codes(prepared_sim, drawn)
+    step = result[4] - plain[4]
+    # 0.2 of the height of 1, less by the scale: the tail is higher too
+    assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)
+    assert np.array_equal(result[5], plain[5])
+    with pytest.raises(CpunetError, match="drawn with electronic noise"):
+        ren.apply(prepared_sim, noise=False, tails_kev=left, **energies)

@@ -1,4 +1,4 @@
-"""The A/E cut against analytic survivals, and its errors against repeated draws."""
+"""A/E: the cut, and its course with energy and drift time, against analytic values."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ from cpunet.validation.a_over_e import (
     survival_by_range,
     survival_table,
 )
+from cpunet.validation.ae_drift_time import ae_against_drift_time, ae_figure
+from cpunet.validation.ae_energy import ae_energy_figure, against_energy, site_fit
+from cpunet.validation.page import ae_energy_html
+from cpunet.validation.run_figures import roc_figure
+from synthetic import require_drawn
 
 SEP_MEAN = -1.0  # in widths of the DEP, whose cut at 90 % lies at -1.28
 SEP_SURVIVAL = 100 * ndtr(SEP_MEAN - ndtri(0.1))
@@ -190,3 +195,179 @@ def test_every_range_and_method_with_its_own_cut():
     assert list(table) == ["line", "continuum"]
     assert table["line"]["data"]["survival"] == 50
     assert table["continuum"]["ren"]["survival"] == 100
+
+
+def drifted(rng, n, slope=-1e-5):
+    """A/E that falls with the drift time, with a Gaussian spread."""
+    time = rng.uniform(500, 1500, n)
+    return 0.07 + slope * (time - 1000) + rng.normal(0, 0.002, n), time
+
+
+def drifted_by_method(rng, sizes, **kwargs):
+    drawn = {m: drifted(rng, n, **kwargs) for m, n in sizes.items()}
+    return {m: a for m, (a, _) in drawn.items()}, {m: t for m, (_, t) in drawn.items()}
+
+
+def test_quantiles_are_the_analytic_ones():
+    amplitude, time = drifted_by_method(
+        np.random.default_rng(0), {"data": 80_000, "ren": 80_000}, slope=0
+    )
+    table = ae_against_drift_time(amplitude, time, bins=4)
+    assert table["edges_ns"][1:-1] == pytest.approx([750, 1000, 1250], abs=8)
+    for row in table["methods"]["ren"]:
+        for name, p in (("q16", 0.16), ("median", 0.5), ("q84", 0.84)):
+            assert row[name] == pytest.approx(0.07 + 0.002 * ndtri(p), abs=6e-5)
+        # the error of a median of normal values
+        assert row["median_error"] == pytest.approx(
+            0.002 * np.sqrt(np.pi / 2 / row["n"]), rel=0.2
+        )
+    json.dumps(table, allow_nan=False)
+
+
+@pytest.mark.parametrize("n", [15, 200])
+def test_errors_are_the_spread_over_repeated_draws(n):
+    rng = np.random.default_rng(1)
+    rows = []
+    for _ in range(400):
+        amplitude, time = drifted_by_method(rng, {"data": n}, slope=0)
+        rows.append(ae_against_drift_time(amplitude, time, bins=1)["methods"]["data"][0])
+    for name in ("q16", "median", "q84"):
+        spread = np.std([row[name] for row in rows])
+        assert np.mean([row[f"{name}_error"] for row in rows]) == pytest.approx(spread, rel=0.2)
+
+
+def test_bins_are_those_of_a_plain_loop_and_what_is_outside_is_counted():
+    amplitude, time = drifted_by_method(np.random.default_rng(2), {"data": 300, "raw": 60})
+    time["raw"][:2] = [1e4, np.nan]
+    amplitude["raw"][2] = np.nan
+    table = ae_against_drift_time(amplitude, time, bins=3)
+    edges = table["edges_ns"]
+    assert table["left_out"]["data"] == 0
+    assert table["left_out"]["raw"] >= 3
+    rows = table["methods"]["raw"]
+    assert sum(row["n"] for row in rows) + table["left_out"]["raw"] == 60
+    inside = [
+        a
+        for a, t in zip(amplitude["raw"], time["raw"], strict=True)
+        if edges[1] <= t < edges[2] and np.isfinite(a)
+    ]
+    assert rows[1]["n"] == len(inside)
+    assert rows[1]["median"] == np.median(inside)
+
+
+def test_a_bin_with_few_events_is_missing():
+    amplitude, time = drifted_by_method(np.random.default_rng(3), {"data": 100, "raw": 9})
+    table = ae_against_drift_time(amplitude, time, bins=1)
+    assert "(at least 10 are needed)" in table["methods"]["raw"][0]["missing"]
+    require_drawn(ae_figure(table, "SEP"))
+
+
+def test_figures_draw_what_is_in_the_tables():
+    amplitude, time = drifted_by_method(
+        np.random.default_rng(9), {"data": 900, "raw": 900, "ren": 900}
+    )
+    table = ae_against_drift_time(amplitude, time)
+    figure = ae_figure(table, "SEP")
+    require_drawn(figure)
+    drawn = figure.axes[0].lines[0].get_ydata()
+    assert drawn.tolist() == [row["median"] for row in table["methods"]["data"]]
+
+
+def test_curves_of_survival_are_the_analytic_ones():
+    """Of uniform amplitudes a cut that leaves a part p of one leaves 2 p - 1 of the other."""
+    single, other = np.linspace(1, 3, 2001), np.linspace(0, 2, 2001)
+    unknown = np.append(other, np.nan)
+    drawn = roc_figure(
+        {"SEP": {"data": unknown, "ren": other}, "DEP": dict.fromkeys(("data", "ren"), single)}
+    )
+    (axes,) = drawn.axes
+    assert [line.get_label() for line in axes.lines] == ["Data", "REN translation"]
+    for line in axes.lines:
+        accepted, left = line.get_data()
+        assert left == pytest.approx(np.clip(2 * accepted - 100, 0, 100) / 2, abs=0.2)
+
+
+LINES = {"DEP": (1587.5, 1597.5), "SEP": (2098.5, 2108.5), "FEP": (2609.5, 2619.5)}
+SCALE, SLOPE = 0.08, -1.5e-6  # per keV
+WIDTH, NOISE_KEV = 0.004, 6.0
+
+
+def events(
+    energy: np.ndarray, several: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """A/E of events of which a share has several sites, and so a lower one."""
+    mean = SCALE * (1 + SLOPE * (energy - 1592.5))
+    sigma = mean * np.hypot(WIDTH, NOISE_KEV / energy)
+    lower = np.where(rng.random(len(energy)) < several, rng.exponential(0.02, len(energy)), 0)
+    return rng.normal(mean - lower, sigma), energy
+
+
+def joined(*sets: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    amplitude, energy = (np.concatenate(parts) for parts in zip(*sets, strict=True))
+    return amplitude, energy
+
+
+def line(low: float, n: int, several: float, rng: np.random.Generator):
+    return events(rng.uniform(low, low + 10, n), several, rng)
+
+
+@pytest.mark.thorough
+def test_the_line_through_the_continuum() -> None:
+    pulls, widths = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        amplitude, energy = joined(
+            events(rng.uniform(950, 1750, 3000), 0.5, rng), line(1587.5, 500, 0.1, rng)
+        )
+        found = against_energy({"data": amplitude}, {"data": energy}, LINES)
+        assert not found["multi_site"]
+        mean, law = found["methods"]["data"]["mean"], found["methods"]["data"]["resolution"]
+        pulls.append((mean["a"] - SLOPE) / mean["a_error"])
+        assert mean["a"] * 1592.5 + mean["b"] == pytest.approx(1)
+        assert mean["per_mev_percent"] == pytest.approx(1e5 * mean["a"])
+        assert mean["chi_square"] < 2.5 * mean["degrees"]
+        widths.append([np.sqrt(law["a"] + (law["b"] / e) ** law["c"]) for e in (1000, 1700)])
+    assert abs(np.mean(pulls)) < 0.7
+    assert 0.6 < np.std(pulls) < 1.5
+    expected = np.hypot(WIDTH, NOISE_KEV / np.array([1000, 1700]))
+    np.testing.assert_allclose(np.mean(widths, axis=0), expected, rtol=0.08)
+
+
+def test_a_wide_line_is_no_continuum() -> None:
+    rng = np.random.default_rng(1)
+    wide = {"DEP": (1560.0, 1625.0)}
+    lines = joined(
+        events(rng.uniform(*wide["DEP"], 600), 0.1, rng),
+        events(rng.uniform(1000, 1500, 3000), 0.4, rng),
+    )
+    found = against_energy({"data": lines[0]}, {"data": lines[1]}, wide)
+    points = found["methods"]["data"]["points"]
+    assert wide["DEP"] in [(p["low_kev"], p["high_kev"]) for p in points]
+
+
+def test_lines_of_many_sites_are_fitted_about_the_single_ones() -> None:
+    rng = np.random.default_rng(1)
+    shares = {1587.5: 0.1, 2098.5: 0.85, 2609.5: 0.8}
+    made = joined(*(line(low, 4000, several, rng) for low, several in shares.items()))
+    amplitude, energy = (dict.fromkeys(("data", "ren"), one) for one in made)
+    found = against_energy(amplitude, energy, LINES)
+    assert found["multi_site"]
+    mean = found["methods"]["ren"]["mean"]
+    assert mean["a"] == pytest.approx(SLOPE, abs=4 * mean["a_error"])
+    assert mean["per_mev_error_percent"] < 0.1
+    assert found["methods"]["data"]["scale"] == pytest.approx(SCALE, rel=1e-3)
+    assert "REN translation" in ae_energy_html(found, "<figure></figure>")
+    axes = ae_energy_figure(found["methods"]).axes
+    assert len(axes) == 2
+    assert "% per MeV" in axes[0].get_legend().get_texts()[0].get_text()
+
+
+def test_too_few_events_are_told() -> None:
+    rng = np.random.default_rng(2)
+    few = line(1587.5, 30, 0.1, rng)
+    found = against_energy({"data": few[0]}, {"data": few[1]}, LINES)
+    assert "0 ranges" in found["missing"]
+    assert "0 ranges" in ae_energy_html(found, "")
+    nothing = np.full(500, np.nan)
+    assert "missing" in against_energy({"data": nothing}, {"data": 2000 + 0 * nothing}, LINES)
+    assert site_fit(np.full(500, 0.1)) is None

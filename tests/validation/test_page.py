@@ -1,11 +1,18 @@
-"""The report's files: strict JSON, a page that stands alone, honest gaps."""
+"""The report's files: strict JSON, a page that stands alone, honest gaps, methods that hide."""
 
 from __future__ import annotations
 
+import html
 import io
 import json
+import os
 import re
+import shutil
+import subprocess
+import tempfile
 from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +20,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from cpunet.html_pages import DPI, figure_png
+from cpunet.plotting import line_look, styled
 from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
 from synthetic import write_report
@@ -226,3 +234,97 @@ def test_a_figure_has_the_pixels_that_it_would_be_saved_with():
     made().savefig(saved, format="png", dpi=DPI)
     drawn, wanted = (Image.open(png) for png in (io.BytesIO(figure_png(made())), saved))
     np.testing.assert_array_equal(drawn, wanted)
+
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+ATTEMPTS = 2  # a browser may fail to start, a page that fails does so twice
+PATIENCE_S = 240  # a browser's start is slow where all cores are busy
+
+
+def browser() -> str:
+    """Path of a Chromium; the test skips without one."""
+    named = os.environ.get("CPUNET_CHROMIUM")
+    found = shutil.which(named) if named else next(filter(None, map(shutil.which, NAMES)), None)
+    if found is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)} is there; or set CPUNET_CHROMIUM")
+    return found
+
+
+def run_page(page: Path, width: int = 1280, height: int = 900) -> tuple[dict[str, Any], str]:
+    """Open a page, and return what it wrote into ``<pre id="selftest">``, and the log."""
+    for _ in range(ATTEMPTS):
+        dom, log = _opened(page, width, height)
+        found = re.search(r'<pre id="selftest"[^>]*>(.*?)</pre>', dom, re.DOTALL)
+        if found:
+            return json.loads(html.unescape(found[1])), log
+    raise AssertionError(f"the page did not report:\n{dom[-500:]}\n{log[-2000:]}")
+
+
+def _opened(page: Path, width: int, height: int) -> tuple[str, str]:
+    """Return the page's DOM after a while, and the browser's log."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        done = subprocess.run(
+            [
+                browser(),
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--no-first-run",
+                "--disable-background-networking",
+                "--disable-component-update",
+                "--disable-dev-shm-usage",
+                "--enable-logging=stderr",
+                f"--user-data-dir={profile}",
+                f"--window-size={width},{height}",
+                "--virtual-time-budget=10000",
+                "--dump-dom",
+                page.resolve().as_uri(),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+    return done.stdout, done.stderr
+
+
+SELFTEST = """<script>
+const shown = (method) => [...document.querySelectorAll(`[data-method="${method}"]`)]
+  .map((one) => one.getBoundingClientRect().width > 0);
+const button = document.querySelector('[data-hides="ren"]');
+const state = () => [shown("ren"), shown("data"), button.ariaPressed];
+const press = () => { button.click(); return state(); };
+const seen = { before: state(), hidden: press(), again: press() };
+seen.widths = [document.documentElement.scrollWidth, innerWidth];
+seen.requests = performance.getEntriesByType("resource").length;
+const report = document.body.appendChild(document.createElement("pre"));
+report.id = "selftest";
+report.textContent = JSON.stringify(seen);
+</script></body>"""
+
+
+@styled
+def two_methods() -> Figure:
+    figure = Figure()
+    axes = figure.subplots()
+    for method, text in (("data", "Data, n = 3"), ("ren", "REN translation, n = 3")):
+        axes.plot([1, 2, len(text)], label=text, **line_look(method, "blue"))
+    axes.legend()
+    return figure
+
+
+def test_a_click_hides_a_method_in_all_figures(tmp_path):
+    browser()  # skips without one
+    write_report(
+        tmp_path, {}, {"SEP mean pulse": two_methods(), "SEP drift_time": two_methods()}, []
+    )
+    page = tmp_path / "report.html"
+    page.write_text(page.read_text().replace("</body>", SELFTEST))
+    seen, log = run_page(page, width=500)
+    assert "CONSOLE" not in log
+    # a line, and in the legend a line and a text, in each of two figures
+    assert seen["before"] == [[True] * 6, [True] * 6, "true"]
+    assert seen["hidden"] == [[False] * 6, [True] * 6, "false"]
+    assert seen["again"] == seen["before"]
+    assert seen["widths"][0] <= seen["widths"][1]
+    assert seen["requests"] == 0
