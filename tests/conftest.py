@@ -107,6 +107,14 @@ def reference_data() -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep solved fields with the other files of the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+        yield
+
+
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> None:
     """Tiny networks: threads that wait for each other cost more than they gain."""

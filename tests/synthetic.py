@@ -9,6 +9,7 @@ import hashlib
 import io
 import resource
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -20,13 +21,19 @@ import numpy.typing as npt
 import pytest
 import scipy.signal
 import torch
+from lgdo import ArrayOfEqualSizedArrays, WaveformTable
 from matplotlib.figure import Figure
 
+from cpunet.cli import main
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
+from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import write_pulses
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
@@ -50,6 +57,8 @@ PREPARATION = PreparationConfig(
     max_padding_after=0,
     saturation_run=4,
 )
+# of a run that was not trained
+FACTS = {"peak": "FEP", "seed": 0, "dt_ns": DT_NS, "seconds": 1.0, "device": "cpu"}
 # settings of the narrowest networks
 SMALL_NETWORK = (
     "generator.width=2",
@@ -187,6 +196,19 @@ def write_files(folder: Path, kev: npt.ArrayLike) -> Files:
     return Files(PulseFile(folder / "sim.lh5"), PulseFile(folder / "data.lh5"))
 
 
+def write_sides(folder: Path, sim_kev: Values, dead: int | None = None) -> None:
+    """Files of both sides, all measured pulses of one energy; a simulated one may be empty."""
+    rng, n = np.random.default_rng(1), len(sim_kev)
+    sim = phased_edges(n, rng, 550, 1200)
+    if dead is not None:
+        sim[dead] = 0
+    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=DT_NS, energy_kev=sim_kev))
+    decayed = phased_edges(n, rng, 550, 1200) * decay(550, 4000, 1200)
+    raw = np.round(1000 + 10 * KEV[0] * decayed + rng.normal(0, 20, decayed.shape))
+    pulses = Pulses.of(raw, dt_ns=DT_NS, energy_kev=np.full(n, KEV[0]))
+    write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
+
+
 @contextmanager
 def nearly_full_disk(size: int) -> Iterator[None]:
     """No file may grow beyond `size` bytes: writing fails as on a full disk."""
@@ -230,6 +252,51 @@ def write_run(
     """Write a run of networks as they are; `info` may be the content of a ``run.json``."""
     facts = {key: value for key, value in info.items() if key not in ("recipe", "format")}
     Run.of(model, recipe, **facts).write(folder)
+
+
+def write_chain(
+    folder: Path,
+    *settings: str,
+    noise_kev: float = 0.0,
+    change: Callable[[ResponseGenerator], object] = lambda _chain: None,
+    inverse: Callable[[ResponseGenerator], torch.nn.Module] | None = None,
+    **facts: Any,
+) -> Path:
+    """Write a run of a readout chain that was not fitted, with white noise, as changed."""
+    recipe = load_recipe("fast", settings)
+    chain = ResponseGenerator(recipe.matching.generator, DT_NS)
+    if noise_kev:
+        density = np.full(NOISE_BINS, noise_kev**2)
+        chain.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
+    with torch.no_grad():
+        change(chain)
+    networks = {"ren": chain} | ({} if inverse is None else {"iren": inverse(chain)})
+    folder.mkdir(exist_ok=True)
+    write_run(folder, torch.nn.ModuleDict(networks), recipe, FACTS | facts)
+    return folder
+
+
+def waveform_table(
+    values: Any, dt: npt.ArrayLike = DT_NS, units: str = "ns", samples: str | None = None
+) -> WaveformTable:
+    """Waveforms of LH5, sampled with one period or with that of each."""
+    if isinstance(values, np.ndarray):
+        attrs = {} if samples is None else {"units": samples}
+        values = ArrayOfEqualSizedArrays(nda=values, attrs=attrs)
+    period = np.broadcast_to(dt, len(values)).astype(float)
+    start = np.zeros(len(values))
+    return WaveformTable(t0=start, t0_units="ns", dt=period, dt_units=units, values=values)
+
+
+def status_of(*words: object) -> Any:
+    """Run the command line in this process; its status."""
+    arguments, sys.argv = sys.argv, ["cpunet", *map(str, words)]
+    try:
+        with pytest.raises(SystemExit) as stop:
+            main()
+    finally:
+        sys.argv = arguments
+    return stop.value.code
 
 
 @contextmanager

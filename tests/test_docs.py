@@ -30,7 +30,7 @@ from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import list_recipes, load_recipe
 from cpunet.training.train import train
 from cpunet.translation.translator import RejectionWarning
-from synthetic import decay, phased_edges
+from synthetic import KEV, phased_edges, write_sides
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -39,7 +39,6 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # only.
 TOO_LONG = {"simulation.md", "legend.md", "python.md"}
 MADE_BY_THE_SITE = ("reference/", "../reference/")
-KEV = 2614.511
 
 
 def blocks(*languages: str) -> list:
@@ -156,17 +155,11 @@ SHORT = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_m
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
     """The files that the pages speak of, sim.lh5 as `cpunet simulate` may write it."""
-    folder, rng = tmp_path_factory.mktemp("docs"), np.random.default_rng(1)
-    sim = phased_edges(260, rng, 550, 1200)
-    sim[7] = 0  # of which nothing was collected
-    kev = np.full(len(sim), KEV)
+    folder, kev = tmp_path_factory.mktemp("docs"), np.full(260, KEV[0])
     kev[3] = 1.0  # the rest was lost in the lithium layer
-    write_pulses(folder / "sim.lh5", Pulses.of(sim, dt_ns=16, energy_kev=kev))
-    decayed = phased_edges(260, rng, 550, 1200) * decay(550, 4000, 1200)
-    raw = np.round(1000 + 10 * KEV * decayed + rng.normal(0, 20, decayed.shape))
-    pulses = Pulses.of(raw, dt_ns=16, energy_kev=np.full(len(raw), KEV))
-    write_pulses(folder / "raw.lh5", pulses, table="geds/raw", waveform_units="ADC")
-    fine = Pulses.of(phased_edges(4, rng, 550, 3000), dt_ns=1, energy_kev=np.full(4, KEV))
+    write_sides(folder, kev, dead=7)  # of which nothing was collected
+    edges = phased_edges(4, np.random.default_rng(2), 550, 3000)
+    fine = Pulses.of(edges, dt_ns=1, energy_kev=np.full(4, KEV[0]))
     write_pulses(folder / "fine.lh5", fine)
     recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
     sides = PulseFile(folder / "sim.lh5"), PulseFile(folder / "raw.lh5")

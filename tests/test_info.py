@@ -12,14 +12,13 @@ import pytest
 from torch import nn
 
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
-from cpunet.cli import main
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.description import trace_properties
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.training import chain_description
-from synthetic import write_run
+from cpunet.training import run_words
+from synthetic import status_of, write_run
 
 RECIPE = load_recipe("fast")
 DT = FileOptions(dt_ns=16)
@@ -252,11 +251,6 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
 COARSE = {"grid_mm": 0.5}
 
 
-@pytest.fixture
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch) -> None:
-    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
-
-
 @pytest.mark.usefixtures("own_cache")
 def test_numbers_of_a_detector():
     told = dict(info("ppc", settings=COARSE).lines)
@@ -279,12 +273,9 @@ def test_impurities_from_the_measured_depletion():
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_the_command_line(tmp_path, capsys, monkeypatch):
+def test_the_command_line(tmp_path, capsys):
     def told(*words: object) -> str:
-        monkeypatch.setattr("sys.argv", ["cpunet", "info", *map(str, words)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return f"{end.value.code} {capsys.readouterr().out}"
+        return f"{status_of('info', *words)} {capsys.readouterr().out}"
 
     assert "bias               2600 V" in told(
         "ppc", "--set", "grid_mm=0.5", "--set=bias_V=2600"

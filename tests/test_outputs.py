@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import (
@@ -94,9 +93,6 @@ def test_a_move_that_fails_brings_the_old_folder_back(tmp_path, monkeypatch):
     with pytest.raises(CpunetError, match="Input/output error"):
         make(tmp_path / "run", run_json="new")
     assert tree(tmp_path) == {"run/run.json": "old"}
-
-
-NAME = st.text(st.characters(exclude_characters="/\0", exclude_categories=["Cs"]), min_size=1)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,9 @@ import lh5
 import numpy as np
 import numpy.typing as npt
 import pytest
-from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
+from lgdo import Array, Table
 
-from cpunet.cli import main
+from synthetic import after_pole_and_decay, in_traces, status_of, waveform_table
 
 DT_NS = 16.0
 PEAKS_KEV = {"DEP": 1592.511, "SEP": 2103.511, "FEP": 2614.511}
@@ -56,22 +55,8 @@ def charge(n: int, rng: np.random.Generator, length: int = 225) -> npt.NDArray[n
 
 
 def respond(pulses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """A record of 1200 samples with the charge from sample 500 on, behind electronics.
-
-    Bandwidth of 60 ns and a decay of 55 µs: two discrete one-pole filters, sample by sample.
-    """
-    record = np.zeros((len(pulses), 1200))
-    record[:, 500:725] = pulses
-    record[:, 725:] = 1
-    smooth, decayed = np.zeros(len(pulses)), np.zeros(len(pulses))
-    rise, fall = np.exp(-DT_NS / 60), np.exp(-DT_NS / 55_000)
-    out, before = np.zeros_like(record), np.zeros(len(pulses))
-    for sample in range(record.shape[1]):
-        smooth = rise * smooth + (1 - rise) * record[:, sample]
-        decayed = fall * decayed + smooth - before
-        before = smooth
-        out[:, sample] = decayed
-    return out
+    """A record with the charge behind electronics: a bandwidth of 60 ns, a decay of 55 µs."""
+    return after_pole_and_decay(in_traces(pulses), DT_NS, 60, 55_000)
 
 
 def digitised(response: npt.NDArray[np.float64], kev: Waveforms, seed: int) -> Waveforms:
@@ -100,13 +85,7 @@ def write(
     n = len(waveforms)
     content = Table(
         col_dict={
-            "waveform": WaveformTable(
-                t0=np.zeros(n),
-                t0_units="ns",
-                dt=np.full(n, dt_ns),
-                dt_units="ns",
-                values=ArrayOfEqualSizedArrays(nda=waveforms, attrs={"units": units}),
-            ),
+            "waveform": waveform_table(waveforms, dt_ns, samples=units),
             "energy": Array(np.asarray(kev, float), attrs={"units": "keV"}),
             "event_number": Array(1000 + 3 * np.arange(n)),
         }
@@ -173,14 +152,8 @@ Command = Callable[..., Outcome]
 def call(capsys: pytest.CaptureFixture[str], *words: object) -> Outcome:
     """Run the command line in this process; its status and what it printed."""
     capsys.readouterr()
-    arguments, sys.argv = sys.argv, ["cpunet", *map(str, words)]
-    try:
-        with pytest.raises(SystemExit) as stop:
-            main()
-    finally:
-        sys.argv = arguments
-    printed = capsys.readouterr()
-    return SimpleNamespace(code=stop.value.code, out=printed.out, err=printed.err)
+    status, printed = status_of(*words), capsys.readouterr()
+    return SimpleNamespace(code=status, out=printed.out, err=printed.err)
 
 
 @pytest.fixture
@@ -192,14 +165,7 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
 def trained(stand: Stand, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder made by the command line; do not change it."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    words = ["cpunet", "train", *stand.inputs, "--out", str(out), "--seed", "3"]
-    arguments, sys.argv = sys.argv, [*words, *TINY_OPTIONS]
-    try:
-        with pytest.raises(SystemExit) as stop:
-            main()
-    finally:
-        sys.argv = arguments
-    assert stop.value.code == 0
+    assert status_of("train", *stand.inputs, "--out", out, "--seed", 3, *TINY_OPTIONS) == 0
     return out
 
 

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import h5py
-import lh5
 import numpy as np
 import pytest
 import yaml
@@ -42,18 +41,22 @@ def test_words_that_are_missing_or_unknown_are_named(command):
     assert command("trai").err.startswith('error: Unknown command "trai"')
 
 
+def told_without(words: list[str], heavy: str) -> str:
+    """What a command prints in a process of its own, which has loaded none of these."""
+    program = (
+        f"import sys, cpunet.cli as program; sys.argv[1:] = {words}\n"
+        "try:\n    program.main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        f"sys.exit(', '.join(sorted({{*{heavy.split()}}} & sys.modules.keys())) or 0)"
+    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
 @pytest.mark.parametrize("words", [["--help"], ["train", "--help"]])
 def test_the_help_does_not_load_torch(words):
-    program = (
-        "import io, sys; import cpunet.cli; sys.stdout = io.StringIO(); "
-        f"cpunet.cli.run({words}); "
-        "heavy = {'torch', 'lh5', 'lgdo', 'dspeed', 'matplotlib', 'scipy', 'numba'}; "
-        "sys.exit(', '.join(sorted(heavy & sys.modules.keys())) or 0)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    told_without(words, "torch lh5 lgdo dspeed matplotlib scipy numba")
 
 
 @pytest.mark.parametrize("name", ["pulses.lh5", "pulses.h5", "pulses.npy", "pulses.npz"])
@@ -70,18 +73,9 @@ def test_plain_files_load_neither_torch_nor_the_lh5_library(stand, tmp_path, nam
     else:
         np.save(file, traces)
     period = [] if name.endswith(".lh5") else ["--dt-ns", "16"]
-    program = (
-        "import sys, cpunet.cli as program\n"
-        f"sys.argv[1:] = {['info', str(file), *period]}\n"
-        "try:\n    program.main()\nexcept SystemExit as end:\n    assert not end.code\n"
-        "heavy = {'torch', 'lh5', 'lgdo', 'dspeed', 'pandas', 'matplotlib', 'hist'}\n"
-        "sys.exit(', '.join(sorted(heavy & sys.modules.keys())) or 0)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert f"{len(traces)} of {traces.shape[1]} samples, every 16 ns" in done.stdout
+    heavy = "torch lh5 lgdo dspeed pandas matplotlib hist"
+    told = told_without(["info", str(file), *period], heavy)
+    assert f"{len(traces)} of {traces.shape[1]} samples, every 16 ns" in told
 
 
 PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
@@ -121,40 +115,6 @@ def test_the_run_folder(trained, stand):
     assert [record["iteration"] for record in records] == [0, 1, 2, 3]
 
 
-def translated(path: Path, table: str) -> dict[str, np.ndarray]:
-    columns = lh5.read(table, str(path))
-    assert set(columns) == {"waveform", "energy", "event_number", "rejection"}
-    waveform = columns["waveform"]
-    return {
-        "values": waveform["values"].nda,
-        "dt": waveform["dt"].nda,
-        "t0": waveform["t0"].nda,
-        "dt_units": waveform["dt"].attrs["units"],
-        "kev": columns["energy"].nda,
-        "kev_units": columns["energy"].attrs["units"],
-        "event_number": columns["event_number"].nda,
-        "rejection": columns["rejection"].nda,
-    }
-
-
-def test_translate_keeps_the_rows(command, trained, stand, tmp_path):
-    n = len(stand.sim_kev)
-    outcome = command("translate", trained, stand.sim, "--out", tmp_path / "out.lh5")
-    assert outcome.code == 0
-    assert f"{n} of {n} pulses translated" in " ".join(outcome.out.split())
-    assert listing(tmp_path) == ["out.lh5"]
-    done = translated(tmp_path / "out.lh5", "geds/ren")
-    assert done["values"].shape == (n, 800)
-    assert done["values"].dtype == np.float32
-    assert np.isfinite(done["values"]).all()
-    assert (done["rejection"] == 0).all()
-    assert done["event_number"].tolist() == [1000 + 3 * i for i in range(n)]
-    np.testing.assert_allclose(done["kev"], stand.sim_kev)
-    assert (done["dt_units"], done["kev_units"]) == ("ns", "keV")
-    assert (done["dt"] == 16).all()
-    assert (done["t0"] == -400 * 16).all()  # sample 400 is where the pulse is aligned
-
-
 def test_raw_simulations_score_what_is_known_of_them(
     command, trained, stand, tmp_path, monkeypatch, undrawn
 ):
@@ -177,86 +137,50 @@ def test_raw_simulations_score_what_is_known_of_them(
         assert scores["paired"]["raw"]["edge_rmse"] > 0.01
 
 
-def test_info_of_files_and_runs(command, stand, trained):
-    told = command("info", stand.data)
-    assert told.code == 0
-    lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
-    assert lines["traces"] == f"{len(stand.data_kev)} of 1200 samples, every 16 ns"
-    assert lines["lines"] == "24 FEP, 24 SEP, 24 DEP"
-    assert lines["trigger"].startswith("half of the height at sample 5")
-    told = command("info", trained)
-    lines = dict(line.split(maxsplit=1) for line in told.out.splitlines())
-    assert lines["run"] == str(trained)
-    assert lines["trained"].startswith("recipe paper on FEP, seed 3; ")
-    assert "pulses used" in lines["simulated"] and "pulses used" in lines["measured"]  # noqa: PT018
-    assert len(told.out.splitlines()) < 20
-
-
-GAMMAS = "--detector icpc --events FEP=1"
-TRAINING = "--sim D/sim.lh5 --data D/data.lh5"
-# Words of each command, and names for --out that are, hold or lie in one of its inputs.
-COMMANDS = {
-    "demo": [],  # reads no file
-    "simulate": [
-        ("--detector icpc --hits D/hits.lh5", "D/hits.lh5"),
-        ("--detector icpc --hits D/link.lh5", "D/hits.lh5"),
-        ("--detector D/my.yaml --events FEP=1", "D/my.yaml"),
-    ],
-    "stand": [
-        ("--preset D/my.yaml", "D"),
-        ("--preset ornl --detector D/my.yaml", "D"),
-        ("--preset ornl --shift bias_V=20 --shift D/my.yaml", "D"),
-    ],
-    "check": [
-        (TRAINING, "D/data.lh5"),
-        (f"{TRAINING} --data-energy D/hits.lh5:ch1/hit/energy", "D/hits.lh5"),
-    ],
-    "train": [
-        (TRAINING, "D"),
-        (TRAINING, "."),
-        (f"{TRAINING} --recipe D/my.yaml", "D"),
-        ("--sim sim.lh5 --data data.lh5 --data-energy D/hits.lh5:ch1/hit/energy", "D"),
-        ("--sim sim.lh5 --data data.lh5 --init RUN", "RUN"),
-    ],
-    "calibrate": [
-        (TRAINING, "D"),
-        (f"{TRAINING} --recipe D/my.yaml", "D"),
-    ],
-    "translate": [
-        ("RUN D/sim.lh5", "D/sim.lh5"),
-        ("RUN D/link.lh5", "D/hits.lh5"),
-        ("RUN D/*.lh5", "D"),
-        ("RUN sim.lh5", "RUN/weights.safetensors"),
-        ("RUN D/sim.lh5 --energy D/hits.lh5:energy", "D/hits.lh5"),
-    ],
-    "validate": [
-        (f"RUN {TRAINING}", "D"),
-        (f"RUN {TRAINING}", "RUN"),
-        ("RUN --sim sim.lh5 --data data.lh5 --truth D/truth.npz", "D"),
-    ],
-    "info": [
-        ("D/sim.lh5", "D/sim.lh5"),
-        ("sim.lh5 --energy D/hits.lh5:energy", "D/hits.lh5"),
-    ],
-    "compare": [("REPORT/metrics.json", "REPORT/metrics.json"), ("REPORT", "REPORT/c.html")],
-    "response": [("RUN", "RUN"), ("RUN --truth D", "D"), ("RUN", ".")],
-    "export onnx": [
-        ("RUN", "RUN/weights.safetensors"),
-        ("RUN --report REPORT", "REPORT/ren.onnx"),
-    ],
-    "export legend": [("RUN", "RUN"), ("RUN --report REPORT", "REPORT")],
-    "library make": [
-        ("--detector D/my.yaml", "D/my.yaml"),
-        ("--detector icpc --settings D/my.yaml", "D/my.yaml"),
-    ],
-    "library translate": [("RUN D/hits.lh5", "D/hits.lh5"), ("RUN D/hits.lh5", "RUN/l.lh5")],
-    "import": [("--ren D/fep_REN.pt", "D")],
-}
-CASES = [
-    pytest.param(name, words, out, id=f"{name} {words} {out}")
-    for name, cases in COMMANDS.items()
-    for words, out in cases
-]
+# Command, words, and a name for --out that is, holds or lies in one of its inputs.
+REPLACING = """
+simulate | --detector icpc --hits D/hits.lh5 | D/hits.lh5
+simulate | --detector icpc --hits D/link.lh5 | D/hits.lh5
+simulate | --detector D/my.yaml --events FEP=1 | D/my.yaml
+stand | --preset D/my.yaml | D
+stand | --preset ornl --detector D/my.yaml | D
+stand | --preset ornl --shift bias_V=20 --shift D/my.yaml | D
+check | SIDES | D/data.lh5
+check | SIDES --data-energy D/hits.lh5:ch1/hit/energy | D/hits.lh5
+train | SIDES | D
+train | SIDES | .
+train | SIDES --recipe D/my.yaml | D
+train | --sim sim.lh5 --data data.lh5 --data-energy D/hits.lh5:ch1/hit/energy | D
+train | --sim sim.lh5 --data data.lh5 --init RUN | RUN
+calibrate | SIDES | D
+calibrate | SIDES --recipe D/my.yaml | D
+translate | RUN D/sim.lh5 | D/sim.lh5
+translate | RUN D/link.lh5 | D/hits.lh5
+translate | RUN D/*.lh5 | D
+translate | RUN sim.lh5 | RUN/weights.safetensors
+translate | RUN D/sim.lh5 --energy D/hits.lh5:energy | D/hits.lh5
+validate | RUN SIDES | D
+validate | RUN SIDES | RUN
+validate | RUN --sim sim.lh5 --data data.lh5 --truth D/truth.npz | D
+info | D/sim.lh5 | D/sim.lh5
+info | sim.lh5 --energy D/hits.lh5:energy | D/hits.lh5
+compare | REPORT/metrics.json | REPORT/metrics.json
+compare | REPORT | REPORT/c.html
+response | RUN | RUN
+response | RUN --truth D | D
+response | RUN | .
+export onnx | RUN | RUN/weights.safetensors
+export onnx | RUN --report REPORT | REPORT/ren.onnx
+export legend | RUN | RUN
+export legend | RUN --report REPORT | REPORT
+library make | --detector D/my.yaml | D/my.yaml
+library make | --detector icpc --settings D/my.yaml | D/my.yaml
+library translate | RUN D/hits.lh5 | D/hits.lh5
+library translate | RUN D/hits.lh5 | RUN/l.lh5
+import | --ren D/fep_REN.pt | D
+"""
+SIDES = "--sim D/sim.lh5 --data D/data.lh5"
+CASES = [row.replace("SIDES", SIDES).split(" | ") for row in REPLACING.strip().splitlines()]
 
 
 def writing_commands(below: App = app, name: str = "") -> set[str]:
@@ -273,7 +197,8 @@ def writing_commands(below: App = app, name: str = "") -> set[str]:
 
 
 def test_every_command_that_writes_is_here():
-    assert writing_commands() == set(COMMANDS)
+    # a demonstration reads no file
+    assert writing_commands() == {name for name, *_ in CASES} | {"demo"}
 
 
 @pytest.fixture
@@ -310,3 +235,18 @@ def test_no_input_is_replaced(command, home, name, words, out):
     assert outcome.err.count("\n") == 1
     assert "the input" in outcome.err
     assert contents(home) == before
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_units_and_windows_of_a_file(command, tmp_path):
+    path = tmp_path / "hits.csv"
+    columns = "".join(f"#column double {c}\n" for c in ("Event", "X", "Y", "Z", "Edep"))
+    head = "#class tools::wcsv::ntuple\n#title hits\n#separator 44\n"
+    path.write_text(f"{head}{columns}0,1,2,20,1000\n1,1,2,20,400\n2,1,2,220,900\n")
+    words = ["--detector", "ppc", "--set", "grid_mm=0.5", "--hits", path]
+    words += ["--out", tmp_path / "sim.lh5"]
+    assert "names no unit; give " in command("simulate", *words).err
+    units = ["--length-unit", "mm", "--energy-unit", "keV", "--events", "800-1200"]
+    outcome = command("simulate", *words, *units)
+    assert "1 of 2 events written (1 800-1200 by" in outcome.out
+    assert "check --origin, --flip-z and --hits-detector" in outcome.err

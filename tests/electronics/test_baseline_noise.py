@@ -80,13 +80,6 @@ def test_the_error_of_the_rms_covers_the_truth() -> None:
     assert 0.5 < np.sqrt((pulls**2).mean()) < 1.5
 
 
-def test_noise_goes_as_one_over_energy(noise) -> None:
-    rng = np.random.default_rng(2)
-    energy = np.repeat([1000.0, 2000.0], 200)
-    width = noise.draw(energy, 800, rng).reshape(2, -1).std(axis=1)
-    assert width[0] / width[1] == pytest.approx(2, rel=0.02)
-
-
 def test_finished_pulses_have_the_noise_of_the_data(noise) -> None:
     records = shape(200, 1200).astype(np.float32)
     windows = finish(

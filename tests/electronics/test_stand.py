@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,10 @@ from cpunet.electronics import stand_sides
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand import make_stand
 from cpunet.errors import CpunetError
+from cpunet.pulses.loading import load_pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.recipes import load_recipe
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.geometry_readers import read_detector
@@ -25,6 +29,9 @@ from cpunet.simulation.library_lookup import Library
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.shifted import Shift
 from cpunet.simulation.stored_simulation import StoredSimulation
+from cpunet.training.response_starts import GOOD_FIT
+from cpunet.training.train import train
+from synthetic import prepared_truth
 
 # a small crystal: its library is built in a second
 DETECTOR = read_detector(
@@ -44,11 +51,7 @@ LIMIT = "cpunet.electronics.stand._LIBRARY_FROM_EVENTS"
 FILES = (".cpunet.json", "data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture
@@ -108,6 +111,50 @@ def test_the_sides_are_events_of_their_own(tmp_path: Path) -> None:
     # of the continuum: the lines are at the same energies on both sides
     nearest = np.abs(sim[:, None] - data).min(axis=1)[(sim > 1000) & (sim < 2000)]
     assert np.median(nearest) > 2
+
+
+def test_the_folder_is_read_and_prepared(tmp_path: Path) -> None:
+    made = tmp_path / "stand"
+    make_stand(made, electronics="ornl", events="FEP=40,DEP=20", shift=("default",))
+    recipe = load_recipe("fast")
+    chosen = parse_selection("FEP,DEP", recipe.peaks)
+    sim = load_pulses(PulseFile(made / "sim.lh5"), "simulated", recipe, chosen)
+    data = load_pulses(PulseFile(made / "data.lh5"), "measured", recipe, chosen)
+    assert len(sim.prepared) > 20
+    assert len(data.prepared) > 10
+    truth = prepared_truth(made / "truth.npz", sim, recipe.preparation)
+    assert np.isfinite(truth).all()
+    # the mean edge of the truth is that of the data, within what the detector's shift makes
+    measured = data.prepared.pulses.waveforms.mean(axis=0)
+    assert np.abs(truth.mean(axis=0) - measured).max() < 0.1
+    made_by = json.loads((made / "stand.json").read_text())
+    assert made_by["shift"]["temperature_K"] == 2
+    assert made_by["data"]["detector"]["temperature_K"] == 92
+    with np.load(made / "data_labels.npz") as stored:
+        flags = dict(stored)
+    assert len(flags["label"]) == len(flags["flag"]) == made_by["counts"]["n_data"]
+    assert set(flags["label"]) <= {0, 2, 3}
+    left = flags["tails_kev"] > 1
+    assert (left == (flags["flag"] & 1 > 0)).mean() > 0.99
+    assert 0.1 < left.mean() < 0.6
+    assert set(flags) == {"label", "flag", "tails_kev", "n_piled", "piled_kev", "piled_ns"}
+
+
+@pytest.mark.slow
+def test_no_ringing_is_invented_for_a_fast_decay(tmp_path: Path) -> None:
+    """With 2,000 pulses a fit with fixed fast decays is poor, and a ringing imitates one."""
+    still = {"earlier_pulses.rate_kHz": 0}
+    stand = tmp_path / "stand"
+    make_stand(stand, electronics="ornl", settings=still, events="FEP=2000", seed=3)
+    sides = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
+    train(*sides, tmp_path / "run")
+    fit = json.loads((tmp_path / "run" / "run.json").read_text())["fit"]
+    found = fit["parameters"]
+    assert "ringing_mhz" not in found
+    assert found["pole_1_ns"] == pytest.approx(55, rel=0.1)
+    assert found["fast_decay_1_us"] == pytest.approx(2.9, rel=0.15)
+    assert found["decay_us"] == pytest.approx(54.6, rel=0.05)
+    assert fit["chi_square"] < GOOD_FIT * fit["moments"]
 
 
 @pytest.mark.thorough

@@ -12,7 +12,6 @@ import lh5
 import numpy as np
 import pytest
 from lgdo import Array, Scalar, Struct
-from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.legend.current_library import expand_library, merge_libraries, read_library
@@ -28,8 +27,7 @@ from cpunet.legend.library_files import chosen_libraries, known_detector
 from cpunet.legend.make_library import make_library
 from cpunet.legend.templates import TemplateTranslator
 from cpunet.legend.translate_library import enclosed, translate_library
-from cpunet.networks.generators import ResponseGenerator
-from cpunet.recipes import load_recipe
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -40,7 +38,7 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run, SideInfo
 from cpunet.translation.translator import REN
-from synthetic import after_pole_and_decay, sampled, write_run
+from synthetic import after_pole_and_decay, sampled, write_chain
 
 R, Z = np.arange(6.0), np.arange(8.0)
 WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")
@@ -50,15 +48,13 @@ SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run, sampled every 16 ns, with two poles, slow parts and decays."""
-    recipe = load_recipe("fast", ["generator.poles_ns=[45,30]", "generator.decay_us=60"])
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    generator.response.slow_weights.data[2] = 0.03
-    generator.response.decay_weights.data[0] = 0.05
-    folder = tmp_path_factory.mktemp("chain")
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-    model = nn.ModuleDict({"ren": generator})
-    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
-    return folder
+
+    def slow(chain: ResponseGenerator) -> None:
+        chain.response.slow_weights[2] = 0.03
+        chain.response.decay_weights[0] = 0.05
+
+    settings = ("generator.poles_ns=[45,30]", "generator.decay_us=60")
+    return write_chain(tmp_path_factory.mktemp("chain"), *settings, change=slow)
 
 
 def charge(n_samples: int = 2400) -> np.ndarray:
@@ -349,6 +345,21 @@ def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
     assert times[2, 6] == pytest.approx(known[2, 6], abs=20)  # of 60 from node to node
 
 
+def test_a_library_is_made(tmp_path: Path) -> None:
+    short = {"grid_mm": 12, "settings": {"dt_ns": 8, "length_ns": 2400}}
+    done = make_library("ppc", tmp_path / "psl.lh5", angles="0,30,45", **short)
+    assert "places have a template" in str(done)
+    (name,) = lh5.ls(str(tmp_path / "psl.lh5"))
+    made = lh5.read(name, str(tmp_path / "psl.lh5"))
+    assert {"waveform_000_deg", "waveform_030_deg", "drift_time_045_deg"} <= set(made)
+    assert made["dt"].value == 8
+    assert made["waveform_000_deg"].nda.shape[2] == 300
+    for wrong in ({"angles": "0,0"}, {"angles": "1.5"}, {"grid_mm": 0}):
+        with pytest.raises(CpunetError, match=r"^[^\n]+$"):
+            make_library("ppc", tmp_path / "other.lh5", **(short | wrong))
+        assert not (tmp_path / "other.lh5").exists()
+
+
 def geant4_events(reference_data: Path, n_events: int | None) -> tuple[Any, Hits]:
     """Geometry A, and events above 600 keV: merged hits without those in the lithium."""
     detector = read_detector(str(reference_data / "siggen" / "geometry_A.yaml"))
@@ -454,29 +465,21 @@ R_PLAIN, Z_PLAIN = np.arange(3.0), np.arange(4.0)
 FINE = 8  # samples of the charge to one of a template
 
 
-def written(folder: Path, *overrides: str, stretch: float = 0.0) -> Path:
-    """A run, sampled every 16 ns, that knows a pole of 50 ns and a decay of 60 µs."""
-    known = ["generator.poles_ns=[50]", "generator.decay_us=60", *overrides]
-    recipe = load_recipe("fast", known)
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    if generator.response.drift is not None:
-        generator.response.drift.stretch.data.fill_(stretch)
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-    model = nn.ModuleDict({"ren": generator})
-    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
-    return folder
+KNOWN = ("generator.poles_ns=[50]", "generator.decay_us=60")
 
 
 @pytest.fixture(scope="module")
 def plain_chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp("chain"))
+    """A run, sampled every 16 ns, that knows a pole of 50 ns and a decay of 60 µs."""
+    return write_chain(tmp_path_factory.mktemp("chain"), *KNOWN)
 
 
 @pytest.fixture(scope="module")
 def stretched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, and charges drift for a tenth longer than simulated."""
+    stretch = lambda chain: chain.response.drift.stretch.fill_(0.1)  # noqa: E731
     folder = tmp_path_factory.mktemp("stretched")
-    return written(folder, "generator.drift_terms=1", stretch=0.1)
+    return write_chain(folder, *KNOWN, "generator.drift_terms=1", change=stretch)
 
 
 def fine_charge(n_samples: int, dt_ns: float, seed: int = 0) -> np.ndarray:

@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 import pytest
 import yaml
-from torch import nn
 
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
@@ -22,10 +21,9 @@ from cpunet.legend.equivalent import (
 )
 from cpunet.legend.export import export_legend
 from cpunet.legend.make_library import make_library
-from cpunet.networks.generators import ResponseGenerator
-from cpunet.recipes import load_recipe
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.simulation.geometry_readers import read_detector
-from synthetic import write_run
+from synthetic import write_chain
 
 MEAN = {"a": -1.5e-6, "b": 1.0024, "per_mev_percent": -0.15, "per_mev_error_percent": 0.02}
 LAW = {"a": 2e-5, "b": 6.0, "c": 2.0}
@@ -34,26 +32,19 @@ METHOD = {"mean": MEAN, "resolution": LAW, "points": [], "scale": 0.08}
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recipe = load_recipe("fast", ["generator.poles_ns=[45,30]", "generator.decay_us=60"])
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    generator.response.slow_weights.data[2] = 0.03
-    folder = tmp_path_factory.mktemp("chain")
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-    model = nn.ModuleDict({"ren": generator})
-    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
-    return folder
+    def slow(chain: ResponseGenerator) -> None:
+        chain.response.slow_weights[2] = 0.03
+
+    settings = ("generator.poles_ns=[45,30]", "generator.decay_us=60")
+    return write_chain(tmp_path_factory.mktemp("chain"), *settings, change=slow)
 
 
 def test_a_stretched_drift_is_not_in_the_parameters(
-    chain: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    recipe = load_recipe("fast", ["generator.drift_terms=1"])
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    generator.response.drift.stretch.data.fill_(0.08)
-    (tmp_path / "run").mkdir()
-    info = json.loads((chain / "run.json").read_text())
-    write_run(tmp_path / "run", nn.ModuleDict({"ren": generator}), recipe, info)
-    told = export_legend(tmp_path / "run", tmp_path / "pars")
+    stretch = lambda chain: chain.response.drift.stretch.fill_(0.08)  # noqa: E731
+    run = write_chain(tmp_path / "run", "generator.drift_terms=1", change=stretch)
+    told = export_legend(run, tmp_path / "pars")
     assert any("charges drift for 8.0 % longer than simulated" in n for n in caplog.messages)
     assert told.content["electronics"]["chain"]["drift_stretch"] == pytest.approx(0.08)
 

@@ -8,7 +8,7 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-from lgdo import Array, Table, VectorOfVectors, WaveformTable
+from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
@@ -20,6 +20,7 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter, write_pulses
 from cpunet.recipes import load_recipe
+from synthetic import waveform_table
 
 RECIPE = load_recipe("fast")
 FEP = parse_selection("FEP", RECIPE.peaks)
@@ -99,7 +100,7 @@ def test_energies_of_another_file_are_joined_by_the_events_of_both(tmp_path, key
     """Rows in another order, and fewer of them."""
     caplog.set_level(logging.INFO)
     numbers, energies = np.arange(100, 100 + N), kev()
-    raw = {key: Array(numbers), "waveform": waveform(traces(energies))}
+    raw = {key: Array(numbers), "waveform": waveform_table(traces(energies))}
     lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
     order = np.random.default_rng(2).permutation(N)[: N - 10]
     hit = {key: Array(numbers[order]), "e": Array(energies[order], attrs={"units": "keV"})}
@@ -112,16 +113,12 @@ def test_energies_of_another_file_are_joined_by_the_events_of_both(tmp_path, key
 
 
 def test_energies_of_other_events_are_refused(tmp_path):
-    raw = {"event_number": Array(np.arange(N)), "waveform": waveform(traces(kev()))}
+    raw = {"event_number": Array(np.arange(N)), "waveform": waveform_table(traces(kev()))}
     lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
     hit = {"event_number": Array(np.arange(N) + N), "e": Array(kev(), attrs={"units": "keV"})}
     lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
     with pytest.raises(CpunetError, match="of other events"):
         open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e")
-
-
-def waveform(values) -> WaveformTable:
-    return WaveformTable(values=values, dt=DT_NS, dt_units="ns", t0=0.0, t0_units="ns")
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
@@ -132,8 +129,7 @@ def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, kind,
         cumulative_length=Array(np.cumsum([len(part) for part in parts])),
         flattened_data=Array(np.concatenate(parts)),
     )
-    period = Array(np.full(3, DT_NS), attrs={"units": "ns"})
-    columns = {"waveform": WaveformTable(values=values, dt=period, t0=period)}
+    columns = {"waveform": waveform_table(values)}
     lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
     source = open_pulses(tmp_path / "sim.lh5")
     if kind is np.uint16:  # as a digitiser has them
@@ -151,7 +147,7 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
     path, energies, values = tmp_path / "sim.lh5", kev(), traces(kev())
     contacts = np.repeat([1, 2], [n_first, N - n_first])
     energy = Array(energies, attrs={"units": "keV"})
-    columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform(values)}
+    columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform_table(values)}
     lh5.write(Table(col_dict=columns), "sim", path)
     with pytest.raises(CpunetError, match=r"contacts 1, 2 .*`table` chnid=1"):
         open_pulses(path)
@@ -187,7 +183,7 @@ def test_reversed_dimensions_are_named(tmp_path, suffix):
 def test_units_in_an_array_of_one(tmp_path):
     columns = {
         "energy": Array(kev(), attrs={"units": "MeV"}),
-        "waveform": waveform(traces(kev())),
+        "waveform": waveform_table(traces(kev())),
     }
     lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
     with h5py.File(tmp_path / "sim.lh5", "a") as file:

@@ -88,13 +88,6 @@ def test_columnwise_arrays_and_objects_beside_the_waveforms(tmp_path):
     np.testing.assert_array_equal(read.waveforms, VALUES)
 
 
-def test_simulated_reference_pulses(reference_data: Path):
-    path = reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
-    pulses = open_pulses(path, table="wf16", dt_ns=16).read()
-    with np.load(path) as arrays:
-        np.testing.assert_array_equal(pulses.waveforms, arrays["wf16"])
-
-
 PULSE = np.linspace(0, 1000, 50, dtype=np.float32)
 
 

@@ -9,21 +9,15 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-from lgdo import Array, Table, VectorOfVectors, WaveformTable
+from lgdo import Array, Table, VectorOfVectors
 from lh5.compression import ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses
+from synthetic import waveform_table
 
 RNG = np.random.default_rng(1)
 N, LENGTH = 23, 40
-
-
-def waveform_table(values, dt=16.0, units="ns"):
-    return WaveformTable(
-        t0=np.zeros(len(values)), t0_units="ns", dt=np.broadcast_to(dt, len(values)).copy(),
-        dt_units=units, values=values,
-    )  # fmt: skip
 
 
 @pytest.fixture
@@ -170,10 +164,7 @@ def test_ragged_waveforms_are_refused_if_they_differ(file):
     even = VectorOfVectors([[1, 2, 3, 4]] * 5, dtype=np.uint16)
     odd = VectorOfVectors([[1, 2, 3, 4]] * 4 + [[1, 2]], dtype=np.uint16)
     for name, values in (("even", even), ("odd", odd)):
-        table = WaveformTable(
-            t0=np.zeros(5), t0_units="ns", dt=np.full(5, 16.0), dt_units="ns", values=values
-        )
-        lh5.write(Table(col_dict={"waveform": table}), name, file)
+        lh5.write(Table(col_dict={"waveform": waveform_table(values)}), name, file)
     assert [len(b) for b in open_pulses(file, table="even").blocks(2)] == [2, 2, 1]
     np.testing.assert_array_equal(
         open_pulses(file, table="even").read().waveforms[4], [1, 2, 3, 4]

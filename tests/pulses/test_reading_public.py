@@ -17,15 +17,6 @@ from synthetic import decay, phased_edges
 
 KEV = 2614.511
 N = 240
-SHORT = {
-    "training.steps": 1,
-    "training.components": 4,
-    "training.squares": 2,
-    "training.start_factors": [1],
-    "training.ringing_mhz": [],
-    "training.noise_sets": 1,
-    "scores.bootstraps": 20,
-}
 
 
 def measured(rng: np.random.Generator, n: int, length: int, start: int) -> np.ndarray:

@@ -35,16 +35,11 @@ def test_uniform_field_moves_charges_at_constant_speed(planar: Maps) -> None:
     assert np.nanmax(paths.electrons[0, :, 2]) == pytest.approx(12, abs=0.15)
 
 
-def test_nothing_drifts_from_a_contact_or_from_outside(planar: Maps) -> None:
-    paths = drift_paths(planar, [5.0, 5.0, 99.0], 0.0, [1.0, 13.0, 8.0], STEPS)
+@pytest.mark.parametrize("far", [99.0, np.nan, np.inf, -np.inf, 1e300])
+def test_nothing_drifts_from_a_contact_or_from_outside(planar: Maps, far: float) -> None:
+    paths = drift_paths(planar, [5.0, 5.0, far, 0.0], 0.0, [1.0, 13.0, 8.0, far], STEPS)
     assert np.isnan(paths.holes).all()
     assert np.isnan(paths.electrons).all()
-
-
-@pytest.mark.parametrize("far", [np.nan, np.inf, -np.inf, 1e300])
-def test_nothing_drifts_from_where_nothing_can_be(planar: Maps, far: float) -> None:
-    paths = drift_paths(planar, [far, 0.0], 0.0, [8.0, far], STEPS)
-    assert np.isnan(paths.holes).all()
 
 
 def test_a_single_place_is_one_path(planar: Maps) -> None:

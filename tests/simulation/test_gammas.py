@@ -122,13 +122,8 @@ def test_sites_agree_with_geant4() -> None:
     assert count[fep].mean() == pytest.approx(4.2, rel=0.05)
 
 
-def test_hits_lie_in_germanium_and_never_exceed_the_line() -> None:
+def test_energies_never_exceed_the_line() -> None:
     hits, seen = run(20, 5_000)
-    shape = CrystalShape.of(crystal())
-    assert all(
-        in_germanium(shape, *place)
-        for place in hits.position_mm[:: max(len(hits.edep_kev) // 3000, 1)]
-    )
     assert hits.energy_kev.max() <= TL208_KEV + 1e-6
     assert hits.n_events == seen.spectrum.sum()
 
@@ -185,13 +180,6 @@ def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
         )
         assert len(hits.edep_kev) > 100_000
         assert detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm).all()
-
-
-def test_the_same_seed_gives_the_same_events() -> None:
-    first, second, other = run(20, 3_000)[0], run(20, 3_000)[0], run(20, 3_000, seed=4)[0]
-    np.testing.assert_array_equal(first.x_mm, second.x_mm)
-    np.testing.assert_array_equal(first.event_number, second.event_number)
-    assert len(other.x_mm) != len(first.x_mm)
 
 
 def test_wanted_counts_are_met_exactly() -> None:

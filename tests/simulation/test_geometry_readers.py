@@ -302,18 +302,6 @@ def test_other_kinds_of_diodes_are_refused(tmp_path: Path) -> None:
     assert "impcc" in refused(written(tmp_path, "B.json", text))
 
 
-def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    assert "icpc" in refused(tmp_path / "nothing.yaml")
-    refused(tmp_path)
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
-    refused(tmp_path / "binary.yaml")
-    assert "bias_kV" in refused("icpc", "bias_kV=4")
-    assert "bias_V" in refused("icpc", "bias_V=high")
-    for word, said in (("bias_V", "expected KEY=VALUE"), ("bias_V=[", "not YAML")):
-        with pytest.raises(CpunetError, match=said):
-            read_detector("icpc", [word])
-
-
 BORED = """
 xtal_length         80   # z length
 xtal_radius         35

@@ -89,13 +89,6 @@ def test_energy_and_centre_of_each_event_stay(counts: list[int], distance: float
     np.testing.assert_array_equal(merged.event_number, hits.event_number)
 
 
-def test_chains_are_one_and_events_are_not_mixed() -> None:
-    chain = Hits.of([[0, 0, 0], [2, 0, 0], [1, 0, 0]], [1.0, 1.0, 2.0], [0, 3])
-    merged = cluster_hits(Hits.concatenate([chain, chain]), 1.0)
-    np.testing.assert_allclose(merged.x_mm, [1, 1])
-    np.testing.assert_allclose(merged.edep_kev, [4, 4])
-
-
 @pytest.mark.parametrize("distance", [-1.0, float("nan"), float("inf")])
 def test_no_distance_is_refused(distance: float) -> None:
     with pytest.raises(CpunetError, match="give 0 or more"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -176,13 +175,6 @@ DETECTOR = read_detector("ppc", ["grid_mm=0.5"])
 SHORT = SimulationSettings(length_ns=1600)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @pytest.fixture(scope="module")
 def hits() -> Hits:
     """Events of three hits, one of them often in the lithium layer."""
@@ -209,6 +201,7 @@ PHYSICS = [
 ]
 
 
+@pytest.mark.usefixtures("own_cache")
 @pytest.mark.parametrize(
     "physics",
     [[{}, {**PHYSICS[1], **PHYSICS[4]}], pytest.param(PHYSICS, marks=pytest.mark.slow)],
@@ -232,6 +225,7 @@ def test_it_is_a_new_simulation_from_one_solution(
     assert len(solved) == 1
 
 
+@pytest.mark.usefixtures("own_cache")
 def test_another_lithium_layer_is_solved_anew(hits: Hits) -> None:
     thick, settings = changed(li_thickness=3.0)
     same = SameHits(hits)
@@ -245,6 +239,7 @@ def test_another_lithium_layer_is_solved_anew(hits: Hits) -> None:
     assert lost[1] > lost[0]
 
 
+@pytest.mark.usefixtures("own_cache")
 @pytest.mark.parametrize(
     "values",
     [

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import lh5
@@ -38,9 +40,7 @@ PLACES = [[10, 0, 20], [12, 0, 25], [5, 0, 45.5], [5, 3, 45.6], [0, 0, 300]]
 HITS = Hits.of(PLACES, [1000, 600, 600, 2614.5, 500], [0, 1, 3, 4, 5], [7, 3, 20, 21])
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch) -> None:
-    monkeypatch.setenv("CPUNET_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +159,57 @@ def test_resolution_changes_energies_and_nothing_else(ppc, source, tmp_path: Pat
     assert np.array_equal(true, first.energy_kev)
 
 
+def test_pulses_of_a_library_of_the_detector(ppc, tmp_path: Path):
+    # in the bulk, and in the lithium layer
+    hits = Hits.of([[10, 0, 20], [5, 0, 45.6]], [2614.5, 100], [0, 1, 2])
+    coarse = {"mode": "library", "library_grid_mm": 4, "library_halvings": 0}
+    file = npz(tmp_path / "hits.npz", hits)
+    told = str(simulate(tmp_path / "sim.lh5", detector=ppc, hits=file, settings=coarse))
+    assert "1 of 2 events written (1 FEP" in told
+    assert "1 without any signal" in told
+    assert "library pulses" in told
+
+
+def test_a_diode_of_legend_with_its_crystal(source, reference_data, tmp_path: Path, caplog):
+    caplog.set_level("INFO", "cpunet")
+    metadata, out = reference_data / "legend-metadata", tmp_path / "a.lh5"
+    diode = Path(shutil.copy(metadata / "diodes" / "P99000A.yaml", tmp_path))
+    values = {
+        "temperature_K": 85,
+        "bias_V": 3300,
+        "grid_mm": 0.5,
+        "impurity_scale": "depletion",
+    }
+    given: dict[str, Any] = {"detector": diode, "hits": source, "settings": values}
+    with pytest.raises(CpunetError, match="give `settings` impurity_z0"):
+        simulate(out, **given)
+    shutil.copy(metadata / "crystals" / "V99000.yaml", tmp_path / "P99000.yaml")
+    simulate(out, **given)
+    assert "so that it depletes at the measured 3000 V" in caplog.text
+    with h5py.File(out) as file:
+        made = json.loads(file["geds/sim"].attrs["simulation"])
+    assert made["detector"]["measured_depletion_V"] == 3000
+    # simulated with the maker's impurities, P99000A would deplete at some 2260 V
+    assert 1.2 < made["detector"]["impurity_scale"] < 1.5
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "give `hits` of a file, or `events` for the gamma Monte Carlo"),
+        ({"hits": "x.npz", "events": "DPE"}, r"'DPE' is no known peak \(FEP, SEP, DEP\)"),
+        ({"events": "FEP=5,FEP=7"}, "names a peak twice; give each once"),
+        ({"events": "FEP=5e3"}, "'5e3' is no number of events; give N or FEP=N,DEP=M"),
+        ({"events": "many"}, "`events`: 'many' is no number of events"),
+        ({"events": "0"}, "no event is wanted"),
+    ],
+)
+def test_events_that_cannot_be_simulated(ppc, tmp_path: Path, given: dict[str, str], said: str):
+    with pytest.raises(CpunetError, match=rf"^[^\n]*{said}[^\n]*$"):
+        simulate(tmp_path / "sim.lh5", detector=ppc, **given)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
     # ppc's layer is 1 mm below the top at 46 mm: z = 44.99 is active, 45.01 is not
     places = [[10, 0, 44.97], [10, 0, 45.01], [10, 0, 44.99], [10, 0, 20]]
@@ -269,10 +320,7 @@ def test_the_diffusion_is_that_of_the_field_unless_told():
         ("diffusion_constant: hot", "diffusion_constant: give a number above 0"),
         ("diffusion_constant: 0", "diffusion_constant: give a number above 0"),
         ("diffusion_constant: [1]", "diffusion_constant: give a number above 0"),
-        ("dt: 8", r"dt: no such setting; there are step_ns"),
         ("dt_ns: 1.5", "dt_ns must be a multiple"),
-        ("- 3", "holds no settings"),
-        ("dt_ns: 8\na: [", "not YAML .* line 2"),
     ],
 )
 def test_wrong_settings_name_the_file(tmp_path: Path, text: str, said: str):

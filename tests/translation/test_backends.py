@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
@@ -16,7 +15,6 @@ from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.networks.kept_noise import NOISE_BINS
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
@@ -25,9 +23,18 @@ from cpunet.training.inverse import fit_inverse
 from cpunet.training.outside import Outside
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
-from synthetic import after_pole_and_decay, in_traces, sampled, two_sites, write_run
+from synthetic import (
+    FACTS,
+    after_pole_and_decay,
+    in_traces,
+    sampled,
+    two_sites,
+    write_chain,
+    write_run,
+)
 
-RECIPE = load_recipe("fast", ["generator.poles_ns=[50]", "generator.decay_us=60"])
+CHAIN = ("generator.poles_ns=[50]", "generator.decay_us=60")
+RECIPE = load_recipe("fast", CHAIN)
 DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0
 FINE = 16  # samples of the charge to one of the digitiser
 N = 40
@@ -59,17 +66,11 @@ def responded(n: int, seed: int) -> FloatArray:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that has learned the chain and its white noise exactly."""
-    generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
-    density = np.full(NOISE_BINS, NOISE_KEV**2)
-    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
     raw = Pulses.of(simulated(400, seed=1), dt_ns=DT_NS)
     windows = prepare(raw, RECIPE.preparation, "simulated").pulses.waveforms
-    inverse = fit_inverse(generator, windows, np.full(len(windows), KEV), RECIPE, seed=0)
-    folder = tmp_path_factory.mktemp("run")
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
-    model = nn.ModuleDict({"ren": generator, "iren": inverse})
-    write_run(folder, model, RECIPE, info | {"seconds": 1.0, "device": "cpu"})
-    return folder
+    folder, kev = tmp_path_factory.mktemp("run"), np.full(len(windows), KEV)
+    inverse = lambda chain: fit_inverse(chain, windows, kev, RECIPE, seed=0)  # noqa: E731
+    return write_chain(folder, *CHAIN, noise_kev=NOISE_KEV, inverse=inverse)
 
 
 @pytest.fixture(scope="module")
@@ -217,12 +218,8 @@ def test_no_pulses_at_all(ren, iren) -> None:
     assert iren.translate(np.zeros((0, 1200), np.float32)).shape == (0, 800)
 
 
-def test_weights_of_the_other_half_are_missed(run: Path, tmp_path: Path) -> None:
-    generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
-    model = nn.ModuleDict({"ren": generator})
-    write_run(tmp_path, model, RECIPE, info | {"seconds": 1.0, "device": "cpu"})
-    REN.load(tmp_path)
+def test_weights_of_the_other_half_are_missed(tmp_path: Path) -> None:
+    REN.load(write_chain(tmp_path))
     with pytest.raises(CpunetError, match="weights of another network"):
         IREN.load(tmp_path)
 
@@ -240,10 +237,9 @@ def noisy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     model = CycleGan(NOISY, outside)
     folder = tmp_path_factory.mktemp("run")
-    info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
     drawn = DrawnTails(TailsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
     fit = {"tails": {"rate_khz": 2.0, "drawn": drawn.describe()}}
-    write_run(folder, model, NOISY, info | {"seconds": 1.0, "device": "cpu", "fit": fit})
+    write_run(folder, model, NOISY, FACTS | {"fit": fit})
     return folder
 
 

@@ -12,16 +12,12 @@ import pytest
 import torch
 from dspeed import build_dsp
 from dspeed.errors import ProcessingChainError
-from lgdo import Array, ArrayOfEqualSizedArrays, Table, WaveformTable
-from torch import nn
+from lgdo import Array, Table
 
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import Pulses
-from cpunet.recipes import load_recipe
 from cpunet.translation.dspeed_processor import ren
 from cpunet.translation.translator import IREN, REN
-from synthetic import write_run
+from synthetic import waveform_table, write_chain
 
 MODULE = "cpunet.translation.dspeed_processor"
 
@@ -29,31 +25,12 @@ MODULE = "cpunet.translation.dspeed_processor"
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a readout chain with white noise of 3 keV."""
-    recipe = load_recipe("fast")
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    density = np.full(NOISE_BINS, 9.0)
-    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), 16.0, 100))
-    folder = tmp_path_factory.mktemp("chain")
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-    model = nn.ModuleDict({"ren": generator})
-    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
-    return folder
+    return write_chain(tmp_path_factory.mktemp("chain"), noise_kev=3)
 
 
 def table(waveforms: np.ndarray, energy: np.ndarray, dt_ns: float = 16.0) -> Table:
-    n = len(waveforms)
-    return Table(
-        {
-            "waveform": WaveformTable(
-                t0=np.zeros(n),
-                t0_units="ns",
-                dt=np.full(n, dt_ns),
-                dt_units="ns",
-                values=ArrayOfEqualSizedArrays(nda=waveforms),
-            ),
-            "energy": Array(energy, attrs={"units": "keV"}),
-        }
-    )
+    kev = Array(energy, attrs={"units": "keV"})
+    return Table({"waveform": waveform_table(waveforms, dt_ns), "energy": kev})
 
 
 def config(run: Path, function: str, args: list[str], *init: Any) -> dict[str, Any]:

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import NOISE_BINS, LinearInverse, ResponseGenerator, Sizes
+from cpunet.networks.linear_inverse import LinearInverse, Sizes
+from cpunet.networks.response_generator import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -20,29 +19,31 @@ from cpunet.translation.export import export_onnx
 from cpunet.translation.onnx import write_onnx
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.comparisons import compare
-from synthetic import write_report, write_run
+from synthetic import write_chain, write_report
 
 
-def write_chain(folder: Path, *overrides: str) -> Path:
-    """A run of a readout chain."""
-    recipe = load_recipe("fast", overrides)
-    generator = ResponseGenerator(recipe.matching.generator, 16.0)
-    if generator.response.drift is not None:
-        generator.response.drift.stretch.data.copy_(torch.tensor([0.08, -0.02]))
-    noise = BaselineNoise(np.full(NOISE_BINS, 9.0), 2 * (NOISE_BINS - 1), 16.0, 100)
-    generator.set_noise(noise)
+def fitted(chain: ResponseGenerator) -> None:
+    """Elsewhere than where a fit begins."""
+    if chain.response.drift is not None:
+        chain.response.drift.stretch.copy_(torch.tensor([0.08, -0.02]))
+    for times, found in (("log_poles_ns", [33.0, 71.0]), ("log_decay_us", [54.6])):
+        getattr(chain.response, times).copy_(torch.tensor(found).log())
+
+
+def unity(_chain: ResponseGenerator) -> LinearInverse:
+    """An inverse that changes nothing."""
+    recipe = load_recipe("fast")
     inverse = LinearInverse(Sizes.of(recipe.preparation.length, recipe.matching.training))
     inverse.half_height.fill_(0.4)
     inverse.weights.copy_(torch.eye(len(inverse.weights)))
-    model = nn.ModuleDict({"ren": generator, "iren": inverse})
-    with torch.no_grad():  # elsewhere than where a fit begins
-        for times, found in (("log_poles_ns", [33.0, 71.0]), ("log_decay_us", [54.6])):
-            getattr(generator.response, times).copy_(torch.tensor(found).log())
-    info = {"recipe": "fast", "peak": "FEP", "seed": 0, "dt_ns": 16.0, "seconds": 1.0}
-    info["fit"] = {"errors": {"log_poles_ns.2": 0.02, "log_decay_us.1": 0.002}}
-    folder.mkdir()
-    write_run(folder, model, recipe, info | {"device": "cpu"})
-    return folder
+    return inverse
+
+
+def written(folder: Path, *settings: str) -> Path:
+    """A run of a readout chain."""
+    fit = {"errors": {"log_poles_ns.2": 0.02, "log_decay_us.1": 0.002}}
+    how = {"change": fitted, "inverse": unity, "noise_kev": 3}
+    return write_chain(folder, *settings, **how, fit=fit)
 
 
 def written_report(folder: Path) -> tuple[Path, dict[str, float]]:
@@ -65,7 +66,7 @@ def written_report(folder: Path) -> tuple[Path, dict[str, float]]:
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_chain(tmp_path_factory.mktemp("exports") / "chain")
+    return written(tmp_path_factory.mktemp("exports") / "chain")
 
 
 def prepared(sim: np.ndarray) -> np.ndarray:
@@ -123,7 +124,7 @@ def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
 @pytest.mark.thorough
 def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
     # as where the physics are off
-    stretched = write_chain(tmp_path / "stretched", "generator.drift_terms=2")
+    stretched = written(tmp_path / "stretched", "generator.drift_terms=2")
     for folder, kind in ((run, IREN), (chain, IREN), (stretched, REN)):
         graph = kind.load(folder).backend.graph(800)
         assert write_onnx(graph, tmp_path / "graph") < 2e-5

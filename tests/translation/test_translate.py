@@ -16,10 +16,9 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors, WaveformTable
+from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 from torch import nn
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import SIZES_KEV
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
@@ -40,11 +39,19 @@ from cpunet.translation.noise_blocks import noise_seed
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
-from synthetic import decay, edges, in_traces, nearly_full_disk, write_run
+from synthetic import (
+    FACTS,
+    decay,
+    edges,
+    in_traces,
+    nearly_full_disk,
+    waveform_table,
+    write_chain,
+    write_run,
+)
 
 DT_NS, N = 16.0, 40
 NOISE_KEV = 2.0
-INFO = {"dt_ns": DT_NS, "peak": "FEP", "seconds": 0, "device": "cpu", "seed": 0}
 # the data of a run: 1 in prepared units was 26145.11 ADC at 2614.511 keV
 DATA = {
     "cuts": {
@@ -61,19 +68,11 @@ def charge(n=N, seed=1):
     return edges(n, seed, at=80).astype(np.float32)
 
 
-def write_chain(folder, info=INFO, **buffers):
-    recipe = load_recipe("fast")
-    chain = ResponseGenerator(recipe.matching.generator, DT_NS)
-    chain.set_noise(BaselineNoise(np.full(4097, NOISE_KEV**2), 8192, DT_NS, 100))
-    folder.mkdir()
-    write_run(folder, nn.ModuleDict({"ren": chain}), recipe, {"recipe": "fast"} | info)
-    return folder
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A readout chain that was not fitted."""
-    return write_chain(tmp_path_factory.mktemp("runs") / "run", INFO | {"data": DATA})
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return write_chain(folder, noise_kev=NOISE_KEV, data=DATA)
 
 
 TAILS = {
@@ -93,8 +92,8 @@ TAILS = {
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory):
     """A chain of data with pile-up tails."""
-    info = INFO | {"data": DATA, "fit": {"tails": TAILS}}
-    return write_chain(tmp_path_factory.mktemp("runs") / "run", info)
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return write_chain(folder, noise_kev=NOISE_KEV, data=DATA, fit={"tails": TAILS})
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +104,7 @@ def network(tmp_path_factory):
     model = nn.ModuleDict({"ren": PositionalUNet(recipe.cyclegan.generator, 800)})
     folder = tmp_path_factory.mktemp("networks") / "run"
     folder.mkdir()
-    write_run(folder, model, recipe, {"recipe": "paper"} | INFO)
+    write_run(folder, model, recipe, FACTS)
     return folder
 
 
@@ -113,13 +112,7 @@ def sim_file(path, n=N, seed=1, **others):
     """An LH5 file by the LH5 library, with columns of many kinds."""
     rng = np.random.default_rng(seed)
     content = {
-        "waveform": WaveformTable(
-            t0=np.zeros(n),
-            t0_units="ns",
-            dt=np.full(n, DT_NS),
-            dt_units="ns",
-            values=ArrayOfEqualSizedArrays(nda=charge(n, seed)),
-        ),
+        "waveform": waveform_table(charge(n, seed)),
         "energy": Array(rng.uniform(500, 2600, n), attrs={"units": "keV"}),
         "event_number": Array(7 + 2 * np.arange(n)),
     }
@@ -165,10 +158,16 @@ def names(folder):
 def test_all_other_columns_are_kept(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5", **many_columns())
     translate(run, source, tmp_path / "out.lh5")
+    assert names(tmp_path) == ["out.lh5", "sim.lh5"]
     before, after = lh5.read("geds/sim", source), lh5.read("geds/ren", tmp_path / "out.lh5")
     assert set(after) == set(before) | {"rejection_source"}
     assert plain(after.rejection_source) == [9] * N
     assert plain(after.rejection) == [0] * N
+    waveform = after.waveform
+    assert (waveform.values.nda.shape, waveform.values.nda.dtype) == ((N, 800), np.float32)
+    assert np.isfinite(waveform.values.nda).all()
+    assert (waveform.dt.attrs["units"], set(waveform.dt.nda)) == ("ns", {DT_NS})
+    assert set(waveform.t0.nda) == {-400 * DT_NS}  # sample 400 is where the pulse is aligned
     for name in set(before) - {"waveform", "rejection"}:
         assert plain(after[name]) == plain(before[name]), name
         assert after[name].attrs.get("units") == before[name].attrs.get("units")

@@ -19,15 +19,14 @@ import pytest
 import yaml
 from lgdo import (
     Array,
-    ArrayOfEqualSizedArrays,
     Scalar,
     Struct,
     Table,
     VectorOfVectors,
-    WaveformTable,
 )
 
 from cpunet.simulation.hit_files import read_hits
+from synthetic import waveform_table
 
 pytest.importorskip("snakemake", reason="snakemake is not installed: pip install '.[workflow]'")
 
@@ -415,13 +414,7 @@ def test_the_profile_names_rules_that_are_there():
 def write_raw(path: Path, first: int, n: int) -> None:
     """Traces of channel 1 in an LH5 file, and energies as in a hit tier in another."""
     values = np.arange(n * 8, dtype=np.uint16).reshape(n, 8) + first
-    waveform = WaveformTable(
-        t0=np.zeros(n),
-        t0_units="ns",
-        dt=np.full(n, 16.0),
-        dt_units="ns",
-        values=ArrayOfEqualSizedArrays(nda=values, attrs={"units": "ADC"}),
-    )
+    waveform = waveform_table(values, samples="ADC")
     raw = Table(col_dict={"waveform": waveform, "event": Array(np.arange(n))})
     hit = Table(
         col_dict={"e": Array(first + np.arange(n, dtype=float), attrs={"units": "keV"})}
@@ -430,8 +423,9 @@ def write_raw(path: Path, first: int, n: int) -> None:
     lh5.write(hit, "hit", str(path.with_name(f"hit-{path.name}")), group="ch1")
 
 
-def merge_script() -> Any:
-    spec = importlib.util.spec_from_file_location("merge", WORKFLOW / "scripts" / "merge.py")
+def script(name: str) -> Any:
+    """A script of the workflow, as a module."""
+    spec = importlib.util.spec_from_file_location(name, WORKFLOW / "scripts" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -445,7 +439,7 @@ def test_files_are_merged_in_order(tmp_path):
     write_raw(files[1], 2000, 2)
     out = tmp_path / "merged.lh5"
     energies = [f"{file.with_name(f'hit-{file.name}')}:ch1/hit/e" for file in files]
-    made = merge_script().merge(out, files, "geds/raw", table="ch1/raw", energies=energies)
+    made = script("merge").merge(out, files, "geds/raw", table="ch1/raw", energies=energies)
     assert made == 5
     merged = lh5.read("geds/raw", str(out))
     assert merged["energy"].nda.tolist() == [1000, 1001, 1002, 2000, 2001]
@@ -553,16 +547,7 @@ def write_steps(path: Path, sims: dict[str, Path], events: slice) -> dict[str, A
 
 
 def snakemake(folder: Path, *words: str) -> str:
-    command = [sys.executable, "-m", "snakemake", "-s", str(WORKFLOW / "Snakefile")]
-    done = subprocess.run(
-        [*command, "--configfile", "config.yaml", "-c2", "--show-failed-logs", *words],
-        cwd=folder,
-        env=os.environ | {"PATH": os.pathsep.join([str(BIN), os.environ["PATH"]])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=3000,
-    )
+    done = Place(folder).run("-c2", "--show-failed-logs", *words)
     assert done.returncode == 0, done.stdout
     return done.stdout
 
@@ -663,15 +648,6 @@ def require_resumed(folder: Path, results: Path) -> None:
     assert len(made) <= 3
 
 
-def dsp_script() -> Any:
-    spec = importlib.util.spec_from_file_location("dsp", WORKFLOW / "scripts" / "dsp.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 DSP_DEFECTS = {
     "no file": ("none.yaml", None, "none.yaml: no such file"),
     "no YAML": ("bad.yaml", "a: [", "bad.yaml: not YAML"),
@@ -687,7 +663,7 @@ def test_what_keeps_dspeed_from_running_is_one_line(tmp_path, defect):
         (tmp_path / name).write_text(text)
     given = [tmp_path / "raw.lh5", tmp_path / "out.lh5", tmp_path / name, "V01/raw"]
     with pytest.raises(Exception, match=words) as error:
-        dsp_script().run_chain(*given, tmp_path / "no run")
+        script("dsp").run_chain(*given, tmp_path / "no run")
     assert "\n" not in str(error.value)
 
 
@@ -700,5 +676,5 @@ def test_a_chain_that_does_not_fit_the_traces(tmp_path):
     (tmp_path / "dsp.yaml").write_text(yaml.safe_dump({"outputs": [], "processors": few}))
     given = [tmp_path / "raw.lh5", tmp_path / "out.lh5", tmp_path / "dsp.yaml", "V01/raw"]
     with pytest.raises(Exception, match=r"fails on V01/raw .*do its times fit the traces"):
-        dsp_script().run_chain(*given, tmp_path / "no run", tau_us=400.0)
+        script("dsp").run_chain(*given, tmp_path / "no run", tau_us=400.0)
     assert not (tmp_path / "out.lh5").exists()
