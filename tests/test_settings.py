@@ -157,10 +157,7 @@ def message(name: str, *overrides: str) -> str:
 @pytest.mark.parametrize(
     ("override", "part"),
     [
-        (
-            "training.batch_siez=16",
-            "batch_siez: no such setting; did you mean batch_size?",
-        ),
+        ("training.batch_siez=16", "batch_siez: no such setting; did you mean batch_size?"),
         ("training.batch_size", "expected KEY=VALUE"),
         ("training.batch_size=[", "not YAML"),
         ("training.rate_generators=.nan", "training.rate_generators: "),

@@ -12,12 +12,7 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.channels import (
-    channel_names,
-    channels_of,
-    each_channel,
-    paired,
-)
+from cpunet.pulses.channels import channel_names, channels_of, each_channel, paired
 from cpunet.pulses.reading.files import PulseFile
 
 

@@ -88,8 +88,7 @@ def other_fine() -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("sigma_ns", "tau_ns"),
-    [(30.0, 60.0), pytest.param(20.0, 90.0, marks=pytest.mark.thorough)],
+    ("sigma_ns", "tau_ns"), [(30.0, 60.0), pytest.param(20.0, 90.0, marks=pytest.mark.thorough)]
 )
 def test_gauss_exp_recovers_its_widths(sim, other_fine, sigma_ns, tau_ns) -> None:
     response = sampled(convolved(other_fine, gauss_exp_kernel(sigma_ns, tau_ns)))

@@ -6,19 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import yaml
 
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
-from cpunet.legend.equivalent import (
-    ae_ratios,
-    current_delay_ns,
-    equivalent_kernel,
-    kernel_step,
-)
+from cpunet.legend.equivalent import ae_ratios, current_delay_ns, equivalent_kernel, kernel_step
 from cpunet.legend.export import export_legend
 from cpunet.legend.make_library import make_library
 from cpunet.networks.response_generator import ResponseGenerator
@@ -93,21 +87,6 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     told = export_legend(chain, out, force=True)
     assert told.detector == "default"
     assert sorted(p.name for p in out.glob("*.yaml")) == ["cpunet.yaml", "elecmod.yaml"]
-
-
-def test_a_library_of_currents_is_refused(chain: Path, tmp_path: Path) -> None:
-    source, time = tmp_path / "currents.lh5", np.arange(600.0)
-    with h5py.File(source, "w") as file:
-        library = file.create_group("V01")
-        for name, values, units in (("r", [0, 1], "mm"), ("z", [0, 1], "mm"), ("dt", 1, "ns")):
-            library[name] = values
-            library[name].attrs["units"] = units
-        library["waveform_000_deg"] = np.tile(
-            np.exp(-0.5 * ((time - 300) / 30) ** 2), (2, 2, 1)
-        )
-    with pytest.raises(CpunetError, match="these are currents"):
-        export_legend(chain, tmp_path / "pars", library=source)
-    assert not (tmp_path / "pars").exists()
 
 
 @pytest.mark.slow  # a library is made

@@ -176,10 +176,7 @@ def test_ragged_waveforms_are_refused_if_they_differ(file):
 def test_a_period_that_changes_names_the_event(file, raw):
     dt = np.full(N, 16.0)
     dt[17] = 8.0
-    columns = {
-        "waveform": waveform_table(raw, dt),
-        "event_number": Array(np.arange(N) + 1000),
-    }
+    columns = {"waveform": waveform_table(raw, dt), "event_number": Array(np.arange(N) + 1000)}
     lh5.write(Table(col_dict=columns), "raw", file)
     with pytest.raises(CpunetError, match=r"event 1017: sampling period 8 ns, before it 16 ns"):
         list(open_pulses(file).blocks(4))

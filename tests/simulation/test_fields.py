@@ -226,11 +226,7 @@ def test_any_tilt_of_the_impurities_from_the_same_solution(more: list[str]) -> N
     solution = solve(detector)
     scale, tilt = 1.1, 0.03
     tilted = superposed_fields(
-        solution,
-        bias_V=3000,
-        impurity_scale=scale,
-        impurity_tilt=tilt,
-        temperature_K=80,
+        solution, bias_V=3000, impurity_scale=scale, impurity_tilt=tilt, temperature_K=80
     )
     # solved for on its own, the impurities written down as they are
     middle_cm = detector.crystal_length / 20

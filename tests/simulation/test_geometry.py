@@ -57,10 +57,7 @@ def test_lithium_is_as_thick_as_said_on_a_taper(taper: str) -> None:
         "bottom": (radius - 10 * math.tan(angle), 10, -1, 1),
     }[taper]
     for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
-        at = (
-            r + depth * into_r * math.cos(angle),
-            z + depth * into_z * math.sin(angle),
-        )
+        at = (r + depth * into_r * math.cos(angle), z + depth * into_z * math.sin(angle))
         assert (detector.inside(*at), detector.active(*at)) == (inside, active)
 
 

@@ -52,10 +52,7 @@ DIODE: dict[str, Any] = {
     "type": "bege",
     "production": {
         "impcc": {
-            "array": {
-                "value_in_1e9e/cm3": [8.0, 12.0],
-                "dist_from_contact_in_mm": [30.0, 0.0],
-            }
+            "array": {"value_in_1e9e/cm3": [8.0, 12.0], "dist_from_contact_in_mm": [30.0, 0.0]}
         }
     },
     "geometry": {
@@ -436,10 +433,7 @@ def test_extra_shapes_that_change_nothing(tmp_path: Path, extra: object) -> None
 @pytest.mark.parametrize(
     ("extra", "said"),
     [
-        (
-            {"crack": {"radius_in_mm": 8, "width_in_mm": 22}},
-            "crack cuts off a side; only",
-        ),
+        ({"crack": {"radius_in_mm": 8, "width_in_mm": 22}}, "crack cuts off a side; only"),
         ({"hole": {"depth_in_mm": 5}}, "hole.depth_in_mm"),
     ],
 )

@@ -25,11 +25,7 @@ from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hit_sources import (
-    GammaSource,
-    HitFile,
-    energy_windows,
-)
+from cpunet.simulation.hit_sources import GammaSource, HitFile, energy_windows
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
@@ -222,23 +218,10 @@ def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
 def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
     ppc, tmp_path: Path
 ):
-    out, merged, few = tmp_path / "exact.lh5", tmp_path / "merged.lh5", "FEP=10,DEP=5"
-    simulate(
-        out,
-        detector=ppc,
-        events=few,
-        seed=4,
-        settings_file=SETTINGS,
-        settings={"cluster_mm": 0},
-    )
-    simulate(
-        merged,
-        detector=ppc,
-        events=few,
-        seed=4,
-        settings_file=SETTINGS,
-        settings={"cluster_mm": 0.05},
-    )
+    out, merged = tmp_path / "exact.lh5", tmp_path / "merged.lh5"
+    how = {"detector": ppc, "events": "FEP=10,DEP=5", "seed": 4, "settings_file": SETTINGS}
+    for file, cluster_mm in ((out, 0), (merged, 0.05)):
+        simulate(file, **how, settings={"cluster_mm": cluster_mm})
     first, second = (next(open_pulses(path).blocks()) for path in (out, merged))
     assert np.abs(first.waveforms - second.waveforms).max() < 1e-3
     assert first.energy_kev == pytest.approx(second.energy_kev)

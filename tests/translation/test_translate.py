@@ -364,8 +364,7 @@ def test_each_output_is_compared_with_few_paths(run, many, tmp_path, monkeypatch
     """And yet none may be another's input."""
     seen = []
     monkeypatch.setattr(
-        "cpunet.translation.many_files.refuse_inputs",
-        lambda *paths: seen.append(len(paths)),
+        "cpunet.translation.many_files.refuse_inputs", lambda *paths: seen.append(len(paths))
     )
     (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
     with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):

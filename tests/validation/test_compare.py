@@ -39,9 +39,7 @@ def scores(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, 
                 "paired": {"ren": {"edge_rmse": 0.0006}, "rc": {"edge_rmse": 0.007}},
             }
         },
-        "ae_survival": {
-            "SEP": {"difference": {"ren": off}, "difference_std": {"ren": 2.0}},
-        },
+        "ae_survival": {"SEP": {"difference": {"ren": off}, "difference_std": {"ren": 2.0}}},
         "rejections": {"data": {"saturated": 3}, "sim": {}},
     }
 

@@ -16,14 +16,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import REN
-from cpunet.validation.tune import (
-    UNCHANGED,
-    HeldOut,
-    search_space,
-    tune,
-    value_of,
-    with_values,
-)
+from cpunet.validation.tune import UNCHANGED, HeldOut, search_space, tune, value_of, with_values
 from synthetic import KEV, SMALL_NETWORK, Files, write_files
 
 SPACE = (

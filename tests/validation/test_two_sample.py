@@ -75,12 +75,6 @@ def test_small_changes_of_real_pulses_are_seen(change):
     assert significance(classifier_auc(edges(rng, 600), edges(rng, 600, **change), seed=0)) > 5
 
 
-def test_missing_noise_gives_a_simulation_away():
-    rng = np.random.default_rng(5)
-    result = classifier_auc(edges(rng, 200), edges(rng, 200, noise=0.0), seed=0)
-    assert result.auc > 0.99
-
-
 def test_additional_features_are_used():
     rng = np.random.default_rng(6)
     sides = edges(rng, 400), edges(rng, 400)

@@ -17,13 +17,7 @@ import lh5
 import numpy as np
 import pytest
 import yaml
-from lgdo import (
-    Array,
-    Scalar,
-    Struct,
-    Table,
-    VectorOfVectors,
-)
+from lgdo import Array, Scalar, Struct, Table, VectorOfVectors
 
 from cpunet.simulation.hit_files import read_hits
 from synthetic import waveform_table
@@ -179,11 +173,7 @@ def whole_chain() -> dict[str, Any]:
     }
     config["periods"]["p04"] = {"data": "raw*/*.lh5"}
     config["detectors"]["B02"]["periods"] = ["p03"]
-    config["library"] = {
-        "grid_mm": 2,
-        "make": ["--angles=0"],
-        "translate": ["--low-rank=16"],
-    }
+    config["library"] = {"grid_mm": 2, "make": ["--angles=0"], "translate": ["--low-rank=16"]}
     config["events"] = {"hits": "stp/*.lh5", "translate": ["--length=2000"], "tau_us": 400}
     del config["train"]["set"]
     return config
@@ -350,17 +340,13 @@ QUICK = {"misspelt", "energies of one"}
 
 
 @pytest.mark.parametrize(
-    "defect",
-    [pytest.param(d, marks=[] if d in QUICK else [pytest.mark.slow]) for d in DEFECTS],
+    "defect", [pytest.param(d, marks=[] if d in QUICK else [pytest.mark.slow]) for d in DEFECTS]
 )
 def test_a_defect_of_the_configuration_is_one_line(place, defect):
     path, value, words = DEFECTS[defect]
     place.configure(changed(path, value))
-    done = place.run("--dry-run")
-    assert done.returncode == 1
-    (line,) = [line for line in done.stdout.splitlines() if line.startswith("configuration")]
+    (line,) = defects(place)
     assert words in line
-    assert "Traceback" not in done.stdout
 
 
 @pytest.mark.thorough
@@ -566,10 +552,7 @@ def configuration(metadata: Path) -> dict[str, Any]:
             for name in DETECTORS
         },
         "calibrate": {"free": "temperature", "events": 300},
-        "library": {
-            "grid_mm": 8,
-            "make": ["--angles=0,45"],
-        },
+        "library": {"grid_mm": 8, "make": ["--angles=0,45"]},
         "events": {"hits": "stp/*.lh5"},
         "validate": {"baselines": False},
     }
