@@ -18,7 +18,6 @@ from cpunet.pulses.preparation import Prepared, Rejection, prepare
 from cpunet.pulses.reading.arrays import MemorySource
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.sets import load_prepared
-from cpunet.recipes.schema import PreparationConfig
 from synthetic import PREPARATION as CONFIG
 
 DT_NS = 16.0
@@ -250,18 +249,9 @@ def test_real_traces(reference_data) -> None:  # type: ignore[no-untyped-def]
     assert (codes[good] == Rejection.ACCEPTED).mean() > 0.98
 
 
-SHORT = PreparationConfig(
-    samples_before=20,
-    samples_after=20,
-    align_fraction=0.999,
-    baseline_samples=10,
-    tail_samples=2,
-    tail_level=0.80,
-    decay_fit_samples=10,
-    max_padding_before=5,
-    max_padding_after=0,
-    saturation_run=4,
-)
+SIZES = {"samples_before": 20, "samples_after": 20, "baseline_samples": 10, "tail_samples": 2}
+SIZES |= {"decay_fit_samples": 10, "max_padding_before": 5}
+SHORT = CONFIG.model_copy(update=SIZES)
 
 
 def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> MemorySource:

@@ -23,30 +23,13 @@ Array = npt.NDArray[np.float64]
 SIGGEN = """
 # general
 verbosity_level 0   # quiet
-xtal_length 96.0    # z length
-xtal_radius 40.45
-top_bullet_radius 0
-pc_length 2
-pc_radius 2.3
-bulletize_PC 0
-wrap_around_radius 14
-ditch_depth 2
-ditch_thickness 3
-hole_length 69.9
-hole_radius 5
-hole_bullet_radius 5
-outer_taper_length 35
-inner_taper_length 0
-taper_angle 10
-Li_thickness 1.0
-xtal_grid 0.1
-impurity_z0 -1.80
-impurity_gradient 0.10
-xtal_HV 4000
-drift_name ./drift_vel.dat
-max_iterations 50000
-xtal_temp 90
-"""
+xtal_length 96.0  # z length; xtal_radius 40.45; top_bullet_radius 0; pc_length 2
+pc_radius 2.3; bulletize_PC 0; wrap_around_radius 14; ditch_depth 2
+ditch_thickness 3; hole_length 69.9; hole_radius 5; hole_bullet_radius 5
+outer_taper_length 35; inner_taper_length 0; taper_angle 10; Li_thickness 1.0
+xtal_grid 0.1; impurity_z0 -1.80; impurity_gradient 0.10; xtal_HV 4000
+drift_name ./drift_vel.dat; max_iterations 50000; xtal_temp 90
+""".replace("; ", "\n")
 DIODE: dict[str, Any] = {
     "name": "B99000A",
     "type": "bege",
@@ -300,24 +283,12 @@ def test_other_kinds_of_diodes_are_refused(tmp_path: Path) -> None:
 
 
 BORED = """
-xtal_length         80   # z length
-xtal_radius         35
-pc_length            2
-pc_radius            3
-wrap_around_radius  15
-ditch_depth          2
-ditch_thickness      3
-hole_length         50
-hole_radius          5
-hole_bullet_radius   2
-inner_taper_length  45
-taper_angle          5
-Li_thickness       1.0
-impurity_z0       -1.0
-impurity_gradient  0.02
-xtal_HV           3500
-xtal_temp           90
-"""
+xtal_length 80  # z length; xtal_radius 35; pc_length 2; pc_radius 3
+wrap_around_radius 15; ditch_depth 2; ditch_thickness 3; hole_length 50
+hole_radius 5; hole_bullet_radius 2; inner_taper_length 45; taper_angle 5
+Li_thickness 1.0; impurity_z0 -1.0; impurity_gradient 0.02; xtal_HV 3500
+xtal_temp 90
+""".replace("; ", "\n")
 
 
 def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
