@@ -27,8 +27,7 @@ from matplotlib.figure import Figure
 from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
-from cpunet.networks.kept_noise import NOISE_BINS
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile

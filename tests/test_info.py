@@ -17,7 +17,7 @@ from cpunet.pulses.description import trace_properties
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.training import run_words
+from cpunet.training import chain_description
 from synthetic import status_of, write_run
 
 RECIPE = load_recipe("fast")

@@ -27,7 +27,7 @@ from cpunet.legend.library_files import chosen_libraries, known_detector
 from cpunet.legend.make_library import make_library
 from cpunet.legend.templates import TemplateTranslator
 from cpunet.legend.translate_library import enclosed, translate_library
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume

@@ -17,7 +17,7 @@ from cpunet.legend.equivalent import ae_ratios, current_delay_ns, equivalent_ker
 from cpunet.legend.export import export_legend
 from cpunet.legend.lithium import LithiumLayer, arrived, delayed, lithium_table
 from cpunet.legend.make_library import make_library
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import write_chain
 

@@ -13,7 +13,7 @@ from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
 from cpunet.electronics.in_trace_pile_up import InTracePileUp
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
-from cpunet.networks.kept_noise import NOISE_BINS
+from cpunet.networks.generators import NOISE_BINS
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare

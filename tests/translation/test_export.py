@@ -16,8 +16,7 @@ from dspeed.errors import ProcessingChainError
 from lgdo import Array, Table
 
 from cpunet.errors import CpunetError
-from cpunet.networks.linear_inverse import LinearInverse, Sizes
-from cpunet.networks.response_generator import ResponseGenerator
+from cpunet.networks.generators import LinearInverse, ResponseGenerator, Sizes
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe

@@ -21,7 +21,6 @@ from torch import nn
 
 from cpunet.electronics.drawn_tails import SIZES_KEV
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.processes import outcomes
 from cpunet.progress import Stage
