@@ -206,7 +206,7 @@ def test_a_dry_run_of_libraries_and_events(place):
     assert "--adc --length=2000 --out-table V01/raw --seed 1 --device cpu" in told
     assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in told
     assert "library make --detector=icpc --grid-mm 2 --angles=0 --out" in told
-    assert "'all results/V01/library/ideal.lh5' --low-rank=16 --device cpu --out" in told
+    assert "'all results/V01/library/ideal.lh5' --low-rank=16 --out" in told
 
 
 @pytest.mark.thorough

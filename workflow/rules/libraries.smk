@@ -73,10 +73,9 @@ rule current_library:
         runtime=120,
     params:
         words=words_of("library", "translate"),
-        device=config["device"],
     shell:
         "cpunet library translate {input.run:q} {input.library:q} {params.words}"
-        " --device {params.device} --out {output:q} --force > {log:q} 2>&1"
+        " --out {output:q} --force > {log:q} 2>&1"
 
 
 # for whoever wants these alone

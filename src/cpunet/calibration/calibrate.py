@@ -44,7 +44,7 @@ from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
-from cpunet.outputs import folder_written_aside, refuse_existing
+from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.progress import stage
 from cpunet.pulses.channels import ALL, CHANNEL, Outcome, Pair, each_channel, paired
 from cpunet.pulses.loading import load_pulses
@@ -144,21 +144,22 @@ def calibrate(
     if out is None and not plan:
         raise CpunetError("give `out`, the run folder to make, or `plan`")
     sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    target = None if out is None else Path(out)
+    if target is not None and not isinstance(recipe, Recipe):
+        refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
     freedom = Freedom.of(free, fix, prior)
     seed = require_seed(seed)
     job = partial(_Job, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed)
-    inputs = [] if isinstance(recipe, Recipe) else [recipe]
-    target = None if out is None else Path(out)
     if sides[1].table != ALL:
-        return _calibrated(job, plan, force, inputs, "", sides, target)
+        return _calibrated(job, plan, force, "", sides, target)
     if target is None or CHANNEL not in str(sides[0].path):
         raise CpunetError(
             f"`data_table` {ALL}: each channel is a detector with physics of its own",
             f"give `out`, and the simulation of each as `sim` sims/{CHANNEL}.lh5",
         )
-    act = partial(_calibrated, job, plan, force, inputs)
+    act = partial(_calibrated, job, plan, force)
     return each_channel(paired(*sides), target, act)
 
 
@@ -166,14 +167,13 @@ def _calibrated(
     make: Callable[[PulseFile, PulseFile], _Job],
     plan: bool,
     force: bool,
-    inputs: Sequence[Path | str],
     _name: str,
     pair: Pair,
     out: Path | None,
 ) -> Calibration | Plan:
     """Calibrate one channel, or plan to."""
     if out is not None:
-        refuse_existing(out, *pair[0].files, *pair[1].files, *inputs, force=force)
+        refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
     job = make(*pair)
     if plan:
         planned = job.plan()
