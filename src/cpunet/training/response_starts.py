@@ -211,12 +211,15 @@ def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
     free = config.model_copy(
         update={"free_decays": True, "fast_decays_us": FAST_DECAYS_US[:1], "slow_ns": slow}
     )
-    decay = fitter.decay
-    starts = [
-        _free_decay_start(problem, free, us, share, decay)
-        for us, share in _decays(problem, decay)
-    ]
-    return fitter.fit(min(starts, key=lambda start: start.cost), coarse=False)
+    decay, found = fitter.decay, []
+    for with_slow in (False, True):  # either may end in another valley
+        starts = [
+            _free_decay_start(problem, free, us, share, decay, with_slow)
+            for us, share in _decays(problem, decay)
+        ]
+        best = min(starts, key=lambda start: start.cost)
+        found.append(fitter.fit(best, coarse=not with_slow))
+    return min(found, key=lambda fit: fit.cost)
 
 
 def _free_decay_start(
@@ -225,18 +228,21 @@ def _free_decay_start(
     fast_us: float,
     share: float,
     decay: KnownDecay | None,
+    with_slow: bool,
 ) -> ResponseProblem:
     """The comparison for a fast and a main decay that together match the data's tails.
 
-    Bandwidth and slow parts found without the fast decay are about right if the tails are.
+    The bandwidth found without the fast decay, and perhaps the slow parts, are about right if
+    the tails are.
     """
     dt_ns, slope = float(problem.response.dt_ns), problem.slope
     if decay is None:
         slope += 1e-3 * dt_ns * share * _fast_slope(problem, fast_us)
     response = start_response(config, dt_ns, 1.0, slope, decay)
     response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
-    kept = [tau in config.slow_ns for tau in problem.response.config.slow_ns]
-    response.slow_weights.data.copy_(problem.response.slow_weights.data[kept])
+    if with_slow:
+        kept = [tau in config.slow_ns for tau in problem.response.config.slow_ns]
+        response.slow_weights.data.copy_(problem.response.slow_weights.data[kept])
     if response.drift is not None and problem.response.drift is not None:
         response.drift.load_state_dict(problem.response.drift.state_dict())
     response.log_fast_decays_us.data.fill_(math.log(fast_us))
