@@ -74,7 +74,7 @@ def _robust_std(values: Values) -> float:
 
 
 @styled
-def remains_figure(raw: Pulses, tails: PileUpTails) -> Figure:
+def tails_figure(raw: Pulses, tails: PileUpTails) -> Figure:
     """Distribution of the tails with the law, slopes before and after, and some traces.
 
     Parameters
@@ -163,7 +163,7 @@ def main() -> None:
     after, noise = Slopes.of(raw, tails).spreads
     console.print(f"slopes without tails {after:.2f} keV, of empty baselines {noise:.2f} keV")
     if arguments.picture:
-        remains_figure(raw, tails).savefig(arguments.picture, dpi=110)
+        tails_figure(raw, tails).savefig(arguments.picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from cpunet.errors import CpunetError
 from cpunet.recipes import load_recipe
 from cpunet.training.pulse_sets import (
     HEAVIEST,
-    LEAST,
+    MIN_PULSES,
     WIDEST,
     _continuum,
     energy_bands,
@@ -51,7 +51,7 @@ def test_spectra_are_made_alike_within_a_band() -> None:
 @given(
     low=st.floats(100, 1500),
     ratio=st.floats(1.01, 4),
-    n=st.integers(LEAST, 4000),
+    n=st.integers(MIN_PULSES, 4000),
     share=st.floats(0.3, 3),
     seed=st.integers(0, 99),
 )
@@ -59,11 +59,13 @@ def test_no_pulse_is_in_two_bands_and_none_is_far_from_its_own(
     low: float, ratio: float, n: int, share: float, seed: int
 ) -> None:
     sim = continuum(n, low, low * ratio, 1, seed)
-    data = continuum(max(LEAST, int(share * n)), low, low * ratio, 1.5, seed + 1)
+    data = continuum(max(MIN_PULSES, int(share * n)), low, low * ratio, 1.5, seed + 1)
     try:
         bands = energy_bands(sim, data, {})
     except CpunetError:
-        assert min(len(sim), len(data)) < 1.5 * LEAST  # the highest ones have no counterpart
+        assert (
+            min(len(sim), len(data)) < 1.5 * MIN_PULSES
+        )  # the highest ones have no counterpart
         return
     # wide bands only where there is no narrower one at all
     both = np.arange(len(sim)), np.arange(len(data))
@@ -72,10 +74,10 @@ def test_no_pulse_is_in_two_bands_and_none_is_far_from_its_own(
         together = np.concatenate(rows)
         assert len(np.unique(together)) == len(together)
         for of_band in rows:
-            assert len(of_band) >= LEAST
+            assert len(of_band) >= MIN_PULSES
             # but for a rest of the lowest energies, that goes along
             narrow = side[of_band] >= side[of_band].max() / (widest + 0.01)
-            assert narrow.sum() >= len(of_band) - 2 * LEAST
+            assert narrow.sum() >= len(of_band) - 2 * MIN_PULSES
     for band in bands:
         assert band.weights.shape == band.sim.shape
         assert band.weights.min() >= 0

@@ -119,7 +119,7 @@ def test_gradients_of_a_view_are_finite_differences(held, moved):
     def views() -> Values:
         early = numbers["shift"]
         translated = numbers["gain"] * ((1 - early) * made + early * following)
-        seen = outside.dress_windows(translated, torch.arange(16))
+        seen = outside.noisy_windows(translated, torch.arange(16))
         time, _ = crossing(seen[:, 0], 0.5, torch.full((16,), CONFIG.samples_before))
         tail = seen[..., -CONFIG.decay_fit_samples :].mean()
         return {
@@ -180,14 +180,14 @@ def test_gradients_of_the_losses_are_finite_differences(held):
 
 def test_without_noise_a_window_is_left_as_it_is():
     made = windows()
-    found = outside_of(rms_kev=0.0).dress_windows(made, torch.arange(4))
+    found = outside_of(rms_kev=0.0).noisy_windows(made, torch.arange(4))
     torch.testing.assert_close(found, made, atol=2e-6, rtol=0)
 
 
 def test_noise_goes_as_one_over_the_energy_of_the_pulse_that_it_is_added_to():
     made = windows().expand(4, 1, 800).repeat(64, 1, 1)
     rows = torch.tensor([3, 1, 0, 2]).repeat(64)
-    noisy = outside_of().dress_windows(made, rows)[:, 0, : CONFIG.baseline_samples]
+    noisy = outside_of().noisy_windows(made, rows)[:, 0, : CONFIG.baseline_samples]
     rms = noisy.reshape(64, 4, -1).square().mean(dim=(0, 2)).sqrt().numpy()
     np.testing.assert_allclose(rms, RMS_KEV / KEV[[3, 1, 0, 2]], rtol=0.05)
 
@@ -196,7 +196,7 @@ def test_the_noise_is_that_of_the_seed():
     drawn = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        drawn.append(outside_of().dress_windows(windows(), torch.arange(4)))
+        drawn.append(outside_of().noisy_windows(windows(), torch.arange(4)))
     assert torch.equal(drawn[0], drawn[1])
     assert not torch.equal(drawn[0], drawn[2])
 

@@ -217,6 +217,14 @@ def test_responses_are_those_of_the_pulses_in_use_whatever_the_block(tmp_path, s
     np.testing.assert_array_equal(np.concatenate(blocks), response[used])
 
 
+@pytest.mark.parametrize("nothing", [np.nan, np.inf])
+def test_responses_none_of_which_is_finite_are_refused(tmp_path, nothing):
+    np.savez(tmp_path / "truth.npz", response=np.full((20, 2), nothing))
+    responses = Responses(tmp_path / "truth.npz", prepared(np.arange(20), 20))
+    with pytest.raises(CpunetError, match=r"truth.npz: no response is finite"):
+        list(responses.blocks(7))
+
+
 def test_responses_that_cannot_be_read(tmp_path):
     path = tmp_path / "truth.npz"
     np.savez(path, response=np.ones((20, 300)))

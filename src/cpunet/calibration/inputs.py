@@ -29,7 +29,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.simulation.superposition import solve
-from cpunet.training.pulse_sets import LEAST
+from cpunet.training.moments import MIN_PULSES
 
 log = logging.getLogger(__name__)
 
@@ -142,10 +142,10 @@ def read_sides(
     for note in require_both_sides(simulated, data, selection):
         log.warning(note)
     fewest = min(len(simulated.prepared), len(data.prepared))
-    if fewest < LEAST:
+    if fewest < MIN_PULSES:
         raise CpunetError(
             f"{fewest} pulses of {peak} on a side tell nothing of the physics, nor of the "
-            f"readout, which takes {LEAST}",
+            f"readout, which takes {MIN_PULSES}",
             "give more files, or more energies as `peak`; all stays known as it was",
         )
     # in random order, so that any first part is a representative sample

@@ -341,7 +341,7 @@ class Search:
 
 
 def _half(band: Band, k: int) -> Band:
-    """Every piled-up pulse of both sides, beginning with the first or the second."""
+    """Every other pulse of both sides, beginning with the first or the second."""
     some = slice(k, None, 2)
     moments = replace(band.moments, data=band.moments.data[some])
     return replace(band, sim=replace(band.sim.of(some), moments=moments), rows=band.rows[some])

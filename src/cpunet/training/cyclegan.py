@@ -216,7 +216,7 @@ class Step:
         ignored = None
         if self.outside is not None and rows is not None:
             # generators make no noise: discriminators see it, and cycles of data lack it
-            fake_data = self.outside.dress_windows(fake_data, rows)
+            fake_data = self.outside.noisy_windows(fake_data, rows)
             ignored = tolerance(data, self.outside.preparation)
         judged_data = self.model.discriminator_data(self._noisy(fake_data))  # (batch,)
         judged_sim = self.model.discriminator_sim(self._noisy(fake_sim))

@@ -135,7 +135,7 @@ def match(
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    tails, drawn, told_of_tails = find_tails(data, recipe.preparation)
+    tails, drawn, tails_info = find_tails(data, recipe.preparation)
     noise, remark = measured_noise(data, recipe.preparation, tails)
     if isinstance(known, ElectronicsResponse):
         allowed = recipe.matching.training.drift_terms
@@ -154,7 +154,7 @@ def match(
     simulated, measured = sim.prepared.pulses, data.prepared.pulses
     response, fit = fitted(simulated, measured, noise, recipe, **given)
     told = _described(fit, response, noise, len(sim.prepared), len(data.prepared))
-    told["tails"] = told_of_tails
+    told["tails"] = tails_info
     recipe = recipe.model_copy(update={"generator": response.config})
     chain = ResponseGenerator(response.config, sim.dt_ns)
     chain.response = response

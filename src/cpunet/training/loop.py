@@ -35,7 +35,7 @@ Listener = Callable[[list[Record]], None]
 State = dict[str, Any]
 
 LAST = 0.25  # last fraction of the updates, over which accuracies are averaged
-MIN_PULSES = 20  # minimum number of updates
+MIN_UPDATES = 20  # minimum number of updates
 WON, LOST = 0.95, 0.52  # accuracy of a discriminator from which a generator learns nothing
 
 
@@ -197,7 +197,7 @@ def judges_noted(records: Sequence[Record]) -> list[str]:
     """One line for each discriminator that has won or lost in the last part of a training."""
     told = [a for record in records if isinstance(a := record.get("accuracy"), dict)]
     last = told[-max(1, round(LAST * len(told))) :]
-    if len(last) < MIN_PULSES:
+    if len(last) < MIN_UPDATES:
         return []
     lines = []
     for side in last[0]:

@@ -44,7 +44,7 @@ class Outside:
     energy_kev: npt.NDArray[np.float64]
     preparation: PreparationConfig
 
-    def dress(self, records: Tensor, rows: Tensor) -> Tensor:
+    def add_noise(self, records: Tensor, rows: Tensor) -> Tensor:
         """Add noise to records of prepared height, and prepare them, shape (batch, 1, samples).
 
         Parameters
@@ -61,9 +61,9 @@ class Outside:
         noisy = records + torch.from_numpy(drawn).to(records)
         return as_measured(noisy, self.preparation, self.noise.dt_ns)
 
-    def dress_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
-        """The same for windows as a network makes them, shape (batch, 1, samples)."""
-        return self.dress(in_room(windows[:, 0], self.preparation), rows)
+    def noisy_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
+        """Windows as a network makes them, (batch, 1, samples), with noise like the data."""
+        return self.add_noise(in_room(windows[:, 0], self.preparation), rows)
 
 
 def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:

@@ -21,18 +21,23 @@ from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
-from cpunet.training.moments import Moments, Rows, TooFewPulsesError, Values
+from cpunet.training.moments import MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
 from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, SimulatedSide
 
 # Ratio of the limits of a band; the next is used only if no band of the one before is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
-LEAST = 200  # minimum number of pulses of each side in a band
 # Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
 SLICES, IN_SLICE = 32, 50
 # The continuum begins where noise is small, and ends well before a line and its sidebands.
 CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
 HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
+MIN_OF_BAND = 400  # minimum number of pulses of a band if only some of a set are taken
+SINGLE = "single sites of the continuum"  # name of their band
+# Draws of the noise of single sites, of which there are few, for each of other pulses.
+MORE_DRAWS = 4
+
+Continuum = Callable[[], tuple[Pulses, Pulses]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +94,7 @@ def energy_bands(
     bands = []
     for name in peaks:
         sim, data = (np.flatnonzero(of == name) for of in labels)
-        if min(len(sim), len(data)) >= LEAST:
+        if min(len(sim), len(data)) >= MIN_PULSES:
             bands.append(EnergyBand(name, sim, data, np.ones(len(sim))))
     inside = {band.name for band in bands}
     sim, data = (np.flatnonzero(~np.isin(of, [*inside])) for of in labels)
@@ -99,9 +104,9 @@ def energy_bands(
             break
     else:
         raise CpunetError(
-            f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {LEAST} of each at "
-            "the same energies are needed: select more energies (`peak`), simulate more, or "
-            "give more files"
+            f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {MIN_PULSES} of "
+            "each at the same energies are needed: select more energies (`peak`), simulate "
+            "more, or give more files"
         )
     return bands
 
@@ -119,10 +124,10 @@ def _continuum(
             int((e[r] >= top / widest).sum()) for r, e in zip(rows, energies, strict=True)
         ]
         left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
-        if min(counts) >= LEAST and min(left) < LEAST and max(left) < 2 * LEAST:
+        if min(counts) >= MIN_PULSES and min(left) < MIN_PULSES and max(left) < 2 * MIN_PULSES:
             counts = [len(r) for r in rows]  # include a small remainder
         parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
-        if min(counts) >= LEAST:
+        if min(counts) >= MIN_PULSES:
             low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
             weights = spectrum_weights(sim_kev[parts[0]], data_kev[parts[1]])
             if weights.any():
@@ -164,14 +169,6 @@ def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
     ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
     weights = np.minimum(ratio, HEAVIEST)[of_sim]
     return np.asarray(weights / max(weights.mean(), 1e-9))
-
-
-# Minimum number of pulses of a band if only some of a set are taken.
-MIN_OF_BAND = 400
-Continuum = Callable[[], tuple[Pulses, Pulses]]
-SINGLE = "single sites of the continuum"  # name of their band
-# Draws of the noise of single sites, of which there are few, for each of other pulses.
-MORE_DRAWS = 4
 
 
 class PulseSets:

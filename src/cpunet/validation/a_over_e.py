@@ -30,7 +30,7 @@ Range = tuple[float, float]
 ByPeak = Mapping[str, Mapping[str, Values]]
 
 ACCEPTANCE = 0.9  # fraction of the DEP that survives
-MIN_PULSES = 20  # events of the DEP: two below the cut
+MIN_EVENTS = 20  # events of the DEP: two below the cut
 DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
 
@@ -110,7 +110,7 @@ def ae_survival(
     (10.0, 90.91)
     """
     dep = dep_ae[np.isfinite(dep_ae)]
-    if dep.size < MIN_PULSES:
+    if dep.size < MIN_EVENTS:
         return Survival(np.nan, np.nan, dict.fromkeys(others, PeakSurvival(np.nan, np.nan)))
     rng = np.random.default_rng(seed)
     # for this quantile the acceptance of new events is exact on average for any sample size

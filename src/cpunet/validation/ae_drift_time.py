@@ -20,7 +20,7 @@ from cpunet.pulses.parameters import PARAMETERS
 Values = npt.NDArray[np.float64]
 
 QUANTILES = {"q16": 0.16, "median": 0.5, "q84": 0.84}
-MIN_PULSES = 10  # minimum events of a bin for errors of its quantiles
+MIN_EVENTS = 10  # minimum events of a bin for errors of its quantiles
 TIME_BINS = 8
 LINEAR = 1.0  # percent, up to which the scale of the ratios is linear if some are large
 FAR = 5  # times LINEAR: larger ratios count as large
@@ -117,8 +117,8 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
 
 def _bin(ae: Values, time: Values) -> dict[str, Any]:
     n = len(ae)
-    if n < MIN_PULSES:
-        return {"n": n, "missing": f"{n} events (at least {MIN_PULSES} are needed)"}
+    if n < MIN_EVENTS:
+        return {"n": n, "missing": f"{n} events (at least {MIN_EVENTS} are needed)"}
     row: dict[str, Any] = {"n": n, "time_ns": float(np.median(time))}
     for name, p in QUANTILES.items():
         # scatter of the rank of a quantile, which is independent of the distribution

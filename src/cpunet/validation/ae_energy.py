@@ -25,7 +25,7 @@ Range = tuple[float, float]
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
-MIN_PULSES = 60  # minimum number of events in a fit
+MIN_EVENTS = 60  # minimum number of events in a fit
 BELOW, ABOVE = 6.0, 4.0  # range of the fit in widths of the peak
 REFERENCE_KEV = 1592.5  # where A/E is 1: the double-escape peak
 
@@ -133,7 +133,7 @@ def site_fit(
     centre, width = about
     x = (values - centre) / width
     x = x[(x > -BELOW) & (x < ABOVE)]
-    if len(x) < MIN_PULSES:
+    if len(x) < MIN_EVENTS:
         return None
     start = np.array([0.0, 0.0, -0.5, 1.0])
     found = scipy.optimize.minimize(_nll, start, args=(x,), method="BFGS")
@@ -257,7 +257,7 @@ def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, An
 
 def _seen(values: Values) -> tuple[float, float] | None:
     """Position of the highest peak, and its width from its upper side."""
-    if len(values) < MIN_PULSES:
+    if len(values) < MIN_EVENTS:
         return None
     # the middle of the shortest interval with a fifth of the sorted values
     n = max(20, len(values) // 5)

@@ -25,7 +25,7 @@ from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
 
-MIN_PULSES = 10  # baselines for a spectrum with an error
+MIN_BASELINES = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2
 # A pulse rises slowly before it crosses 1 %, its nominal start; margin in samples before that.
 MARGIN = 60
@@ -83,8 +83,8 @@ def baseline_spectra(
     found: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
     for method, pulses in windows.items():
         power = _band_powers(pulses[free[method] >= samples, :samples], edges)
-        if len(power) < MIN_PULSES:
-            found[method] = {"missing": f"{len(power)} baselines; {MIN_PULSES} are needed"}
+        if len(power) < MIN_BASELINES:
+            found[method] = {"missing": f"{len(power)} baselines; {MIN_BASELINES} are needed"}
             continue
         found[method] = {"samples": samples} | _summary(power)
     data = found["data"]

@@ -51,22 +51,31 @@ class Responses:
                 f"{path}: response has shape {values.shape}, but {sim.path} holds "
                 f"{sim.prepared.n_read} pulses; give the truth of that file"
             )
-        self._values = values
+        self._path, self._values = path, values
 
     def blocks(self, size: int = FINISHED) -> Iterator[FloatArray]:
-        """Float32 traces of the pulses in use, in order, `size` at a time."""
-        traces = self._values
+        """Float32 traces of the pulses in use, in order, `size` at a time.
+
+        Raises
+        ------
+        CpunetError
+            At the end, if none of them is finite.
+        """
+        traces, finite = self._values, False
         waiting = np.empty((0, traces.shape[1]), np.float32)
         for first in range(0, len(traces), size):
             rows = traces[first : first + size]
             begin, end = np.searchsorted(self._index, [first, first + len(rows)])
             chosen = rows[self._index[begin:end] - first].astype(np.float32)
+            finite = finite or bool(np.isfinite(chosen).all(axis=1).any())
             waiting = np.concatenate([waiting, chosen])
             if len(waiting) >= size:
                 yield waiting[:size]
                 waiting = waiting[size:]
         if len(waiting):
             yield waiting
+        if len(self._index) and not finite:
+            raise CpunetError(f"{self._path}: no response is finite; give noise-free traces")
 
 
 class PairedScores(TypedDict):
