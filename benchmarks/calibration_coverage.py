@@ -32,9 +32,9 @@ from cpunet.plotting import styled
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
+from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.stored_simulation import StoredSimulation
 from cpunet.training.pulse_sets import PulseSets
 
 # All that may become free, in groups that are fitted together.

@@ -17,8 +17,8 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from cpunet.simulation.cloud import FWHM_PER_SIGMA, cloud_after_step, repulsion_constant
 from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.drift import FWHM_PER_SIGMA, cloud_after_step, repulsion_constant
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.velocity import HOLE, drift_velocity, velocity_table
 

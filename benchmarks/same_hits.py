@@ -17,8 +17,7 @@ from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_sources import EnergyWindow, GammaSource
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.shifted import Shift
+from cpunet.simulation.settings import Shift, SimulationSettings
 
 EVENTS = 500
 SHIFTS = (

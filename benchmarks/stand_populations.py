@@ -20,7 +20,7 @@ from cpunet.electronics.stand_sides import Side, stand_sides
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_sources import EnergyWindow
-from cpunet.simulation.shifted import Shift
+from cpunet.simulation.settings import Shift
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")

@@ -15,8 +15,7 @@ from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.shifted import Shift
+from cpunet.simulation.settings import Shift, SimulationSettings
 
 KINDS = (Electronics, Recipe, Detector, SimulationSettings, Shift)
 TEXTS = {

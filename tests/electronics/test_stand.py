@@ -21,14 +21,12 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
-from cpunet.simulation.again import SameHits
+from cpunet.simulation.again import SameHits, StoredSimulation
 from cpunet.simulation.field_lookup import Maps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.shifted import Shift
-from cpunet.simulation.stored_simulation import StoredSimulation
+from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.train import train
 from synthetic import prepared_truth

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.field_cache import cache_file
 from cpunet.simulation.fields import (
     FieldMaps,
     compute_fields,
@@ -17,7 +16,7 @@ from cpunet.simulation.fields import (
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
-from cpunet.simulation.superposition import NOT_IN_PARTS, solve
+from cpunet.simulation.superposition import NOT_IN_PARTS, cache_file, solve
 
 COARSE = ["grid_mm=0.5"]
 
@@ -141,9 +140,8 @@ def test_any_bias_and_impurity_from_one_solution(
     detector = read_detector("ppc", [*COARSE, *more])
     solution = solve(detector)
     for bias, scale in ((2500.0, 1.0), (3100.0, 1.2), (2200.0, 0.6)):
-        fields = superposed_fields(
-            solution, bias_V=bias, impurity_scale=scale, temperature_K=80
-        )
+        wanted = {"bias_V": bias, "impurity_scale": scale, "temperature_K": 80}
+        fields = superposed_fields(solution, detector.model_copy(update=wanted))
         # solved for on its own, the impurities written down as they are
         changed = {"impurity_z0_1e10_per_cm3": -0.8, "impurity_gradient_1e10_per_cm4": 0.08}
         changed = {key: scale * value for key, value in changed.items()} | {"bias_V": bias}
@@ -177,14 +175,16 @@ def test_the_scale_decides_whether_a_bias_depletes(caplog: pytest.LogCaptureFixt
 
 
 def test_undepleted_parts_are_not_superposed() -> None:
-    solution = solve(read_detector("ppc", COARSE))
+    detector = read_detector("ppc", COARSE)
+    solution = solve(detector)
     depletion = solution.depletion_V(1.3)
     for volts in (depletion + 1, depletion - 1):
         if volts > depletion:
             assert solution.potential_V(volts, 1.3).max() == pytest.approx(volts)
             continue
+        wanted = detector.model_copy(update={"bias_V": volts, "impurity_scale": 1.3})
         with pytest.raises(CpunetError, match="does not deplete it; give at least the dep"):
-            superposed_fields(solution, bias_V=volts, impurity_scale=1.3, temperature_K=90)
+            superposed_fields(solution, wanted)
 
 
 @pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
@@ -225,9 +225,9 @@ def test_any_tilt_of_the_impurities_from_the_same_solution(more: list[str]) -> N
     detector = read_detector("ppc", [*COARSE, *more])
     solution = solve(detector)
     scale, tilt = 1.1, 0.03
-    tilted = superposed_fields(
-        solution, bias_V=3000, impurity_scale=scale, impurity_tilt=tilt, temperature_K=80
-    )
+    keyed = {"impurity_scale": scale, "impurity_tilt_1e10_per_cm4": tilt, "bias_V": 3000.0}
+    wanted = detector.model_copy(update=keyed)
+    tilted = superposed_fields(solution, wanted)
     # solved for on its own, the impurities written down as they are
     middle_cm = detector.crystal_length / 20
     z0 = scale * detector.impurity_z0_1e10_per_cm3 - tilt * middle_cm
@@ -235,11 +235,11 @@ def test_any_tilt_of_the_impurities_from_the_same_solution(more: list[str]) -> N
     written = {"impurity_z0_1e10_per_cm3": z0, "impurity_gradient_1e10_per_cm4": gradient}
     alone = detector.model_copy(update=written | {"bias_V": 3000.0})
     expected = compute_fields(alone, cache=False)
-    keyed = {"impurity_scale": scale, "impurity_tilt_1e10_per_cm4": tilt, "bias_V": 3000.0}
-    read = compute_fields(detector.model_copy(update=keyed))
+    read = compute_fields(wanted)
     for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm"):
         np.testing.assert_allclose(getattr(tilted, name), getattr(expected, name), atol=1e-6)
         np.testing.assert_array_equal(getattr(tilted, name), getattr(read, name))
     assert tilted.depletion_V == pytest.approx(expected.depletion_V, abs=1)
-    plain = superposed_fields(solution, bias_V=3000, impurity_scale=scale, temperature_K=80)
+    flat = wanted.model_copy(update={"impurity_tilt_1e10_per_cm4": 0.0})
+    plain = superposed_fields(solution, flat)
     assert np.abs(plain.potential_V - tilted.potential_V).max() > 10

@@ -10,8 +10,8 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.gammas.electrons import compton_energy
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
-from cpunet.simulation.gammas.processes import compton_energy
 from cpunet.simulation.gammas.sample import (
     TL208_KEV,
     GammaStatistics,

@@ -14,8 +14,7 @@ from pydantic import ValidationError
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.shifted import Shift
+from cpunet.simulation.settings import Shift, SimulationSettings
 
 ICPC = read_detector("icpc")
 heights = st.floats(-5, 100)

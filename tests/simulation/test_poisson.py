@@ -8,17 +8,17 @@ import pytest
 from scipy.constants import elementary_charge, epsilon_0
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.depletion import depletion_voltage
 from cpunet.simulation.fields import electric_field
 from cpunet.simulation.geometry import GERMANIUM, Detector, RegionArray
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.grid import make_grid
 from cpunet.simulation.poisson import (
     EPSILON_GERMANIUM,
     VOLT_PER_MM2,
+    make_grid,
     solve_potentials,
     surface_charges,
 )
+from cpunet.simulation.superposition import depletion_voltage
 
 # no multiples of the grid, so that contacts lie between nodes
 INNER, OUTER = 2.04, 8.53

@@ -27,7 +27,7 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
-from cpunet.simulation.stored_simulation import StoredSimulation
+from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.superposition import solve
 from cpunet.training.moments import MIN_PULSES
 

@@ -30,8 +30,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
 from cpunet.simulation.hit_sources import wanted_events
 from cpunet.simulation.library_lookup import Library
-from cpunet.simulation.settings import SimulationSettings, split_overrides
-from cpunet.simulation.shifted import Shift
+from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
 from cpunet.tables import counted
 
 MARKER = "stand.json"

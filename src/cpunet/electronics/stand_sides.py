@@ -22,8 +22,7 @@ from cpunet.simulation.hit_sources import EnergyWindow, GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import Library
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.shifted import Shift
+from cpunet.simulation.settings import Shift, SimulationSettings
 
 Labels = npt.NDArray[np.int64]
 

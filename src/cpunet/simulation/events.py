@@ -11,7 +11,7 @@ from numba import prange
 
 from cpunet.kernels import kernel
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
+from cpunet.simulation.drift import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library

@@ -10,7 +10,7 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry import DITCH, LI_CONTACT, Detector, FloatArray, RegionArray
-from cpunet.simulation.grid import CONTACT_EDGE, DITCH_EDGE, Grid, point_types
+from cpunet.simulation.poisson import CONTACT_EDGE, DITCH_EDGE, Grid, point_types
 from cpunet.simulation.superposition import Superposition, solve
 
 log = logging.getLogger(__name__)
@@ -57,33 +57,20 @@ def compute_fields(detector: Detector, *, cache: bool = True) -> FieldMaps:
     CpunetError
         If the detector is not fully depleted, or the grid is too fine.
     """
-    solution = solve(detector, cache=cache)
-    return superposed_fields(
-        solution,
-        bias_V=detector.bias_V,
-        impurity_scale=detector.impurity_scale,
-        impurity_tilt=detector.impurity_tilt_1e10_per_cm4,
-        temperature_K=detector.temperature_K,
-    )
+    return superposed_fields(solve(detector, cache=cache), detector)
 
 
 def superposed_fields(
-    solution: Superposition,
-    *,
-    bias_V: float,
-    impurity_scale: float = 1.0,
-    impurity_tilt: float = 0.0,
-    temperature_K: float,
-    depletion: bool = True,
+    solution: Superposition, detector: Detector, *, depletion: bool = True
 ) -> FieldMaps:
-    """Fields at a bias, with scaled and tilted impurities, from an existing solution.
+    """Fields of a detector from a solution for any bias, scale and tilt of its impurities.
 
     Parameters
     ----------
     solution
         Solution of the detector.
-    bias_V, impurity_scale, impurity_tilt, temperature_K
-        As in `Detector`. The tilt is in 1e10/cm4.
+    detector
+        Detector with the bias, the temperature and the impurities wanted.
     depletion
         Whether to determine ``depletion_V``; NaN otherwise. With tilted impurities or a
         surface charge this takes longer than everything else.
@@ -93,9 +80,12 @@ def superposed_fields(
     CpunetError
         If the detector is not fully depleted.
     """
-    grid, detector = solution.grid, solution.detector
-    potential = solution.potential_V(bias_V, impurity_scale, impurity_tilt)
-    e_r, e_z = electric_field(potential, grid, mirror=not _charged_face(detector))
+    grid, parts = solution.grid, solution.potentials
+    impurities = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
+    potential = solution.potential_V(detector.bias_V, *impurities)
+    # without a charge or a plane there, the field has no component normal to the face z = 0
+    mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
+    e_r, e_z = electric_field(potential, grid, mirror=mirror)
     return FieldMaps(
         r_mm=grid.r_mm,
         z_mm=grid.z_mm,
@@ -103,13 +93,11 @@ def superposed_fields(
         potential_V=potential,
         e_r_V_per_cm=e_r,
         e_z_V_per_cm=e_z,
-        weighting_potential=solution.potentials.point_contact,
+        weighting_potential=parts.point_contact,
         point_type=point_types(grid),
-        temperature_K=temperature_K,
-        capacitance_pF=solution.potentials.capacitance_pF,
-        depletion_V=solution.depletion_V(impurity_scale, impurity_tilt)
-        if depletion
-        else np.nan,
+        temperature_K=detector.temperature_K,
+        capacitance_pF=parts.capacitance_pF,
+        depletion_V=solution.depletion_V(*impurities) if depletion else np.nan,
     )
 
 
@@ -137,11 +125,6 @@ def scaled_to_depletion(detector: Detector) -> Detector:
         f"{measured:g} V"
     )
     return detector.model_copy(update={"impurity_scale": scale})
-
-
-def _charged_face(detector: Detector) -> bool:
-    """Whether the field on z = 0 has a component normal to the face."""
-    return bool(detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
 
 
 def electric_field(

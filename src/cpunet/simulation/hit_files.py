@@ -6,25 +6,26 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import opened
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.hit_steps import (
     Steps,
+    choose,
     require_physics,
     require_some,
     to_hits,
-    unit_factor,
     whole_numbers,
 )
 from cpunet.simulation.hit_tables import (
     NTUPLES,
     STEPS,
+    Table,
     csv_detectors,
     detectors_of,
     holds_tables,
@@ -93,7 +94,7 @@ def hit_parts(
         Returns an iterator over the parts, from the first one, each time it is called.
     """
     file = Path(path)
-    table = table_of(file, options.hits_detector) if _has_tables(file) else None
+    table = table_of(file, options.hits_detector) if _kind(file) == "tables" else None
     divided = parts_of(file, table) if table else None
     if table is None or divided is None or len(divided[0]) < 2:
         whole = read_hits(file, options)
@@ -118,74 +119,53 @@ def holds_hits(path: Path | str) -> bool:
     Files of simulated pulses that also contain their hits count as files of pulses.
     """
     file = Path(path)
-    start = _start(file)
-    if start.startswith(_HDF5_MAGIC):
-        with opened(file) as content:
-            return holds_tables(content)
-    if start.startswith(_ZIP_MAGIC):
-        with suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
-            return {"x_mm.npy", "offsets.npy"} <= set(archive.namelist())
-        return False  # the reader of pulses reports the error
-    return start == _CSV_MAGIC
+    with suppress(CpunetError, zipfile.BadZipFile):  # the reader of pulses reports the error
+        kind = _kind(file)
+        if kind == "npz":
+            with zipfile.ZipFile(file) as archive:
+                return {"x_mm.npy", "offsets.npy"} <= set(archive.namelist())
+        return kind in ("tables", "csv")
+    return False
 
 
 def hit_detectors(path: Path | str) -> list[str]:
     """Names of the detectors of a file; empty if it names none."""
     file = Path(path)
-    if _start(file) == _CSV_MAGIC:
+    if (kind := _kind(file)) == "csv":
         return csv_detectors(file)
-    return list(detectors_of(file)) if _has_tables(file) else []
+    return list(detectors_of(file)) if kind == "tables" else []
 
 
-def _start(path: Path) -> bytes:
-    """First bytes of a file; none if it cannot be read, which its reader reports."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(len(_CSV_MAGIC))
-    except OSError:
-        return b""
-
-
-def _has_tables(path: Path) -> bool:
-    if not _start(path).startswith(_HDF5_MAGIC):
-        return False
-    with opened(path) as file:
-        return holds_tables(file)
-
-
-def _steps(path: Path, options: HitOptions) -> Steps:
-    detector = options.hits_detector
+def _kind(path: Path) -> Literal["tables", "stored", "csv", "npz", "other"]:
+    """Format of a file by its content; `stored` are hits beside their pulses."""
     try:
         with path.open("rb") as stream:
             start = stream.read(len(_CSV_MAGIC))
     except OSError as error:
         raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    if start.startswith(_CSV_MAGIC):
-        return read_csv(path, options)
     if start.startswith(_HDF5_MAGIC):
         with opened(path) as file:
-            has_tables, is_kept = holds_tables(file), HIT_TABLE in file
-        if has_tables:
-            return read_table(path, table_of(path, detector), options)
-        read = _read_hit_table
-        if not is_kept:
-            raise CpunetError(
-                f"{path}: HDF5 without hits; expected {STEPS} (remage), {HIT_TABLE} (cpunet "
-                f"simulate) or {NTUPLES} (Geant4, g4simple)"
+            return (
+                "tables" if holds_tables(file) else "stored" if HIT_TABLE in file else "other"
             )
-    elif start.startswith(_ZIP_MAGIC):
-        read = _npz
-    else:
+    if start.startswith(_ZIP_MAGIC):
+        return "npz"
+    return "csv" if start == _CSV_MAGIC else "other"
+
+
+def _steps(path: Path, options: HitOptions) -> Steps:
+    detector, kind = options.hits_detector, _kind(path)
+    if kind == "csv":
+        return read_csv(path, options)
+    if kind == "tables":
+        return read_table(path, table_of(path, detector), options)
+    choose(path, [], detector)
+    if kind == "other":
         raise CpunetError(
-            f"{path}: no known format of hits; expected remage LH5, g4simple HDF5, "
-            "Geant4 CSV or NPZ"
+            f"{path}: no known format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
+            f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
         )
-    if detector is not None:
-        raise CpunetError(
-            f"{path}: its hits name no detector to pick {detector} by; leave "
-            "`hits_detector` out"
-        )
-    return read(path)
+    return _npz(path) if kind == "npz" else _stored(path)
 
 
 def _npz(path: Path) -> Steps:
@@ -229,35 +209,14 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
     }
 
 
-def _read_hit_table(path: Path) -> Steps:
-    """Read the steps of the table, in the frame of the crystal in which they were written.
-
-    Raises
-    ------
-    CpunetError
-        If the table cannot be read, lacks a column or a unit, has columns of different
-        lengths, or has no hits for an event whose pulse is in the file.
-    """
-    values, named = {}, {}
+def _stored(path: Path) -> Steps:
+    """Steps beside their pulses, in the frame of the crystal in which they were written."""
+    steps = read_table(path, Table(HIT_TABLE, None), HitOptions())
     with opened(path) as file:
-        for name in ("event_number", *"xyz", "edep"):
-            column = file.get(f"{HIT_TABLE}/{name}")
-            if not is_column(column):
-                raise CpunetError(f"{path}: no numbers in {HIT_TABLE}/{name}; write it again")
-            values[name] = np.asarray(column[()])
-            named[name] = text_attribute(column, "units")
-        pulses = file.get(_EVENTS)
-        events = np.asarray(pulses[()]) if is_column(pulses) else np.empty(0, np.int64)
-    if len({column.shape for column in values.values()}) != 1:
-        raise CpunetError(f"{path}: columns of {HIT_TABLE} differ in length; is it truncated?")
-    number = whole_numbers(path, f"{HIT_TABLE}/event_number", values["event_number"])
-    without = ~np.isin(events, number)
+        events = np.asarray(file[_EVENTS][()]) if _EVENTS in file else np.empty(0, np.int64)
+    without = ~np.isin(events, steps.event)
     if without.any():
         raise CpunetError(
             f"{path}: {HIT_TABLE} has no hit of event {events[without][0]}; simulate it again"
         )
-    x, y, z, energy = (
-        values[name] * unit_factor(HitOptions(), name, path, f"{HIT_TABLE}/{name}", named[name])
-        for name in ("x", "y", "z", "edep")
-    )
-    return Steps(number, np.stack([x, y, z], axis=1), energy)
+    return steps

@@ -35,7 +35,7 @@ ReadColumn = Callable[[], tuple[npt.NDArray[Any], str]]
 
 # what a column is, and its names in small letters: the first that is there is read
 _NAMES = {
-    "event": ("evtid", "event", "event#", "eventid", "event_id"),
+    "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
     "x": ("xloc", "x"),
     "y": ("yloc", "y"),
     "z": ("zloc", "z"),
@@ -92,10 +92,6 @@ class Steps:
         """Steps that are `kept`."""
         time = None if self.time_ns is None else self.time_ns[kept]
         return Steps(self.event[kept], self.position_mm[kept], self.edep_kev[kept], time)
-
-    def moved(self, by_mm: FloatArray) -> Steps:
-        """Steps at positions shifted by a vector."""
-        return replace(self, position_mm=self.position_mm + by_mm)
 
 
 def to_hits(
@@ -321,8 +317,7 @@ def of_detector(
     """Steps of a detector by its label, or of the only one if none is given."""
     labels = detector_labels(columns)
     if labels is None:
-        if detector is not None:
-            raise CpunetError(f"{path}: no column to pick detector {detector} by")
+        choose(path, [], detector)
         return steps
     if len(labels) != len(steps.event):
         raise CpunetError(f"{path}: the column of detectors differs in length; truncated?")
@@ -339,7 +334,12 @@ def choose(path: Path, there: list[str], detector: str | None) -> str | None:
     CpunetError
         If it is not there, or several are and none was chosen.
     """
-    names = ", ".join(there) or "none"
+    if detector is not None and not there:
+        raise CpunetError(
+            f"{path}: its hits name no detector to pick {detector} by; leave out "
+            "`hits_detector`"
+        )
+    names = ", ".join(there)
     if detector is None and len(there) > 1:
         raise CpunetError(f"{path}: holds detectors {names}; choose one with `hits_detector`")
     if detector is not None and detector not in there:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,8 +72,8 @@ def read_table(path: Path, table: Table, options: HitOptions, rows: slice = _ALL
         steps = steps_of(path, columns, options)
         if table.label is not None:
             steps = of_detector(path, steps, columns, table.label)
-        name = table.label or table.name.rpartition("/")[2]
-        return steps.moved(-_origin(path, file, name))
+        origin = _origin(path, file, table.label or table.name.rpartition("/")[2])
+    return replace(steps, position_mm=steps.position_mm - origin)
 
 
 def parts_of(path: Path, table: Table, size: int = ROWS) -> tuple[list[slice], int] | None:
@@ -152,21 +152,19 @@ def _read(
         item = item["pages"]
     unit = text_attribute(item, "units")
     if _is_vectors(item):
-        ends = _ends(item, rows)
-        if counts is None or not np.array_equal(np.diff(ends), counts):
-            raise CpunetError(
-                f"{path}: columns {name} and edep differ in length; is the file truncated?"
-            )
-        flat = item["flattened_data"]
-        return np.asarray(flat[ends[0] : ends[-1]]), text_attribute(flat, "units") or unit
-    if not isinstance(item, h5py.Dataset) or item.ndim != 1:
+        ends, flat = _ends(item, rows), item["flattened_data"]
+        same = counts is not None and np.array_equal(np.diff(ends), counts)
+        values = np.asarray(flat[ends[0] : ends[-1]])
+        unit = text_attribute(flat, "units") or unit
+    elif isinstance(item, h5py.Dataset) and item.ndim == 1:
+        values = np.asarray(item[rows.start : rows.stop])
+        same = counts is None or len(values) == len(counts)
+        values = np.repeat(values, counts) if same and counts is not None else values
+    else:
         raise CpunetError(f"{path}: column {name} is no array with a value per step or hit")
-    values = np.asarray(item[rows.start : rows.stop])
-    if counts is None:
-        return values, unit
-    if len(values) != len(counts):
+    if not same:
         raise CpunetError(f"{path}: columns {name} and edep differ in length; truncated?")
-    return np.repeat(values, counts), unit
+    return values, unit
 
 
 def _row_numbers(item: Any) -> npt.NDArray[Any] | None:
@@ -184,16 +182,13 @@ def _row_numbers(item: Any) -> npt.NDArray[Any] | None:
 def _origin(path: Path, file: h5py.File, name: str) -> npt.NDArray[np.float64]:
     """Origin of a detector in mm; zero if it is not in the file."""
     origin = np.zeros(3)
-    if f"detector_origins/{name}" not in file:
-        return origin
     for i, axis in enumerate("xyz"):
         where = f"detector_origins/{name}/{axis}loc"
-        number = file.get(where)
-        if not is_column(number) or number.size != 1:
-            raise CpunetError(f"{path}: {where} is no number; write the file again")
-        # an origin may lack a unit; all lengths of remage are in m
-        unit = text_attribute(number, "units") or "m"
-        origin[i] = number[()].item() * unit_factor(HitOptions(), "x", path, where, unit)
+        if where in file:
+            # an origin may lack a unit; all lengths of remage are in m
+            unit = text_attribute(file[where], "units") or "m"
+            factor = unit_factor(HitOptions(), "x", path, where, unit)
+            origin[i] = file[where][()].item() * factor
     return origin
 
 
@@ -224,49 +219,32 @@ def csv_detectors(path: Path) -> list[str]:
 
 def _csv_columns(path: Path) -> tuple[str, Mapping[str, ReadColumn]]:
     """Title of the file, and its columns."""
-    title, names = _header(path)
+    from pandas import DataFrame, read_csv  # half a second, which other formats do not need
+
     with path.open(encoding="utf-8", errors="replace") as lines:
-        body = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-    if not body:
-        raise CpunetError(f"{path}: holds no steps; simulate again")
-    if (n := body[0].count(",") + 1) != len(names):
-        raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
-    cells: npt.NDArray[Any]
+        head = list(takewhile(lambda line: line.startswith("#"), lines))
+    title, names = "", []
+    for line in head:
+        key, _, value = line[1:].strip().partition(" ")
+        if key == "title":
+            title = value
+        elif key == "column":
+            names.append(value.partition(" ")[2])
+        elif key == "separator" and value != "44":
+            raise CpunetError(f"{path}: columns are not separated by commas; export again")
     try:
-        cells = np.loadtxt(body, delimiter=",", ndmin=2)
-    except ValueError:  # names of volumes and processes among the numbers
-        rows = [line.split(",") for line in body]
-        if any(len(row) != len(names) for row in rows):
-            raise CpunetError(
-                f"{path}: a line is not {len(names)} values; is it cut off?"
-            ) from None
-        cells = np.array(rows)
+        # the columns of one file can be numbers, text or both
+        cells: DataFrame = read_csv(
+            path, header=None, skiprows=len(head), low_memory=False, encoding_errors="replace"
+        )
+    except ValueError as error:
+        raise CpunetError(f"{path}: holds no steps ({error}); export again") from error
+    if (n := cells.shape[1]) != len(names):
+        raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
+    if cells[n - 1].isna().any():
+        raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
 
     def reader(at: int) -> ReadColumn:
-        return lambda: (_numbers(cells[:, at]), "")
+        return lambda: (cells[at].to_numpy(), "")
 
     return title, {name: reader(at) for at, name in enumerate(names)}
-
-
-def _header(path: Path) -> tuple[str, list[str]]:
-    title, columns = "", []
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            if not line.startswith("#"):
-                break
-            key, _, value = line[1:].strip().partition(" ")
-            if key == "title":
-                title = value
-            elif key == "column":
-                columns.append(value.partition(" ")[2])
-            elif key == "separator" and value != "44":
-                raise CpunetError(f"{path}: columns are not separated by commas; export again")
-    return title, columns
-
-
-def _numbers(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Values as numbers, unless one is text."""
-    try:
-        return values.astype(float)
-    except ValueError:
-        return values

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from numba import prange
 
 from cpunet.kernels import kernel
-from cpunet.simulation.cloud import FWHM_PER_SIGMA, smear_and_sample
+from cpunet.simulation.drift import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, in_active_volume
 from cpunet.simulation.library_lookup import LATE, OUTSIDE, Float32Array, Library, add_pulse
 from cpunet.simulation.signals import Task, point_signal

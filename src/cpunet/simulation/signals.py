@@ -11,14 +11,14 @@ from numba import prange
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
-from cpunet.simulation.cloud import (
+from cpunet.simulation.drift import (
     FWHM_PER_SIGMA,
     SMALLEST_FWHM_MM,
     diffusion_constant,
+    drift,
     repulsion_constant,
     smear_and_sample,
 )
-from cpunet.simulation.drift import drift
 from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
 from cpunet.simulation.hits import FARTHEST_MM
 from cpunet.simulation.settings import SimulationSettings
@@ -32,7 +32,7 @@ EXACT, WHOLE, WHOLE_ON_AVERAGE = range(3)
 class Task(NamedTuple):
     """Parameters of the compiled loops, besides the maps, for drifting and smearing.
 
-    The cloud starts with a FWHM of `cloud_fwhm_mm`; see `cpunet.simulation.cloud` for
+    The cloud starts with a FWHM of `cloud_fwhm_mm`; see `cpunet.simulation.drift` for
     `diffusion` and `repulsion_per_kev`. `rounding` of its duration is `EXACT`, `WHOLE` or
     `WHOLE_ON_AVERAGE`. A step of the drift lasts `step_ns` and replaces `stride` time steps;
     `per_sample` is the number of steps of the drift per sample.

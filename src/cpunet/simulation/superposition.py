@@ -6,25 +6,159 @@ With space charge everywhere the potential is linear in its sources,
 
 with the bias :math:`b`, the scale :math:`s` and the tilt :math:`t` of the impurities. The parts
 are :math:`w` (1 on the lithium contact), :math:`u` (impurities as given), :math:`v` (unit
-tilt) and :math:`q` (surface charge). Bias, scale and tilt therefore need no new solution. This
-does not hold if part of the detector is not depleted. Such a potential has a pocket (see
-`cpunet.simulation.depletion`) and is refused.
+tilt) and :math:`q` (surface charge). Bias, scale and tilt therefore need no new solution; the
+parts are kept on disk, so that each detector is solved only once.
+
+This is the true potential if it has no pocket in which holes would collect: no local minimum
+apart from the electrodes. At such a minimum, or wherever the potential is below 0, germanium
+is not depleted, and the potential is refused.
 """
 
 from __future__ import annotations
 
+import heapq
 import logging
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import platformdirs
+from scipy.ndimage import minimum_filter
 
 from cpunet.errors import CpunetError
-from cpunet.simulation import field_cache
-from cpunet.simulation.depletion import HIGHEST_BIAS_V, depletion_voltage, has_pocket
-from cpunet.simulation.geometry import Detector, FloatArray
-from cpunet.simulation.grid import Grid, make_grid
-from cpunet.simulation.poisson import Potentials, solve_potentials
+from cpunet.outputs import written_aside
+from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.simulation.geometry import GERMANIUM, Detector, FloatArray, RegionArray
+from cpunet.simulation.poisson import Grid, Potentials, make_grid, solve_potentials
+
+# V: a pocket this shallow holds no charge (about kT/e at 90 K), and is not resolved by the
+# grid
+POCKET_DEPTH_V = 0.01
+HIGHEST_BIAS_V = 20_000.0
+_RESOLUTION_V = 0.5
+_NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j)
+
+
+def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
+    r"""Smallest bias in V at which the potential has no pocket; infinite if there is none.
+
+    Parameters
+    ----------
+    bias, impurities
+        Potentials of a unit bias, and of the impurities in V, shape (nr, nz).
+    region
+        Region of each node, as from `Detector.region`.
+
+    Examples
+    --------
+    A planar detector of thickness :math:`d` depletes at :math:`e N d^2 / 2 \varepsilon`.
+
+    >>> import numpy as np
+    >>> z = np.tile(np.linspace(0, 10, 401), (3, 1))  # mm
+    >>> impurities = -10 * z * (10 - z) / 2  # e N / epsilon = 10 V / mm2
+    >>> region = np.where(z == 0, 0, np.where(z == 10, 1, 2))
+    >>> bool(abs(depletion_voltage(z / 10, impurities, region) - 500) < 5)
+    True
+    """
+    low, high = 0.0, HIGHEST_BIAS_V
+    if has_pocket(high * bias + impurities, region):
+        return float("inf")
+    if not has_pocket(impurities, region):
+        return 0.0
+    while high - low > _RESOLUTION_V:
+        middle = (low + high) / 2
+        if has_pocket(middle * bias + impurities, region):
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
+    """Whether `potential` (nr, nz), in V, keeps holes from reaching an electrode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> r, z = np.meshgrid(np.arange(9), np.arange(9), indexing="ij")
+    >>> region = np.where(z == 0, 0, 2)
+    >>> has_pocket(z * 10.0, region), has_pocket((z - 4.0) ** 2, region)
+    (False, True)
+    """
+    minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
+        region == GERMANIUM
+    )
+    # deepest first: a true pocket is found early
+    where = np.argwhere(minima)
+    order = np.argsort(potential[minima])
+    return any(_holds(potential, region, *map(int, where[k])) for k in order)
+
+
+def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) -> bool:
+    """Whether leaving a minimum requires a climb of more than `POCKET_DEPTH_V`.
+
+    Floods from the minimum, lowest node first, until a lower node or a contact is reached.
+    """
+    start = potential[row, column]
+    heap = [(float(start), row, column)]
+    seen = {(row, column)}
+    while heap:
+        level, i, j = heapq.heappop(heap)
+        if level > start + POCKET_DEPTH_V:
+            return True
+        if level < start or region[i, j] < GERMANIUM:
+            return False
+        for di, dj in _NEIGHBOURS:
+            node = (i + di, j + dj)
+            inside = 0 <= node[0] < region.shape[0] and 0 <= node[1] < region.shape[1]
+            if inside and node not in seen:
+                seen.add(node)
+                heapq.heappush(heap, (float(potential[node]), *node))
+    return True
+
+
+# part of the file name, so that results of an older solver are not used
+SOLVER_VERSION = 3
+
+_OF_GRID = ("r_mm", "z_mm", "region", "r_steps", "z_steps")
+_OF_NODES = ("point_contact", "bias", "impurities", "tilt", "surface")
+
+
+def cache_file(key: str) -> Path:
+    """Cache file of the potentials of a detector with the fingerprint `key`."""
+    folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
+    return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
+
+
+def kept_parts(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
+    """Load grid, potentials and depletion voltage (V) of `key` from the cache.
+
+    Returns None if they are missing or damaged.
+    """
+    try:
+        kept = read_arrays(cache_file(key))
+        grid = Grid(step_mm=step_mm, **{name: kept[name] for name in _OF_GRID})
+        nodes = {name: kept[name] for name in _OF_NODES}
+        capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
+    except (CpunetError, LookupError):
+        return None  # solved again and overwritten
+    return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion
+
+
+def keep_parts(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:
+    """Write to the cache atomically. A cache that cannot be written is ignored."""
+    arrays = {name: getattr(grid, name) for name in _OF_GRID}
+    arrays |= {name: getattr(potentials, name) for name in _OF_NODES}
+    arrays["capacitance_pF"] = np.array(potentials.capacitance_pF)
+    arrays["depletion_V"] = np.array(depletion_V)
+    try:
+        with written_aside(cache_file(key)) as aside:
+            np.savez(aside, allow_pickle=False, **arrays)
+    except CpunetError:
+        return  # a read-only home directory must not stop a simulation
+
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +212,17 @@ class Superposition:
         """
         potential = self._sum(bias_V, impurity_scale, impurity_tilt)
         if has_pocket(potential, self.grid.region):
-            self._refuse(bias_V, impurity_scale, impurity_tilt)
+            depletion = self.depletion_V(impurity_scale, impurity_tilt)
+            name = self.detector.name
+            if depletion == math.inf:
+                raise CpunetError(
+                    f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
+                    "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
+                )
+            raise CpunetError(
+                f"detector {name}: bias_V = {bias_V:g} does not deplete it; "
+                f"give at least the depletion voltage, {np.ceil(depletion):.0f} V"
+            )
         return potential
 
     def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
@@ -130,19 +274,6 @@ class Superposition:
     def _pocket(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> bool:
         return has_pocket(self._sum(bias_V, impurity_scale, impurity_tilt), self.grid.region)
 
-    def _refuse(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> None:
-        depletion = self.depletion_V(impurity_scale, impurity_tilt)
-        name = self.detector.name
-        if depletion == math.inf:
-            raise CpunetError(
-                f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
-                "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
-            )
-        raise CpunetError(
-            f"detector {name}: bias_V = {bias_V:g} does not deplete it; "
-            f"give at least the depletion voltage, {np.ceil(depletion):.0f} V"
-        )
-
 
 def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     """Solve for the parts of a detector's potential, or load them from the cache.
@@ -165,7 +296,7 @@ def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     unit = detector.model_copy(
         update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
     )
-    if cache and (kept := field_cache.load(key, detector.grid_mm)) is not None:
+    if cache and (kept := kept_parts(key, detector.grid_mm)) is not None:
         return Superposition(unit, *kept)
     grid = make_grid(unit)
     log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
@@ -174,5 +305,5 @@ def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     fixed = potentials.impurities + potentials.surface
     depletion = depletion_voltage(potentials.bias, fixed, grid.region)
     if cache:
-        field_cache.store(key, grid, potentials, depletion)
+        keep_parts(key, grid, potentials, depletion)
     return Superposition(unit, grid, potentials, depletion)

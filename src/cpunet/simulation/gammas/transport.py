@@ -9,7 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.gammas.electrons import put_photon, record, slow_down
+from cpunet.simulation.gammas.electrons import (
+    UnitVector,
+    compton_energy,
+    forward,
+    pair_share,
+    put_photon,
+    record,
+    remainder,
+    slow_down,
+    turned,
+)
 from cpunet.simulation.gammas.germanium import (
     ELECTRON_MASS,
     K_BINDING,
@@ -17,14 +27,6 @@ from cpunet.simulation.gammas.germanium import (
     Array,
     ElectronTable,
     PhotonTable,
-)
-from cpunet.simulation.gammas.processes import (
-    UnitVector,
-    compton_energy,
-    forward,
-    pair_share,
-    remainder,
-    turned,
 )
 from cpunet.simulation.gammas.shape import CrystalShape, in_germanium, way_to_cylinder
 
