@@ -47,7 +47,8 @@ class Cost(NamedTuple):
 def some_hits(seed: int) -> Hits:
     """Events of the full-energy peak and of the continuum."""
     windows = energy_windows("FEP,1000-2600", load_recipe("fast").peaks, 0.5)
-    source = GammaSource(tuple(windows), (POOL // 5, POOL - POOL // 5), 20.0, 5.0, seed)
+    events = dict(zip(windows, (POOL // 5, POOL - POOL // 5), strict=True))
+    source = GammaSource(events, 20.0, 5.0, seed)
     return Hits.concatenate(list(source.open(read_detector("icpc")).blocks))
 
 

@@ -11,11 +11,11 @@ import time
 import numpy as np
 
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas.sample import WantedLine, simulate_gammas
+from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 
 N_EVENTS = 3_000
-DEP = {"DEP": WantedLine(1591.0, 1594.0, N_EVENTS)}
+DEP = {EnergyWindow("DEP", 1591.0, 1594.0): N_EVENTS}
 # fractions of the gammas in the cone to the crystal: any hit; within 1 keV of FEP, SEP and DEP
 GEANT4 = {
     20.0: (0.4265, 0.0997, 0.01131, 0.00370),

@@ -20,7 +20,7 @@ import numpy as np
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.drift import FWHM_PER_SIGMA, cloud_after_step, repulsion_constant
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.velocity import HOLE, drift_velocity, velocity_table
+from cpunet.simulation.velocity import HOLE, carrier_velocity, velocity_table
 
 ENERGIES_KEV = (100, 200, 400, 700, 1000, 1400, 2000)
 FIELD, DRIFT_NS, STEP_NS, BODIES, CLOUD_MM = 800.0, 600.0, 2.0, 300, 0.1
@@ -32,7 +32,7 @@ TABLE = velocity_table(90.0)
 
 
 def speed(field: float) -> float:
-    return float(drift_velocity(TABLE, [[field, 0, 0]], HOLE)[0, 0])
+    return float(carrier_velocity(*TABLE, HOLE, field, 0.0, 0.0)[0])
 
 
 SPEED = speed(FIELD)

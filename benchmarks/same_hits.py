@@ -14,8 +14,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import EnergyWindow, GammaSource
+from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import Shift, SimulationSettings
 
@@ -52,17 +53,17 @@ def _crossing(smooth: npt.NDArray[np.float64], level: float) -> npt.NDArray[np.f
 def main() -> None:
     detector = read_detector("icpc")
     settings = SimulationSettings(dt_ns=4, length_ns=2400)
-    source = GammaSource((EnergyWindow("FEP", 2614.0, 2615.0),), (EVENTS,), 20.0, 5.0, 1)
+    source = GammaSource({EnergyWindow("FEP", 2614.0, 2615.0): EVENTS}, 20.0, 5.0, 1)
     hits = merge_hits(Hits.concatenate(list(source.open(detector).blocks)), detector, 0.05)
     same = SameHits(hits)
     first = {}
     # the same events everywhere: those that lose less than 1 keV in the lithium layer
     kept = same.simulate(detector, settings).lost_kev < 1
     for mode in ("exact", "quick"):
-        events = same.simulate(detector, settings, mode=mode)
+        events = same.simulate(detector, settings, quick=mode == "quick")
         first[mode] = moments(events.waveforms[kept], 4)
         start = time.process_time()
-        same.simulate(detector, SimulationSettings(), mode=mode)
+        same.simulate(detector, SimulationSettings(), quick=mode == "quick")
         spent = time.process_time() - start
         print(f"{mode}: {spent:.2f} s of CPU for {EVENTS} events at 16 ns")
     print("shift: exact change of ln I_max, rise and 90 % time; error of the quick one")
@@ -71,7 +72,7 @@ def main() -> None:
         change = []
         for mode in ("exact", "quick"):
             events = same.simulate(
-                shift.detector(detector), shift.settings(settings), mode=mode
+                shift.detector(detector), shift.settings(settings), quick=mode == "quick"
             )
             change.append(moments(events.waveforms[kept], 4) - first[mode])
         exact, error = change[0], change[1] / change[0] - 1

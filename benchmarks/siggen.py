@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.simulation.drift import drift_paths
-from cpunet.simulation.field_lookup import Maps
-from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
@@ -46,7 +45,7 @@ def stored_maps(folder: Path) -> StoredMaps:
         return StoredMaps(0.5, *(maps[name] for name in names))
 
 
-def compare(folder: Path, fields: Maps) -> None:
+def compare(folder: Path, fields: FieldMaps) -> None:
     with np.load(folder / "waveforms_plain_A_outertaper_grid0.1.npz") as plain:
         expected = plain["wf1"]
         found = hit_signals(fields, *plain["positions"].T, 100.0, PLAIN).waveforms

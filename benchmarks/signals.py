@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.simulation.events import EventPulses, simulate_events
+from cpunet.simulation.events import INTERPOLATED, NO_SIGNAL, EventPulses, simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.gammas.sample import simulate_gammas
 from cpunet.simulation.geometry_readers import read_detector
@@ -42,7 +42,7 @@ def timed(
     start = time.perf_counter()
     events = simulate_events(fields, hits, settings, **how)  # type: ignore[arg-type]
     seconds = time.perf_counter() - start
-    return events, (events.counts["hits"] - events.counts["hits without signal"]) / seconds
+    return events, np.sum(events.outcome != NO_SIGNAL) / seconds
 
 
 def three(values: npt.NDArray[np.floating]) -> str:
@@ -58,8 +58,8 @@ def main() -> None:
     fields = compute_fields(detector)
     # compiled, or taken from the compiler's cache, before anything is timed
     quick = settings.model_copy(update={"library_grid_mm": 20.0, "library_halvings": 0})
-    for mode in ("exact", "library"):
-        simulate_events(fields, random_events(fields, 10, 0), quick, mode)  # type: ignore[arg-type]
+    for library in (None, build_library(fields, quick)):
+        simulate_events(fields, random_events(fields, 10, 0), quick, library)
 
     start = time.perf_counter()
     library = build_library(fields, settings)
@@ -72,16 +72,14 @@ def main() -> None:
     )
     samples = {"uniform": random_events(fields, LIBRARY_HITS, 1), "gammas": gammas}
     for name, hits in samples.items():
-        many, rate = timed(fields, hits, settings, mode="library", library=library)
-        share = many.counts["hits interpolated"] / (
-            many.counts["hits"] - many.counts["hits without signal"]
-        )
+        many, rate = timed(fields, hits, settings, library=library)
+        share = np.mean(many.outcome[many.outcome != NO_SIGNAL] == INTERPOLATED)
         print(f"library, {name}: {rate:.0f} hits/s, {100 * share:.2f} % interpolated")
 
     few = random_events(fields, EXACT_HITS, 2)
-    exact, rate = timed(fields, few, settings, mode="exact")
+    exact, rate = timed(fields, few, settings)
     print(f"exact: {rate:.0f} hits/s")
-    interpolated, _ = timed(fields, few, settings, mode="library", library=library)
+    interpolated, _ = timed(fields, few, settings, library=library)
     kept = exact.collected_kev > 0
     pulses = [events.waveforms[kept].astype(float) for events in (interpolated, exact)]
     rise = [np.diff(p, axis=1, prepend=0).max(axis=1) for p in pulses]

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand_sides import Side, stand_sides
 from cpunet.simulation.clustering import cluster_hits
+from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import EnergyWindow
 from cpunet.simulation.settings import Shift
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)

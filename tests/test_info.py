@@ -139,11 +139,11 @@ def test_files_of_hits_are_described(tmp_path):
     path = tmp_path / "hits.npz"
     place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
     np.savez(path, **place, edep_keV=[2000.0, 614.5, 50.0], offsets=np.array([0, 2, 3]))
-    told = info(path).values["detectors"][""]
-    assert (told["events"], told["hits"]) == (2, 3)
-    assert told["energy_kev"] == [50.0, 2614.5]
-    assert told["r_mm"] == [0.0, 5.0]
-    assert told["peaks"] == {"FEP": 1, "SEP": 0, "DEP": 0}
+    told = info(path).values[""]
+    assert (told.events, told.hits) == (2, 3)
+    assert told.energy_kev == [50.0, 2614.5]
+    assert told.extents_mm["r"] == [0.0, 5.0]
+    assert told.peaks == {"FEP": 1, "SEP": 0, "DEP": 0}
     csv = tmp_path / "hits.csv"
     names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
     csv.write_text(
@@ -152,7 +152,7 @@ def test_files_of_hits_are_described(tmp_path):
     assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
     assert "names no unit" in str(info(csv))
     units = HitOptions(length_unit="cm", energy_unit="keV")
-    assert info(csv, frame=units).values["detectors"][""]["x_mm"] == [30, 30]
+    assert info(csv, frame=units).values[""].extents_mm["x"] == [30, 30]
 
 
 def test_measured_traces_are_described(reference_data: Path):
@@ -217,8 +217,8 @@ def test_hits_are_compared_with_a_crystal(reference_data: Path, tmp_path):
     """Hits of a crystal without the taper, and the same where it stands turned over."""
     path = reference_data / "geant4" / "g4_h20mm.npz"
     crystal = read_detector("icpc")
-    right = info(path, detector=crystal).values["detectors"][""]["crystal"]
-    assert right["outside_percent"] == pytest.approx(10.5, abs=0.3)
+    right = info(path, detector=crystal).values[""]
+    assert right.outside_percent == pytest.approx(10.5, abs=0.3)
     with np.load(path) as file:
         arrays = {name: file[name] for name in ("x_mm", "edep_keV", "offsets")}
         arrays |= {"y_mm": -file["y_mm"] - 10, "z_mm": 200 - file["z_mm"]}
@@ -226,8 +226,8 @@ def test_hits_are_compared_with_a_crystal(reference_data: Path, tmp_path):
     moved = info(tmp_path / "moved.npz", detector=crystal)
     assert "100.00 % of the hits; check `origin`, `flip_z`" in str(moved)
     given = HitOptions(origin=(0, -10, 200), flip_z=True)
-    told = info(tmp_path / "moved.npz", detector=crystal, frame=given).values["detectors"][""]
-    assert told["crystal"] == pytest.approx(right)
+    told = info(tmp_path / "moved.npz", detector=crystal, frame=given).values[""]
+    assert told.outside_percent == pytest.approx(right.outside_percent)
 
 
 def test_traces_that_are_no_numbers(tmp_path):

@@ -17,7 +17,7 @@ from cpunet.recipes import load_recipe
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
-from cpunet.simulation.gammas.sample import WantedLine, simulate_gammas
+from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
@@ -31,7 +31,7 @@ SIM, DATA, GREY = "#d55e00", "#0072b2", "0.65"
 
 def hits_of_an_event(detector: Detector) -> Hits:
     """A full-energy event of Tl-208 in the detector, its hits merged."""
-    wanted = {"FEP": WantedLine(2614.0, 2615.0, 10)}
+    wanted = {EnergyWindow("FEP", 2614.0, 2615.0): 10}
     hits, _ = simulate_gammas(
         detector,
         source_height_mm=20,

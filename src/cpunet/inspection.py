@@ -215,15 +215,17 @@ def _look(
     if Path(path).is_dir():
         return _folder(path)
     from cpunet.recipes import load_recipe
-    from cpunet.simulation.hit_files import holds_hits
+    from cpunet.simulation.hit_files import describe_hits, holds_hits
 
     recipe = load_recipe("fast")
     if holds_hits(path):
-        from cpunet.simulation.hit_description import describe_hits, hits_in_words
-
         inside = None if crystal is None else read_detector(crystal)
         hits = describe_hits(Path(path), frame, recipe.peaks, inside)
-        return InfoResult(str(path), hits_in_words(hits), hits)
+        lines = [("file", str(path))]
+        for name, one in hits.items():
+            lines.append(("detector", name))
+            lines += [("hits", one)] if isinstance(one, str) else one.lines
+        return InfoResult(str(path), lines, hits)
     return _file(pulse_file(path, read), recipe)
 
 

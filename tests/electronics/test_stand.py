@@ -22,10 +22,10 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.simulation.again import SameHits, StoredSimulation
-from cpunet.simulation.field_lookup import Maps
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.train import train
@@ -57,7 +57,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let every stand use libraries; the temperatures (K) of those built."""
     built: list[float] = []
 
-    def build(maps: Maps, settings: SimulationSettings) -> Library:
+    def build(maps: FieldMaps, settings: SimulationSettings) -> PulseLibrary:
         built.append(maps.temperature_K)
         # few halvings: more places are left to the drift, the others are as good
         return build_library(maps, settings.model_copy(update={"library_halvings": 3}))

@@ -5,17 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.simulation.drift import drift_paths
-from cpunet.simulation.field_lookup import Maps
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import (
     ELECTRON,
     HOLE,
-    drift_velocity,
+    VelocityTable,
+    carrier_velocity,
     measured_table,
     velocity_factor,
     velocity_table,
@@ -24,7 +26,13 @@ from cpunet.simulation.velocity import (
 STEPS = SimulationSettings(dt_ns=1, library_step_ns=1, length_ns=3000)
 
 
-def test_uniform_field_moves_charges_at_constant_speed(planar: Maps) -> None:
+def drift_velocity(table: VelocityTable, fields: npt.ArrayLike, carrier: int) -> np.ndarray:
+    """Velocity vectors (n, 3) for field vectors (n, 3)."""
+    rows = np.asarray(fields, float).tolist()
+    return np.array([carrier_velocity(*table, carrier, *row)[:3] for row in rows])
+
+
+def test_uniform_field_moves_charges_at_constant_speed(planar: FieldMaps) -> None:
     paths = drift_paths(planar, [5.0], [3.0], [8.0], STEPS)
     speed = -drift_velocity(velocity_table(90), [[0, 0, -1000.0]], HOLE)[0, 2]
     hole = paths.holes[0]
@@ -36,19 +44,19 @@ def test_uniform_field_moves_charges_at_constant_speed(planar: Maps) -> None:
 
 
 @pytest.mark.parametrize("far", [99.0, np.nan, np.inf, -np.inf, 1e300])
-def test_nothing_drifts_from_a_contact_or_from_outside(planar: Maps, far: float) -> None:
+def test_nothing_drifts_from_a_contact_or_from_outside(planar: FieldMaps, far: float) -> None:
     paths = drift_paths(planar, [5.0, 5.0, far, 0.0], 0.0, [1.0, 13.0, 8.0, far], STEPS)
     assert np.isnan(paths.holes).all()
     assert np.isnan(paths.electrons).all()
 
 
-def test_a_single_place_is_one_path(planar: Maps) -> None:
+def test_a_single_place_is_one_path(planar: FieldMaps) -> None:
     paths = drift_paths(planar, 5.0, 3.0, 8.0, STEPS)
     assert paths.holes.shape == (1, STEPS.n_steps, 3)
     np.testing.assert_array_equal(paths.holes, drift_paths(planar, [5], [3], [8], STEPS).holes)
 
 
-def test_reference_paths(reference_data: Path, reference_maps: Maps) -> None:
+def test_reference_paths(reference_data: Path, reference_maps: FieldMaps) -> None:
     with np.load(reference_data / "siggen" / "drift_paths_A_grid0.1.npz") as data:
         start, expected = data["positions"], data["paths"][:, : STEPS.n_steps]
     paths = drift_paths(reference_maps, *start.T, STEPS)

@@ -14,8 +14,8 @@ from cpunet.simulation.gammas.electrons import compton_energy
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.sample import (
     TL208_KEV,
+    EnergyWindow,
     GammaStatistics,
-    WantedLine,
     simulate_gammas,
     with_resolution,
 )
@@ -43,10 +43,11 @@ def crystal(**changed: float) -> Detector:
     return Detector.model_validate(values | changed)
 
 
+FEP = EnergyWindow("FEP", 2613.5, 2615.5)
 LINES = {
-    "DEP": WantedLine(1591.0, 1594.0, 1500),
-    "SEP": WantedLine(2102.0, 2105.0, 800),
-    "FEP": WantedLine(2613.5, 2615.5, 800),
+    EnergyWindow("DEP", 1591.0, 1594.0): 1500,
+    EnergyWindow("SEP", 2102.0, 2105.0): 800,
+    FEP: 800,
 }
 # Geant4 11.4, option0: hit, FEP, SEP, DEP per gamma in the cone
 GEANT4 = {20: (0.4265, 0.0997, 0.01131, 0.00370), 100: (0.4450, 0.1101, 0.01199, 0.00386)}
@@ -64,7 +65,7 @@ def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, Gam
 
 
 # one keV bin of a window that keeps no event, so that only the statistics cost memory
-NONE = {"none": WantedLine(2613.0, 2613.1, 10**9)}
+NONE = {EnergyWindow("none", 2613.0, 2613.1): 10**9}
 
 
 def counted(height: float, n: int) -> GammaStatistics:
@@ -183,7 +184,7 @@ def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
 
 
 def test_wanted_counts_are_met_exactly() -> None:
-    wanted = {"FEP": LINES["FEP"]._replace(events=50), "low": WantedLine(100, 600, 20)}
+    wanted = {FEP: 50, EnergyWindow("low", 100, 600): 20}
     hits, seen = run(100, 100_000, wanted=wanted)
     energy = hits.energy_kev
     assert np.sum(energy > 2600) == 50
@@ -195,7 +196,7 @@ def test_wanted_counts_are_met_exactly() -> None:
     ("settings", "message"),
     [
         ({"height": 20, "n": 10, "wanted": NONE}, "10 gammas were not enough"),
-        ({"height": 20, "n": 10, "wanted": {"a": WantedLine(9, 2, 1)}}, "a: window"),
+        ({"height": 20, "n": 10, "wanted": {EnergyWindow("a", 9, 2): 1}}, "a: window"),
     ],
 )
 def test_impossible_wishes_are_refused(settings: dict[str, object], message: str) -> None:

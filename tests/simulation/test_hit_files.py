@@ -13,10 +13,10 @@ from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.simulation import hit_sources
+from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_description import describe_hits
-from cpunet.simulation.hit_files import hit_detectors, hit_parts, read_hits
-from cpunet.simulation.hit_sources import EnergyWindow, HitFile
+from cpunet.simulation.hit_files import describe_hits, hit_detectors, hit_parts, read_hits
+from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.hit_tables import parts_of, table_of
 from cpunet.simulation.hits import HitOptions, Hits
 
@@ -110,18 +110,18 @@ def test_late_deposits_are_counted_once(tmp_path, monkeypatch, caplog, size) -> 
     path = written(tmp_path, "vectors", steps(time=(time, "ns")))
     for _ in HitFile(path).open(read_detector("icpc")).blocks:
         pass
-    (told,) = caplog.messages
+    (told,) = (text for text in caplog.messages if "lie outside" not in text)
     assert f"{N // 3} events have deposits more than 50 ns after their first" in told
     caplog.clear()
     HitFile(path, HitOptions(time_window_us=0.1)).open(read_detector("icpc"))
-    assert not caplog.messages
+    assert "deposits more than" not in caplog.text
 
 
 def test_a_description_has_the_same_events(tmp_path: Path) -> None:
     path = written(tmp_path, "flat", steps(det_uid=(np.tile([11, 11, 2], N), "")), "germanium")
     for window_us, table in ((10.0, {"2": N, "11": N}), (1e-3, {"2": N, "11": 2 * N})):
-        told = describe_hits(path, HitOptions(time_window_us=window_us), {})["detectors"]
-        assert {name: one["events"] for name, one in told.items()} == table
+        told = describe_hits(path, HitOptions(time_window_us=window_us), {})
+        assert {name: one.events for name, one in told.items()} == table
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

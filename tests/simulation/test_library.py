@@ -13,16 +13,21 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
 from cpunet.simulation import again
-from cpunet.simulation import events as events_module
 from cpunet.simulation.again import SameHits
-from cpunet.simulation.events import EventPulses, simulate_events
-from cpunet.simulation.field_lookup import Maps
-from cpunet.simulation.fields import compute_fields
+from cpunet.simulation.events import (
+    COLLECTED,
+    INTERPOLATED,
+    NO_SIGNAL,
+    NOT_COLLECTED,
+    EventPulses,
+    simulate_events,
+)
+from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import Library, add_pulse, covers
+from cpunet.simulation.library_lookup import PulseLibrary, add_pulse, covers
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
 
@@ -34,7 +39,7 @@ FINE = SETTINGS.model_copy(update={"library_grid_mm": 1.0})
 
 
 @pytest.fixture(scope="module")
-def library(planar: Maps) -> Library:
+def library(planar: FieldMaps) -> PulseLibrary:
     return build_library(planar, FINE)
 
 
@@ -52,7 +57,7 @@ def largest_rise(events: EventPulses, kept: npt.NDArray[np.bool_]) -> Array:
     return np.diff(events.waveforms[kept].astype(float), axis=1, prepend=0).max(axis=1)
 
 
-def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
+def test_an_event_is_the_weighted_sum_of_its_hits(planar: FieldMaps) -> None:
     place = [[1.0, 2.0, 5.0], [6.0, 0.0, 9.0], [0.0, 0.0, 0.5]]
     hits = Hits.of(place, [300.0, 100.0, 50.0], [0, 3, 3])
     events = simulate_events(planar, hits, SETTINGS)
@@ -62,8 +67,7 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
     )
     assert events.lost_kev.tolist() == [50.0, 0.0]
     assert events.collected_kev.tolist() == [400.0, 0.0]
-    assert events.counts["hits without signal"] == 1
-    assert events.counts["events without signal"] == 1
+    assert events.outcome.tolist() == [COLLECTED, COLLECTED, NO_SIGNAL]
     assert len(events.pulses()) == 1
     assert events.pulses().energy_kev.tolist() == [400.0]
 
@@ -74,15 +78,15 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: Maps) -> None:
     ids=["of a part", "of the crystal"],
 )
 def test_library_agrees_with_the_exact_drift(
-    reference_maps: Maps, size: tuple[float, float], above: float, n_hits: int
+    reference_maps: FieldMaps, size: tuple[float, float], above: float, n_hits: int
 ) -> None:
     hits = random_events(size, n_hits, above=above)
     exact = simulate_events(reference_maps, hits, SETTINGS)
-    quick = simulate_events(reference_maps, hits, SETTINGS, mode="library")
-    np.testing.assert_array_equal(exact.lost_kev, quick.lost_kev)
-    assert quick.counts["hits interpolated"] > 0.7 * (
-        quick.counts["hits"] - quick.counts["hits without signal"]
+    quick = simulate_events(
+        reference_maps, hits, SETTINGS, build_library(reference_maps, SETTINGS)
     )
+    np.testing.assert_array_equal(exact.lost_kev, quick.lost_kev)
+    assert np.mean(quick.outcome[quick.outcome != NO_SIGNAL] == INTERPOLATED) > 0.7
     kept = exact.collected_kev > 0
     difference = quick.waveforms[kept] - exact.waveforms[kept]
     assert np.sqrt(np.mean(difference**2, axis=1)).max() < 1e-3
@@ -103,12 +107,12 @@ def test_library_agrees_with_the_exact_drift(
     ],
     ids=lambda changed: ", ".join(changed),
 )
-def test_library_follows_the_settings(planar: Maps, changed: dict[str, object]) -> None:
+def test_library_follows_the_settings(planar: FieldMaps, changed: dict[str, object]) -> None:
     settings = SimulationSettings(**{**FINE.model_dump(), **changed})
     hits = random_events((14, 14), 600)
     exact = simulate_events(planar, hits, settings)
-    quick = simulate_events(planar, hits, settings, mode="library")
-    assert quick.counts["hits interpolated"] > 100
+    quick = simulate_events(planar, hits, settings, build_library(planar, settings))
+    assert np.sum(quick.outcome == INTERPOLATED) > 100
     # siggen rounds the cloud's duration, by half a step at most
     limit = 0.01 if "diffusion_constant" in changed else 0.005
     assert np.abs(quick.waveforms - exact.waveforms).max() < limit
@@ -117,7 +121,7 @@ def test_library_follows_the_settings(planar: Maps, changed: dict[str, object]) 
 @given(st.floats(0, 19), st.floats(-7, 7), st.floats(2.2, 11.8), st.integers(0, 3))
 @examples(max_examples=50)
 def test_a_pulse_of_the_library_is_that_of_its_place(
-    planar: Maps, library: Library, r: float, phi: float, z: float, delay: int
+    planar: FieldMaps, library: PulseLibrary, r: float, phi: float, z: float, delay: int
 ) -> None:
     hit = np.array([r * np.cos(phi), r * np.sin(phi), z, 500.0])
     if not covers(library, *hit):
@@ -132,14 +136,14 @@ def test_a_pulse_of_the_library_is_that_of_its_place(
 
 
 @pytest.mark.thorough
-def test_what_misses_the_tolerance_is_drifted(planar: Maps) -> None:
+def test_what_misses_the_tolerance_is_drifted(planar: FieldMaps) -> None:
     hits = random_events((14, 14), 600)
     exact = simulate_events(planar, hits, SETTINGS)
     interpolated, deviation = [], []
     for tolerance in (1e-9, 3e-3, 3e-1):
         settings = FINE.model_copy(update={"library_tolerance": tolerance})
-        quick = simulate_events(planar, hits, settings, mode="library")
-        interpolated.append(quick.counts["hits interpolated"])
+        quick = simulate_events(planar, hits, settings, build_library(planar, settings))
+        interpolated.append(np.sum(quick.outcome == INTERPOLATED))
         deviation.append(np.abs(quick.waveforms - exact.waveforms).max())
     assert interpolated[0] == 0
     assert deviation[0] < 1e-6
@@ -147,28 +151,14 @@ def test_what_misses_the_tolerance_is_drifted(planar: Maps) -> None:
     assert deviation[1] < deviation[2]
 
 
-def test_charges_that_come_too_late_are_drifted_and_counted(planar: Maps) -> None:
+def test_charges_that_come_too_late_are_drifted_and_counted(planar: FieldMaps) -> None:
     short = FINE.model_copy(update={"length_ns": 64.0})
     hits = random_events((14, 14), 600)
     exact = simulate_events(planar, hits, short)
-    quick = simulate_events(planar, hits, short, mode="library")
-    late = "hits not collected within the record"
-    assert 0 < exact.counts[late] == quick.counts[late]
+    quick = simulate_events(planar, hits, short, build_library(planar, short))
+    late = exact.outcome == NOT_COLLECTED
+    assert 0 < late.sum() == np.sum(quick.outcome == NOT_COLLECTED)
     assert np.abs(quick.waveforms - exact.waveforms).max() < 0.005
-
-
-def test_exact_mode_does_without_a_library(
-    planar: Maps, library: Library, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> Library:
-        raise AssertionError
-
-    monkeypatch.setattr(events_module, "build_library", refuse)
-    hits = random_events((14, 14), 6)
-    without = simulate_events(planar, hits, SETTINGS)
-    ignored = simulate_events(planar, hits, SETTINGS, library=library)
-    np.testing.assert_array_equal(without.waveforms, ignored.waveforms)
-    assert simulate_events(planar, hits, SETTINGS, "library", library=library).counts
 
 
 DETECTOR = read_detector("ppc", ["grid_mm=0.5"])
@@ -255,9 +245,9 @@ def test_quick_differences_are_the_exact_ones(hits: Hits, values: dict[str, floa
     same = SameHits(hits)
     detector, settings = changed(**values)
     change = [
-        _smooth(same.simulate(detector, settings, mode=mode))
-        - _smooth(same.simulate(*changed(), mode=mode))
-        for mode in ("exact", "quick")
+        _smooth(same.simulate(detector, settings, quick=quick))
+        - _smooth(same.simulate(*changed(), quick=quick))
+        for quick in (False, True)
     ]
     error = np.sqrt(np.mean((change[1] - change[0]) ** 2) / np.mean(change[0] ** 2))
     assert 0 < error < 0.1

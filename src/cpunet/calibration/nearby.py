@@ -64,7 +64,7 @@ class Simulator:
         """Finely sampled pulses of the first `most` events, for differences."""
         detector, settings = self.physics.at(coordinates)
         fine = settings.model_copy(update={"dt_ns": settings.dt_ns / self._finer})
-        events = self._same.simulate(detector, fine, mode="quick", most=most)
+        events = self._same.simulate(detector, fine, quick=True, most=most)
         self._simulated()
         return events.waveforms
 

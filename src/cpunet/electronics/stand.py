@@ -29,7 +29,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
 from cpunet.simulation.hit_sources import wanted_events
-from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
 from cpunet.tables import counted
 
@@ -212,7 +212,7 @@ def make_stand(
         settings=physics,
         seed=seed,
     )
-    mode, n_events = sim.settings.mode, sum(sim.source.events)
+    mode, n_events = sim.settings.mode, sum(sim.source.events.values())
     many = mode == "library" or (mode == "auto" and n_events >= _LIBRARY_FROM_EVENTS)
     stand = Stand(Path(out), chain)
     with folder_written_aside(stand.folder, STAND, force=force) as folder:
@@ -234,7 +234,7 @@ def make_stand(
     return stand
 
 
-def _write_sim(folder: Path, side: Side, library: Library | None, stand: Stand) -> None:
+def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: Stand) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
     electronics = stand.electronics
@@ -266,7 +266,7 @@ def _write_sim(folder: Path, side: Side, library: Library | None, stand: Stand) 
 
 
 def _write_data(
-    folder: Path, side: Side, seed: int, library: Library | None, stand: Stand
+    folder: Path, side: Side, seed: int, library: PulseLibrary | None, stand: Stand
 ) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = stand.electronics

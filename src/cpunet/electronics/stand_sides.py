@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,12 @@ from cpunet.pulses.container import Pulses
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_sources import EnergyWindow, GammaSource
+from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import Library
+from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings
 
 Labels = npt.NDArray[np.int64]
@@ -52,12 +53,12 @@ class Side:
         with stage(f"Fields of {self.detector.name}"):
             return compute_fields(self.detector)
 
-    def library(self) -> Library:
+    def library(self) -> PulseLibrary:
         """Pre-computed pulses."""
         return build_library(self._fields(), self.settings)
 
     def blocks(
-        self, title: str, library: Library | None
+        self, title: str, library: PulseLibrary | None
     ) -> Iterator[tuple[Pulses, Labels, Hits]]:
         """Finely sampled pulses, their lines and their hits, block by block.
 
@@ -70,18 +71,17 @@ class Side:
             If no event gives a signal.
         """
         fields = self._fields()
-        mode: Literal["exact", "library"] = "exact" if library is None else "library"
         opened = self.source.open(self.detector)
         gain = 0.0
         with stage(title, opened.n_events) as bar:
             for hits in opened.blocks:
                 merged = merge_hits(hits, self.detector, self.settings.cluster_mm)
-                events = simulate_events(fields, merged, self.settings, mode, library=library)
+                events = simulate_events(fields, merged, self.settings, library)
                 kept = events.collected_kev > 0
                 pulses = events.pulses()
                 if len(pulses):
                     untrapped = pulses.energy_kev + events.trapped_kev[kept]
-                    labels = labels_of(untrapped, self.source.windows)
+                    labels = labels_of(untrapped, self.source.events)
                     gain = gain or _calibration(untrapped / pulses.energy_kev, labels)
                     calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     yield calibrated, labels, merged[kept]
@@ -132,13 +132,7 @@ def stand_sides(
         int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
     )
     sim_hits, data_hits = (
-        GammaSource(
-            tuple(events),
-            tuple(events.values()),
-            settings.source_height_mm,
-            settings.source_radius_mm,
-            s,
-        )
+        GammaSource(events, settings.source_height_mm, settings.source_radius_mm, s)
         for s in (sim_seed, data_seed)
     )
     sim = Side(detector, settings, sim_hits)
@@ -150,7 +144,7 @@ def stand_sides(
     return sim, data, readout_seed
 
 
-def labels_of(energy_kev: npt.NDArray[np.float64], windows: tuple[EnergyWindow, ...]) -> Labels:
+def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindow]) -> Labels:
     """Labels by energy window: 0 DEP, 1 SEP, 2 FEP, 3 other; collected energies in keV."""
     labels = np.full(len(energy_kev), OTHER)
     for window in windows:

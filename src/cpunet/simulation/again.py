@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
@@ -123,7 +123,7 @@ class SameHits:
         detector: Detector,
         settings: SimulationSettings,
         *,
-        mode: Literal["exact", "quick", "library"] = "exact",
+        quick: bool = False,
         most: int | None = None,
     ) -> EventPulses:
         """Pulses of the events with the physics of `detector` and `settings`.
@@ -132,10 +132,9 @@ class SameHits:
         ----------
         detector, settings
             Detector and simulation settings.
-        mode
-            ``"exact"`` and ``"library"`` as in `simulate_events`. ``"quick"`` takes longer
-            steps, for differences between two sets of physics: its errors are nearly equal in
-            both. See benchmarks/same_hits.py for accuracy and speed.
+        quick
+            Whether to take longer steps, for differences between two sets of physics: its
+            errors are nearly equal in both. See benchmarks/same_hits.py for accuracy and speed.
         most
             Number of first events to simulate; None for all.
 
@@ -146,9 +145,7 @@ class SameHits:
         """
         fields = superposed_fields(self._solution(detector), detector, depletion=False)
         hits = self._hits[:most]
-        if mode != "quick":
-            return simulate_events(fields, hits, settings, mode)
-        steps = settings.steps_per_sample
+        steps = settings.steps_per_sample if quick else 1
         stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
         return simulate_events(fields, hits, settings, stride=stride)
 

@@ -7,6 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import distance_transform_edt
 
 from cpunet.plotting import COLOURS, styled
@@ -33,7 +36,7 @@ _RAY_RAD = np.deg2rad(55)
 
 
 @styled
-def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True) -> Figure:
+def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     """Potential, weighting potential and collection times on the cross-section r, z.
 
     Collection times are those of holes at the point contact.  They and the paths start in
@@ -46,8 +49,6 @@ def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True
         Detector whose outline is drawn.
     fields
         Field maps of the detector.
-    paths
-        Whether to draw drift paths of electrons and holes over the potential.
     """
     ratio = detector.crystal_length / detector.crystal_radius
     figure = Figure(figsize=(10.5, min(max(1.6 + 2.5 * ratio, 3.4), 7.5)))
@@ -55,8 +56,7 @@ def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True
     _potential(figure, panels[0], fields)
     _weighting_potential(figure, panels[1], fields)
     _collection_times(figure, panels[2], detector, fields)
-    if paths:
-        _paths(panels[0], detector, fields)
+    _paths(panels[0], detector, fields)
     for axes in panels:
         _outline(axes, detector)
         axes.set(xlabel="r [mm]", aspect="equal")
@@ -64,7 +64,16 @@ def detector_figure(detector: Detector, fields: FieldMaps, *, paths: bool = True
         axes.set_xlim(0, detector.crystal_radius * 1.02)
         axes.set_ylim(-0.01 * detector.crystal_length, detector.crystal_length * 1.01)
     panels[0].set_ylabel("z [mm]")
-    _legend(figure, detector, fields, paths)
+    handles = [
+        *(Patch(color=colour, label=name) for _, name, colour in _REGIONS),
+        Line2D([], [], color=_ELECTRON, label="electron path"),
+        Line2D([], [], color=_HOLE, label="hole path"),
+    ]
+    title = (
+        f"{detector.name}: {detector.bias_V:g} V, depleted from {fields.depletion_V:.0f} V, "
+        f"{fields.capacitance_pF:.2f} pF, {detector.temperature_K:g} K"
+    )
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)
     return figure
 
 
@@ -134,12 +143,11 @@ def _collection_times(
     top = float(np.nanmax(times))
     times = _filled(times)
     image = axes.pcolormesh(r, z, times.T, cmap="YlOrRd", vmin=0, vmax=top, rasterized=True)
-    spacing = _round_number(top / 8)
-    levels = np.arange(spacing, top, spacing)
+    levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(0, top)[1:-1]
     lines = axes.contour(r, z, times.T, levels, colors="black", linewidths=0.7)
     axes.clabel(lines, levels=levels[1::2], fmt="%g", fontsize=7.5)
     axes.set_title("Hole collection time")
-    _bar(figure, axes, image, f"To the p⁺ contact [ns], lines every {spacing:g} ns")
+    _bar(figure, axes, image, f"To the p⁺ contact [ns], lines every {levels[0]:g} ns")
 
 
 def _hole_times(fields: FieldMaps, r: FloatArray, z: FloatArray) -> FloatArray:
@@ -151,7 +159,14 @@ def _hole_times(fields: FieldMaps, r: FloatArray, z: FloatArray) -> FloatArray:
 
 
 def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
-    r, z = _starting_points(detector)
+    r, z = np.meshgrid(
+        np.array([0.35, 0.75]) * detector.crystal_radius,
+        np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
+    )
+    # well away from the surfaces of the active germanium
+    margin = 0.05 * detector.crystal_radius
+    inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
+    r, z = r[inside], z[inside]
     tracks = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS)
     for carrier, colour in ((tracks.electrons, _ELECTRON), (tracks.holes, _HOLE)):
         for track in carrier:
@@ -160,18 +175,6 @@ def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
             axes.plot(radius, height, color="white", linewidth=2.2, alpha=0.75)
             axes.plot(radius, height, color=colour, linewidth=1.2)
     axes.plot(r, z, "o", color="white", markeredgecolor="black", markersize=4)
-
-
-def _starting_points(detector: Detector) -> tuple[FloatArray, FloatArray]:
-    """A few points in the active germanium, well away from its surfaces."""
-    r, z = np.meshgrid(
-        np.array([0.35, 0.75]) * detector.crystal_radius,
-        np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
-        indexing="ij",
-    )
-    margin = 0.05 * detector.crystal_radius
-    inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
-    return r[inside], z[inside]
 
 
 def _outline(axes: Axes, detector: Detector) -> None:
@@ -192,23 +195,6 @@ def _outline(axes: Axes, detector: Detector) -> None:
     axes.plot(r, bottom, color="black", linewidth=1.0, zorder=2.3)
 
 
-def _legend(figure: Figure, detector: Detector, fields: FieldMaps, paths: bool) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles: list[Patch | Line2D] = [Patch(color=c, label=name) for _, name, c in _REGIONS]
-    if paths:
-        handles += [
-            Line2D([], [], color=_ELECTRON, label="electron path"),
-            Line2D([], [], color=_HOLE, label="hole path"),
-        ]
-    title = (
-        f"{detector.name}: {detector.bias_V:g} V, depleted from {fields.depletion_V:.0f} V, "
-        f"{fields.capacitance_pF:.2f} pF, {detector.temperature_K:g} K"
-    )
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)
-
-
 def _in_germanium(fields: FieldMaps, values: FloatArray) -> FloatArray:
     """The map with the germanium's values extended into the lithium layer and the ditch."""
     return _filled(np.where(np.isin(fields.point_type, (LI_CONTACT, DITCH)), np.nan, values))
@@ -225,16 +211,3 @@ def _filled(values: FloatArray) -> FloatArray:
 def _bar(figure: Figure, axes: Axes, image: ScalarMappable, text: str) -> None:
     bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.95, pad=0.02, aspect=25)
     bar.set_label(text)
-
-
-def _round_number(value: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten.
-
-    Examples
-    --------
-    >>> _round_number(130), _round_number(42)
-    (100.0, 50.0)
-    """
-    power = 10 ** np.floor(np.log10(value))
-    choices = np.array([1, 2, 5, 10]) * power
-    return float(choices[np.argmin(np.abs(np.log(choices / value)))])

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from cpunet.kernels import kernel
 from cpunet.simulation.field_lookup import (
     DriftMaps,
-    Maps,
     drift_maps,
     in_active_volume,
     look_up,
 )
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import (
     ELECTRON,
@@ -323,7 +323,7 @@ def drift(
 
 
 def drift_paths(
-    fields: Maps,
+    fields: FieldMaps,
     x_mm: npt.ArrayLike,
     y_mm: npt.ArrayLike,
     z_mm: npt.ArrayLike,

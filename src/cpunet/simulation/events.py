@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -12,20 +11,18 @@ from numba import prange
 from cpunet.kernels import kernel
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.drift import FWHM_PER_SIGMA, smear_and_sample
-from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
+from cpunet.simulation.field_lookup import DriftMaps, drift_maps, in_active_volume
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import Library, add_pulse, covers
+from cpunet.simulation.library_lookup import PulseLibrary, add_pulse, covers
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import Task, drift_task, hit_table, point_signal
 from cpunet.simulation.velocity import FloatArray
 
-# Events summed at once.
-_BLOCK = 2000
 # Events per task of a thread.
 _CHUNK = 25
 # Outcomes of a hit.
-_COLLECTED, _NO_SIGNAL, _NOT_COLLECTED, _INTERPOLATED = 0, 1, 2, 3
+COLLECTED, NO_SIGNAL, NOT_COLLECTED, INTERPOLATED = range(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +44,9 @@ class EventPulses:
         Part of it whose signal is lost to trapping.
     event_number
         Event numbers of the source.
-    counts
-        Numbers of hits and events by outcome.
+    outcome
+        Outcome of each hit: `COLLECTED`, `NO_SIGNAL`, `NOT_COLLECTED` within the record, or
+        `INTERPOLATED` between pulses of the library.
     """
 
     waveforms: npt.NDArray[np.float32]
@@ -57,7 +55,7 @@ class EventPulses:
     lost_kev: FloatArray
     trapped_kev: FloatArray
     event_number: npt.NDArray[np.int64]
-    counts: dict[str, int]
+    outcome: npt.NDArray[np.int8]
 
     @property
     def collected_kev(self) -> FloatArray:
@@ -76,11 +74,10 @@ class EventPulses:
 
 
 def simulate_events(
-    fields: Maps,
+    fields: FieldMaps,
     hits: Hits,
     settings: SimulationSettings,
-    mode: Literal["exact", "library"] = "exact",
-    library: Library | None = None,
+    library: PulseLibrary | None = None,
     stride: int = 1,
 ) -> EventPulses:
     r"""Simulate the pulse of each event, in parallel over the events.
@@ -99,11 +96,9 @@ def simulate_events(
         Energy deposits of the events.
     settings
         Simulation settings.
-    mode
-        ``"exact"`` drifts every hit. ``"library"`` interpolates between pre-computed pulses
-        and drifts only the hits where these are not accurate enough.
     library
-        Pre-computed pulses for the same fields and settings; built if None.
+        Pre-computed pulses for the same fields and settings, to interpolate between; only hits
+        where these are not accurate enough are drifted. Without it all are.
     stride
         Number of time steps that a step of the drift replaces, a divisor of those per sample.
 
@@ -113,41 +108,25 @@ def simulate_events(
         If the position or energy of a hit is not finite.
     """
     table = hit_table(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
-    if mode == "exact":
-        library = None
-    elif library is None:
-        library = build_library(fields, settings)
     maps = drift_maps(fields, settings)
     n = hits.n_events
     waveforms = np.zeros((n, settings.n_samples), np.float32)
     lost_kev, trapped_kev = np.zeros(n), np.zeros(n)
     outcome = np.zeros(len(table), np.int8)
     task = drift_task(fields, settings, stride)
-    for begin in range(0, n, _BLOCK):
-        end = min(begin + _BLOCK, n)
-        part = slice(begin, end)
-        offsets = hits.offsets[begin : end + 1]
-        sums = (waveforms[part], lost_kev[part], trapped_kev[part], outcome)
-        if library is None:
-            _sum_exact(maps, table, offsets, task, *sums)
-        else:
-            _sum_library(maps, library, table, offsets, task, *sums)
-    energy = hits.energy_kev
+    sums = (waveforms, lost_kev, trapped_kev, outcome)
+    if library is None:
+        _sum_exact(maps, table, hits.offsets, task, *sums)
+    else:
+        _sum_library(maps, library, table, hits.offsets, task, *sums)
     return EventPulses(
         waveforms=waveforms,
         dt_ns=settings.dt_ns,
-        energy_kev=energy,
+        energy_kev=hits.energy_kev,
         lost_kev=lost_kev,
         trapped_kev=trapped_kev,
         event_number=hits.event_number,
-        counts={
-            "hits": len(table),
-            "hits interpolated": int((outcome == _INTERPOLATED).sum()),
-            "hits without signal": int((outcome == _NO_SIGNAL).sum()),
-            "hits not collected within the record": int((outcome == _NOT_COLLECTED).sum()),
-            "events": n,
-            "events without signal": int((energy - lost_kev - trapped_kev <= 0).sum()),
-        },
+        outcome=outcome,
     )
 
 
@@ -169,7 +148,7 @@ def _sum_exact(
         for i in range(offsets[event], offsets[event + 1]):
             hit = hits[i]
             if not in_active_volume(maps, hit[0], hit[1], hit[2]):
-                outcome[i] = _NO_SIGNAL
+                outcome[i] = NO_SIGNAL
                 lost += hit[3]
                 continue
             collected += hit[3]
@@ -184,7 +163,7 @@ def _sum_exact(
 @kernel(parallel=True)
 def _sum_library(
     maps: DriftMaps,
-    library: Library,
+    library: PulseLibrary,
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
     task: Task,
@@ -208,12 +187,12 @@ def _sum_library(
             for i in range(offsets[event], offsets[event + 1]):
                 hit = hits[i]
                 if not in_active_volume(maps, hit[0], hit[1], hit[2]):
-                    outcome[i] = _NO_SIGNAL
+                    outcome[i] = NO_SIGNAL
                     lost += hit[3]
                     continue
                 collected += hit[3]
                 if covers(library, hit[0], hit[1], hit[2], hit[3]):
-                    outcome[i] = _INTERPOLATED
+                    outcome[i] = INTERPOLATED
                     trapped += add_pulse(library, hit, hit[3], 0, quick, steps)
                 else:
                     outcome[i], part = _add_drifted(maps, hit, task, signal, out)
@@ -237,4 +216,4 @@ def _add_drifted(
     """Add the pulse of one drifted hit to `out`; return its outcome and trapped fraction."""
     last, arrived, fwhm, trapped = point_signal(maps, hit, task, signal)
     smear_and_sample(signal, task.per_sample, fwhm / FWHM_PER_SIGMA, last, hit[3], out)
-    return _COLLECTED if arrived else _NOT_COLLECTED, trapped
+    return COLLECTED if arrived else NOT_COLLECTED, trapped

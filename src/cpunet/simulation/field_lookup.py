@@ -2,14 +2,14 @@
 
 Nodes inside a contact carry no field. The first layers of them are extrapolated from the
 germanium, so the surface of a contact lies between nodes where the potential reaches that of
-the contact. Maps coarser than 0.1 mm are refined by cubic splines, because bilinear
+the contact. FieldMaps coarser than 0.1 mm are refined by cubic splines, because bilinear
 interpolation would flatten the weighting potential near the contact.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import DITCH
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import FloatArray, velocity_table
@@ -30,25 +31,6 @@ E_R, E_Z, WP, POTENTIAL = range(4)
 _FINE_MM = 0.1
 # Extrapolated nodes used by the splines inside a contact and beyond a mirror plane.
 _SPLINE_GHOSTS, _SPLINE_MIRROR = 8, 6
-
-
-class Maps(Protocol):
-    """Attributes of `cpunet.simulation.fields.FieldMaps` that the drift needs."""
-
-    @property
-    def grid_mm(self) -> float: ...
-    @property
-    def potential_V(self) -> FloatArray: ...
-    @property
-    def e_r_V_per_cm(self) -> FloatArray: ...
-    @property
-    def e_z_V_per_cm(self) -> FloatArray: ...
-    @property
-    def weighting_potential(self) -> FloatArray: ...
-    @property
-    def point_type(self) -> npt.NDArray[np.int8]: ...
-    @property
-    def temperature_K(self) -> float: ...
 
 
 class DriftMaps(NamedTuple):
@@ -70,7 +52,7 @@ class DriftMaps(NamedTuple):
     trapping_per_ns: FloatArray
 
 
-def drift_maps(fields: Maps, settings: SimulationSettings) -> DriftMaps:
+def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
@@ -165,33 +147,22 @@ def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, 
     >>> with_ghost_nodes(values, known)[0].ravel().tolist()
     [1.0, 2.0, 3.0]
     """
+    nr, nz = known.shape
     for _ in range(2):
-        total = np.zeros_like(values)
-        ways = np.zeros(known.shape)
-        for axis in (0, 1):
-            for near, far in ((1, 2), (-1, -2)):
-                usable = _shifted(known, near, axis) & _shifted(known, far, axis) & ~known
-                here = np.nonzero(usable)
-                one, two = list(here), list(here)
-                one[axis], two[axis] = here[axis] + near, here[axis] + far
-                total[here] += 2 * values[tuple(one)] - values[tuple(two)]
-                ways += usable
+        total, ways, padded = np.zeros_like(values), np.zeros(known.shape), np.pad(known, 2)
+        for dr, dz in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            one, two = (
+                padded[2 + n * dr : 2 + n * dr + nr, 2 + n * dz : 2 + n * dz + nz]
+                for n in (1, 2)
+            )
+            i, j = np.nonzero(one & two & ~known)
+            total[i, j] += 2 * values[i + dr, j + dz] - values[i + 2 * dr, j + 2 * dz]
+            ways[i, j] += 1
         found = np.nonzero(ways)
         filled = values.copy()
         filled[found] = (total[found].T / ways[found]).T
         values, known = filled, known | (ways > 0)
     return values, known
-
-
-def _shifted(array: npt.NDArray[Any], by: int, axis: int) -> npt.NDArray[Any]:
-    """Shift an array: entry i is the old entry i + by. Zeros fill the end."""
-    out = np.zeros_like(array)
-    n = array.shape[axis]
-    target = slice(0, n - by) if by > 0 else slice(-by, n)
-    source = slice(by, n) if by > 0 else slice(0, n + by)
-    index = (slice(None),) * axis
-    out[(*index, target)] = array[(*index, source)]
-    return out
 
 
 @kernel(inline="always")

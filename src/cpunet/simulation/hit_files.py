@@ -1,10 +1,11 @@
-"""One entry point for all formats of hits, recognised by the content of the file."""
+"""One entry point for all formats of hits, recognised by content, and what is in a file."""
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,10 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.recipes.schema import PeakConfig
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_steps import (
     Steps,
     choose,
@@ -35,12 +39,15 @@ from cpunet.simulation.hit_tables import (
     table_of,
 )
 from cpunet.simulation.hits import HitOptions, Hits
+from cpunet.tables import counted, span
 
 HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
 _EVENTS = "geds/sim/event_number"
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
+# More hits outside the crystal are those of another frame, or of another detector.
+_MISPLACED_PERCENT = 1.0
 _NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")  # arrays of an NPZ
 
 
@@ -220,3 +227,109 @@ def _stored(path: Path) -> Steps:
             f"{path}: {HIT_TABLE} has no hit of event {events[without][0]}; simulate it again"
         )
     return steps
+
+
+@dataclass(frozen=True)
+class HitsInfo:
+    """What is known of the hits of one detector.
+
+    Parameters
+    ----------
+    events, hits
+        Their numbers.
+    energy_kev
+        Lowest and highest energy of an event in keV.
+    extents_mm
+        Lowest and highest x, y, z and r in the frame of the file less a known origin.
+    peaks
+        Number of events in each gamma line, by the energy deposited.
+    crystal
+        Crystal in which the hits should lie, if one was given.
+    outside_percent
+        Share of the hits outside it.
+    """
+
+    events: int
+    hits: int
+    energy_kev: list[float]
+    extents_mm: dict[str, list[float]]
+    peaks: dict[str, int]
+    crystal: Detector | None
+    outside_percent: float
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Names and texts."""
+        extents = ", ".join(f"{axis} {span(ends, 2)}" for axis, ends in self.extents_mm.items())
+        lines = [
+            ("hits", f"{self.hits} of {self.events} events"),
+            ("energy", f"{span(self.energy_kev)} keV an event"),
+            ("lines", counted(self.peaks)),
+            ("extents", f"{extents} mm"),
+        ]
+        if (crystal := self.crystal) is not None:
+            size = f"radius {crystal.crystal_radius:g} mm, z 0 to {crystal.crystal_length:g} mm"
+            misplaced = self.outside_percent > _MISPLACED_PERCENT
+            remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
+            lines += [
+                ("crystal", f"{crystal.name}, {size}"),
+                ("outside", f"{self.outside_percent:.2f} % of the hits{remedy}"),
+            ]
+        return lines
+
+
+def describe_hits(
+    path: Path,
+    options: HitOptions,
+    peaks: Mapping[str, PeakConfig],
+    crystal: Detector | None = None,
+) -> dict[str, HitsInfo | str]:
+    """Describe the hits of a file, detector by detector.
+
+    Parameters
+    ----------
+    path
+        A file for which `holds_hits` is true.
+    options
+        How it is read; all detectors if none is chosen.
+    peaks
+        Gamma lines whose events are counted.
+    crystal
+        Crystal in which the hits should lie.
+
+    Returns
+    -------
+    dict
+        By name of the detector (``""`` if the file names none); or the reason why its hits
+        cannot be read.
+    """
+    found: dict[str, HitsInfo | str] = {}
+    names: list[str | None] = [options.hits_detector]
+    if options.hits_detector is None:
+        names = [*hit_detectors(path)] or names
+    for name in names:
+        as_in_file = replace(options, hits_detector=name, origin=(0, 0, 0), flip_z=False)
+        try:
+            hits = read_hits(path, as_in_file)
+        except CpunetError as error:
+            found[name or ""] = str(error).removeprefix(f"{path}: ")
+            continue
+        places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm}
+        places["r"] = np.hypot(hits.x_mm, hits.y_mm)
+        lines = label_peaks(hits.energy_kev, peaks)
+        x, y, z = options.to_crystal(hits.position_mm).T
+        inside = np.ones(len(x), bool) if crystal is None else crystal.inside(np.hypot(x, y), z)
+        found[name or ""] = HitsInfo(
+            events=hits.n_events,
+            hits=len(x),
+            energy_kev=_ends(hits.energy_kev),
+            extents_mm={axis: _ends(values) for axis, values in places.items()},
+            peaks={peak: int((lines == peak).sum()) for peak in peaks},
+            crystal=crystal,
+            outside_percent=100 * float(np.mean(~inside)),
+        )
+    return found
+
+
+def _ends(values: npt.NDArray[np.float64]) -> list[float]:
+    return [float(values.min()), float(values.max())]

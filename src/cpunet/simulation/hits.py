@@ -156,26 +156,14 @@ class Hits:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         # hit j of the result is hit j - offsets[i] of its original event
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
-        return Hits(
-            self.x_mm[take],
-            self.y_mm[take],
-            self.z_mm[take],
-            self.edep_kev[take],
-            offsets,
-            self.event_number[rows],
-        )
+        kept = self.position_mm[take], self.edep_kev[take]
+        return Hits.of(*kept, offsets, self.event_number[rows])
 
     def where(self, keep: npt.NDArray[np.bool_]) -> Hits:
         """The same events with only the hits of a mask. An event may become empty."""
         kept = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
-        return Hits(
-            self.x_mm[keep],
-            self.y_mm[keep],
-            self.z_mm[keep],
-            self.edep_kev[keep],
-            kept[self.offsets],
-            self.event_number,
-        )
+        left = self.position_mm[keep], self.edep_kev[keep]
+        return Hits.of(*left, kept[self.offsets], self.event_number)
 
     def of_events(self, event_number: npt.ArrayLike) -> Hits:
         """Events with the given numbers, in their order.

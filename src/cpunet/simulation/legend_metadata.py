@@ -86,7 +86,6 @@ _EXTRA = (
 )
 # of the argon around LEGEND's detectors
 LIQUID_ARGON_K = 87.0
-_NOT_SIMULATED = {"coax": "semi-coaxial detectors collect on their bore"}
 _SIMULATED = ("icpc", "bege", "ppc")
 # closer points determine no slope
 _NEAREST_CM = 1e-6
@@ -127,10 +126,9 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
         has a crack, which is not symmetric.
     """
     kind = diode.get("type")
-    if kind is not None and kind not in _SIMULATED:
-        why = f" ({_NOT_SIMULATED[kind]})" if str(kind) in _NOT_SIMULATED else ""
+    if kind is not None and kind not in _SIMULATED:  # semi-coaxial ones collect on their bore
         raise CpunetError(
-            f"detector {name}: type {reprlib.repr(kind)} is not simulated{why}; "
+            f"detector {name}: type {reprlib.repr(kind)} is not simulated; "
             f"give one of type {', '.join(_SIMULATED)}"
         )
     geometry = _flat(diode["geometry"], name)
@@ -158,9 +156,12 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
         none = not any(values.get(size) for size in sizes)
         if none or values.get(f"{shape}_radius") == values.get(same, 0):
             values = {k: v for k, v in values.items() if k not in (f"{shape}_radius", *sizes)}
-    outer, inner = (geometry.get(f"groove.radius_in_mm.{x}", 0) for x in ("outer", "inner"))
+    outer, inner = (
+        _number_at(diode, f"geometry.groove.radius_in_mm.{side}", f"detector {name}", 0.0)
+        for side in ("outer", "inner")
+    )
     if geometry.get("groove.depth_in_mm"):
-        values["ditch_thickness"] = _number(outer, name) - _number(inner, name)
+        values["ditch_thickness"] = outer - inner
     for field, places in _MEASURED.items():
         found = [v for v in (_at(diode, p) for p in places) if isinstance(v, int | float)]
         if known := [v for v in found if v > 0]:
@@ -214,15 +215,6 @@ def _at(values: Any, place: str) -> Any:
     for key in place.split("."):
         values = values.get(key) if isinstance(values, Mapping) else None
     return values
-
-
-def _number(value: Any, name: str) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError) as error:
-        raise CpunetError(
-            f"detector {name}: geometry.groove.radius_in_mm has no numbers; give both"
-        ) from error
 
 
 def impurity_values(
@@ -303,11 +295,7 @@ def _number_at(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
     """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
-    found: Any = values
-    for key in place.split("."):
-        found = found.get(key) if isinstance(found, Mapping) else None
-    if found is None and default is not None:
-        return default
+    found = default if _at(values, place) is None else _at(values, place)
     if found is None:
         raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
     number = isinstance(found, int | float) and not isinstance(found, bool)

@@ -12,7 +12,8 @@ import math
 import numpy as np
 
 from cpunet.progress import Stage, stage
-from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps
+from cpunet.simulation.field_lookup import DriftMaps, drift_maps
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.library_drift import (
     MARGIN_NS,
     IntArray,
@@ -20,7 +21,7 @@ from cpunet.simulation.library_drift import (
     compare,
     drift_nodes,
 )
-from cpunet.simulation.library_lookup import LATE, OUTSIDE, UNTRIED, Library
+from cpunet.simulation.library_lookup import LATE, OUTSIDE, UNTRIED, PulseLibrary
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import EXACT, WHOLE_ON_AVERAGE, Task, drift_task
 from cpunet.simulation.velocity import FloatArray
@@ -36,7 +37,7 @@ def _blocks(n: int) -> list[slice]:
     return [slice(b, min(b + _BLOCK, n)) for b in range(0, n, _BLOCK)]
 
 
-def build_library(fields: Maps, settings: SimulationSettings) -> Library:
+def build_library(fields: FieldMaps, settings: SimulationSettings) -> PulseLibrary:
     """Simulate pulses on an adaptive grid, in parallel.
 
     At the centre of each cell, at azimuths between those of its nodes, the interpolated pulse
@@ -70,14 +71,14 @@ def build_library(fields: Maps, settings: SimulationSettings) -> Library:
     return library
 
 
-def _task(fields: Maps, settings: SimulationSettings) -> Task:
+def _task(fields: FieldMaps, settings: SimulationSettings) -> Task:
     """No jumps from place to place, which could not be interpolated."""
     task = drift_task(fields, settings)
     rounding = EXACT if task.rounding == EXACT else WHOLE_ON_AVERAGE
     return task._replace(rounding=rounding)
 
 
-def _empty(fields: Maps, settings: SimulationSettings) -> Library:
+def _empty(fields: FieldMaps, settings: SimulationSettings) -> PulseLibrary:
     finest = settings.library_grid_mm / 2**settings.library_halvings
     nr, nz = (
         2**settings.library_halvings
@@ -85,7 +86,7 @@ def _empty(fields: Maps, settings: SimulationSettings) -> Library:
         for n in fields.potential_V.shape
     )
     energies = _ENERGIES_KEV if settings.self_repulsion else _ENERGIES_KEV[:1]
-    return Library(
+    return PulseLibrary(
         pulses=np.zeros(0, np.float32),
         start=np.zeros(0, np.int64),
         samples=np.zeros(0, np.int64),
@@ -116,7 +117,7 @@ def _phases(settings: SimulationSettings) -> int:
     )
 
 
-def _new_corners(library: Library, cells: IntArray, size: int) -> IntArray:
+def _new_corners(library: PulseLibrary, cells: IntArray, size: int) -> IntArray:
     """Corners (n, 2) of cells at which no charge has been drifted yet."""
     new = np.zeros(library.column.shape, np.bool_)
     new[tuple((cells[:, None] + size * _CORNERS).reshape(-1, 2).T)] = True
@@ -125,8 +126,8 @@ def _new_corners(library: Library, cells: IntArray, size: int) -> IntArray:
 
 
 def _with_nodes(
-    library: Library, maps: DriftMaps, task: Task, places: IntArray, bar: Stage
-) -> Library:
+    library: PulseLibrary, maps: DriftMaps, task: Task, places: IntArray, bar: Stage
+) -> PulseLibrary:
     """Add columns of pulses at further grid points (n, 2), given in fine steps."""
     azimuths = len(library.cos4)
     longest = library.margin + task.n_samples
@@ -162,7 +163,7 @@ def _with_nodes(
     )
 
 
-def _sorted(library: Library, cells: IntArray, size: int) -> tuple[IntArray, IntArray]:
+def _sorted(library: PulseLibrary, cells: IntArray, size: int) -> tuple[IntArray, IntArray]:
     """Cells with pulses at all corners, and cells at an edge, which are to be halved."""
     corners = library.column[tuple(np.moveaxis(cells[:, None] + size * _CORNERS, -1, 0))]
     known, outside, late = corners >= 0, corners == OUTSIDE, corners == LATE
@@ -170,7 +171,7 @@ def _sorted(library: Library, cells: IntArray, size: int) -> tuple[IntArray, Int
     return cells[known.all(1)], cells[known.any(1) & outside.any(1) & ~late.any(1)]
 
 
-def _with_cells(library: Library, cells: IntArray, size: int) -> Library:
+def _with_cells(library: PulseLibrary, cells: IntArray, size: int) -> PulseLibrary:
     """Add cells in which pulses are interpolated."""
     _enter(library.cell, cells, size, np.full(len(cells), size))
     _enter(library.number, cells, size, len(library.bend_ns) + np.arange(len(cells)))
@@ -180,7 +181,7 @@ def _with_cells(library: Library, cells: IntArray, size: int) -> Library:
 
 
 def _deviations(
-    library: Library, maps: DriftMaps, task: Task, places: FloatArray, bar: Stage
+    library: PulseLibrary, maps: DriftMaps, task: Task, places: FloatArray, bar: Stage
 ) -> FloatArray:
     worst = np.zeros(len(places))
     for block in _blocks(len(places)):

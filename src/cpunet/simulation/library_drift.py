@@ -11,7 +11,13 @@ from numba import prange
 from cpunet.kernels import kernel
 from cpunet.simulation.drift import FWHM_PER_SIGMA, smear_and_sample
 from cpunet.simulation.field_lookup import DriftMaps, in_active_volume
-from cpunet.simulation.library_lookup import LATE, OUTSIDE, Float32Array, Library, add_pulse
+from cpunet.simulation.library_lookup import (
+    LATE,
+    OUTSIDE,
+    Float32Array,
+    PulseLibrary,
+    add_pulse,
+)
 from cpunet.simulation.signals import Task, point_signal
 from cpunet.simulation.velocity import FloatArray
 
@@ -23,7 +29,7 @@ times differ by more are of different kinds (another path or another carrier).""
 
 
 @kernel
-def bend(library: Library, cells: IntArray, size: int, bends: Float32Array) -> None:
+def bend(library: PulseLibrary, cells: IntArray, size: int, bends: Float32Array) -> None:
     """Curvature of the half-maximum time in r and in z: ``bend u (1 - u)`` is added.
 
     It is the mean second difference at the corners for which both neighbours exist.
@@ -57,7 +63,7 @@ def bend(library: Library, cells: IntArray, size: int, bends: Float32Array) -> N
 
 @kernel(parallel=True)
 def drift_nodes(
-    library: Library,
+    library: PulseLibrary,
     maps: DriftMaps,
     task: Task,
     places: IntArray,
@@ -99,7 +105,7 @@ def _at_azimuth(r: float, z: float, k: float, azimuths: int, energy: float) -> F
 
 @kernel
 def _fine_pulse(
-    library: Library,
+    library: PulseLibrary,
     maps: DriftMaps,
     task: Task,
     hit: FloatArray,
@@ -147,7 +153,7 @@ def _half_time(signal: FloatArray, zero: int) -> float:
 
 @kernel(parallel=True)
 def compare(
-    library: Library, maps: DriftMaps, task: Task, places: FloatArray, worst: FloatArray
+    library: PulseLibrary, maps: DriftMaps, task: Task, places: FloatArray, worst: FloatArray
 ) -> None:
     """Largest deviation at points (fine steps), at every other midpoint of two azimuths."""
     for place in prange(len(places)):
@@ -180,7 +186,7 @@ def _between(energies: FloatArray, k: int) -> float:
 
 
 @kernel
-def _spread(library: Library, place: FloatArray, k: int) -> float:
+def _spread(library: PulseLibrary, place: FloatArray, k: int) -> float:
     """Range (ns) of the half-maximum times of the corners around a point."""
     size = library.cell[int(place[0]), int(place[1])]
     i, j = int(place[0]) // size * size, int(place[1]) // size * size
@@ -193,7 +199,7 @@ def _spread(library: Library, place: FloatArray, k: int) -> float:
 
 
 @kernel
-def _deviation(library: Library, hit: FloatArray, rows: Float32Array) -> float:
+def _deviation(library: PulseLibrary, hit: FloatArray, rows: Float32Array) -> float:
     """Largest deviation between interpolated and exact samples over all phases.
 
     The largest rise in one sample also counts, relative to itself.

@@ -20,15 +20,15 @@ from cpunet.simulation.velocity import FloatArray
 
 Float32Array = npt.NDArray[np.float32]
 
-# Entries of `Library.column` at grid points without pulses: not tried yet, outside the active
-# germanium, not collected within the record.
+# Entries of `PulseLibrary.column` at grid points without pulses: not tried yet, outside the
+# active germanium, not collected within the record.
 UNTRIED, OUTSIDE, LATE = -3, -2, -1
 
 # Energy above which repulsion widens a typical cloud more than diffusion does.
 _REPELLING_KEV = 100.0
 
 
-class Library(NamedTuple):
+class PulseLibrary(NamedTuple):
     """Pulses of point charges at columns of nodes: points in (r, z), each at all azimuths.
 
     Cells of 1, 2, 4, ... fine steps tile the (r, z) plane. The pulse inside a cell is
@@ -65,7 +65,7 @@ class Library(NamedTuple):
 
 
 @kernel
-def covers(library: Library, x: float, y: float, z: float, energy_kev: float) -> bool:
+def covers(library: PulseLibrary, x: float, y: float, z: float, energy_kev: float) -> bool:
     """Whether the pulse of a hit can be interpolated."""
     i, j = int(math.hypot(x, y) * library.per_mm), int(z * library.per_mm)
     nr, nz = library.cell.shape
@@ -78,7 +78,7 @@ def covers(library: Library, x: float, y: float, z: float, energy_kev: float) ->
 
 @kernel
 def add_pulse(
-    library: Library,
+    library: PulseLibrary,
     hit: FloatArray,
     weight: float,
     delay: int,
@@ -140,7 +140,7 @@ def add_pulse(
 
 @kernel
 def _smooth_half(
-    library: Library,
+    library: PulseLibrary,
     cos4: float,
     first: tuple[int, int, int, int],
     parts: tuple[float, float, float, float],
@@ -191,7 +191,7 @@ def _cloud_scale(energy_kev: float) -> float:
 
 @kernel
 def _add_shifted(
-    library: Library,
+    library: PulseLibrary,
     node: int,
     row: int,
     weight: float,

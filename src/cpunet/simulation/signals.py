@@ -19,7 +19,8 @@ from cpunet.simulation.drift import (
     repulsion_constant,
     smear_and_sample,
 )
-from cpunet.simulation.field_lookup import DriftMaps, Maps, drift_maps, in_active_volume
+from cpunet.simulation.field_lookup import DriftMaps, drift_maps, in_active_volume
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.hits import FARTHEST_MM
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
@@ -82,7 +83,7 @@ class Signals:
 
 
 def hit_signals(
-    fields: Maps,
+    fields: FieldMaps,
     x_mm: npt.ArrayLike,
     y_mm: npt.ArrayLike,
     z_mm: npt.ArrayLike,
@@ -125,7 +126,7 @@ def hit_signals(
     In a planar detector of thickness :math:`d` the pulse rises by :math:`(v_e + v_h)/d`.
 
     >>> from types import SimpleNamespace
-    >>> from cpunet.simulation.velocity import drift_velocity, velocity_table
+    >>> from cpunet.simulation.velocity import carrier_velocity, velocity_table
     >>> height = np.tile(np.arange(11.0), (11, 1))  # z in mm
     >>> planar = SimpleNamespace(
     ...     grid_mm=1.0, potential_V=100 * height, weighting_potential=1 - height / 10,
@@ -133,9 +134,9 @@ def hit_signals(
     ...     point_type=np.full((11, 11), 2, np.int8), temperature_K=90.0)
     >>> point = SimulationSettings(dt_ns=1, length_ns=200, diffusion=False, cloud_fwhm_mm=0)
     >>> pulse = hit_signals(planar, 0.0, 0.0, [5.0], 100.0, point).waveforms[0]
-    >>> along_z = [[0.0, 0.0, -1000.0]]
     >>> v_e, v_h = (
-    ...     abs(drift_velocity(velocity_table(90), along_z, c)[0, 2]) for c in (ELECTRON, HOLE))
+    ...     abs(carrier_velocity(*velocity_table(90), carrier, 0.0, 0.0, -1000.0)[2])
+    ...     for carrier in (ELECTRON, HOLE))
     >>> bool(abs(pulse[20] - 20 * (v_e + v_h) / 10) < 1e-3), round(float(pulse[-1]), 3)
     (True, 1.0)
     """
@@ -171,7 +172,7 @@ def hit_table(
     return table
 
 
-def drift_task(fields: Maps, settings: SimulationSettings, stride: int = 1) -> Task:
+def drift_task(fields: FieldMaps, settings: SimulationSettings, stride: int = 1) -> Task:
     """Parameters of the compiled loops for some settings.
 
     A drift step replaces `stride` time steps, a divisor of their number per sample.

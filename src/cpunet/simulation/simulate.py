@@ -22,14 +22,13 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, read_settings, require_seed
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.events import EventPulses, simulate_events
+from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
-from cpunet.simulation.gammas.sample import with_resolution
+from cpunet.simulation.gammas.sample import EnergyWindow, with_resolution
 from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
 from cpunet.simulation.hit_sources import (
-    EnergyWindow,
     GammaSource,
     HitFile,
     HitSource,
@@ -84,6 +83,26 @@ class Simulation:
     def without_signal(self) -> int:
         """Number of events that were not written because none of their hits gives a signal."""
         return self.n_events - self.n_written
+
+    def count(self, hits: Hits, events: EventPulses, windows: list[EnergyWindow]) -> None:
+        """Count a block of events."""
+        r = np.hypot(hits.x_mm, hits.y_mm)
+        inside = self.detector.inside(r, hits.z_mm)
+        contacts = np.isin(self.detector.region(r, hits.z_mm), (POINT_CONTACT, LI_CONTACT))
+        collected = events.collected_kev
+        self.n_events += len(hits)
+        self.n_written += int((collected > 0).sum())
+        self.hits += len(hits.edep_kev)
+        self.hits_outside += int((~inside).sum())
+        self.hits_in_contacts += int((inside & contacts).sum())
+        self.not_collected += int((events.outcome == NOT_COLLECTED).sum())
+        self.energy_kev += float(events.energy_kev.sum())
+        self.lost_kev += float(events.lost_kev.sum())
+        self.trapped_kev += float(events.trapped_kev.sum())
+        self.events_with_loss += int((events.lost_kev > 0).sum())
+        for window in windows:
+            within = (collected >= window.low_kev) & (collected <= window.high_kev)
+            self.lines[window.name] += int(within.sum())
 
     def __repr__(self) -> str:
         return f"<Simulation {self.path}: {self.n_written} pulses of {self.detector.name}>"
@@ -173,25 +192,26 @@ def simulate(
     refuse_inputs(out, *files)
     physics = read_settings(SimulationSettings, settings_file, of_settings)
     peaks = load_recipe("fast").peaks
-    windows = tuple(energy_windows(",".join(peaks), peaks, physics.window_kev))
+    windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
     source: HitSource
     if hits is not None:
         source = hits if isinstance(hits, HitFile) else HitFile(Path(hits), frame)
         if events is not None:
             names = events if isinstance(events, str) else ",".join(events)
-            windows = tuple(energy_windows(names, peaks, physics.window_kev))
-            source = replace(source, windows=windows)
+            windows = energy_windows(names, peaks, physics.window_kev)
+            source = replace(source, windows=tuple(windows))
     elif events is not None:
         wanted = wanted_events(events, peaks, physics.window_kev)
-        windows = tuple(wanted)
-        height, radius = physics.source_height_mm, physics.source_radius_mm
-        source = GammaSource(windows, tuple(wanted.values()), height, radius, seed)
+        windows = list(wanted)
+        source = GammaSource(wanted, physics.source_height_mm, physics.source_radius_mm, seed)
     else:
         raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
     simulation = Simulation(out, read_detector(detector, of_detector), physics)
     writer = PulseWriter(
         out, attrs={"made_by": f"cpunet simulate {cpunet.__version__}"}, force=force
     )
+    if resolution is not None:
+        _smeared(np.zeros(0), resolution, seed)  # wrong ones are told before any work
     _simulate(simulation, source, windows, writer, resolution, seed)
     return simulation
 
@@ -199,24 +219,24 @@ def simulate(
 def _simulate(
     simulation: Simulation,
     source: HitSource,
-    windows: tuple[EnergyWindow, ...],
+    windows: list[EnergyWindow],
     writer: PulseWriter,
     resolution: Resolution | None,
     seed: int,
 ) -> None:
     """Write the pulses, and count them."""
     detector, settings = simulation.detector, simulation.settings
-    if resolution is not None:
-        _smeared(np.zeros(0), resolution, seed)  # wrong ones are told before any work
     opened = source.open(detector)
-    if opened.warning:
-        log.warning(opened.warning)
     with stage(f"Fields of {detector.name}"):
         fields = compute_fields(detector)
     merged = isinstance(source, HitFile) and source.placed
-    blocks = _merged(
-        opened.blocks, detector, 0.0 if merged else settings.cluster_mm, simulation
-    )
+
+    def merged_blocks() -> Iterator[Hits]:
+        for block in opened.blocks:
+            simulation.hits_before_merging += len(block.edep_kev)
+            yield merge_hits(block, detector, 0.0 if merged else settings.cluster_mm)
+
+    blocks = merged_blocks()
     first = next(blocks)
     mode = settings.mode
     if mode == "auto":
@@ -226,8 +246,8 @@ def _simulate(
     library = build_library(fields, settings) if mode == "library" else None
     with writer, stage(f"Simulating {detector.name}", opened.n_events) as bar:
         for block in chain([first], blocks):
-            events = simulate_events(fields, block, settings, mode, library)
-            _count(simulation, block, events, windows)
+            events = simulate_events(fields, block, settings, library)
+            simulation.count(block, events, windows)
             _append(writer, block, events, settings, resolution, seed)
             bar.update(len(block))
         if not writer.n_pulses:
@@ -235,44 +255,24 @@ def _simulate(
                 f"{simulation.path}: none of {simulation.n_events} events gives a signal: "
                 f"their hits lie outside {detector.name} or in its contacts; check their frame"
             )
-        made = _made(simulation, source, resolution, seed) | {"depletion_V": fields.depletion_V}
+        made = {
+            "cpunet": cpunet.__version__,
+            "detector": detector.model_dump(mode="json"),
+            "settings": settings.model_dump(mode="json"),
+            "hits": source.provenance(),
+            "mode": mode,
+            "resolution": resolution,
+            "seed": seed,
+            "events": simulation.n_events,
+            "events_without_signal": simulation.without_signal,
+            "depletion_V": fields.depletion_V,
+        }
         writer.annotate({"simulation": json.dumps(made)})
 
 
 def _smeared(energy_kev: Any, resolution: Resolution, seed: int) -> Any:
     noise, fano = resolution
     return with_resolution(energy_kev, noise_kev2=noise, fano_kev=fano, seed=seed)
-
-
-def _merged(
-    blocks: Iterator[Hits], detector: Detector, distance_mm: float, simulation: Simulation
-) -> Iterator[Hits]:
-    for block in blocks:
-        simulation.hits_before_merging += len(block.edep_kev)
-        yield merge_hits(block, detector, distance_mm)
-
-
-def _count(
-    simulation: Simulation, hits: Hits, events: EventPulses, windows: tuple[EnergyWindow, ...]
-) -> None:
-    """Count a block of events."""
-    r = np.hypot(hits.x_mm, hits.y_mm)
-    inside = simulation.detector.inside(r, hits.z_mm)
-    contacts = np.isin(simulation.detector.region(r, hits.z_mm), (POINT_CONTACT, LI_CONTACT))
-    collected = events.collected_kev
-    simulation.n_events += len(hits)
-    simulation.n_written += int((collected > 0).sum())
-    simulation.hits += len(hits.edep_kev)
-    simulation.hits_outside += int((~inside).sum())
-    simulation.hits_in_contacts += int((inside & contacts).sum())
-    simulation.not_collected += events.counts["hits not collected within the record"]
-    simulation.energy_kev += float(events.energy_kev.sum())
-    simulation.lost_kev += float(events.lost_kev.sum())
-    simulation.trapped_kev += float(events.trapped_kev.sum())
-    simulation.events_with_loss += int((events.lost_kev > 0).sum())
-    for window in windows:
-        within = (collected >= window.low_kev) & (collected <= window.high_kev)
-        simulation.lines[window.name] += int(within.sum())
 
 
 def _append(
@@ -298,20 +298,3 @@ def _append(
         pulses = replace(pulses, energy_kev=_smeared(pulses.energy_kev, resolution, block_seed))
     writer.append(pulses, columns)
     writer.append_rows(HIT_TABLE, hit_columns(hits[kept]))
-
-
-def _made(
-    simulation: Simulation, source: HitSource, resolution: Resolution | None, seed: int
-) -> dict[str, Any]:
-    """Provenance of the file, to be stored in it."""
-    return {
-        "cpunet": cpunet.__version__,
-        "detector": simulation.detector.model_dump(mode="json"),
-        "settings": simulation.settings.model_dump(mode="json"),
-        "hits": source.provenance(),
-        "mode": simulation.mode,
-        "resolution": resolution,
-        "seed": seed,
-        "events": simulation.n_events,
-        "events_without_signal": simulation.without_signal,
-    }

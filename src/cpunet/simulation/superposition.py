@@ -20,8 +20,10 @@ import heapq
 import logging
 import math
 import os
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import platformdirs
@@ -32,6 +34,8 @@ from cpunet.outputs import written_aside
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.geometry import GERMANIUM, Detector, FloatArray, RegionArray
 from cpunet.simulation.poisson import Grid, Potentials, make_grid, solve_potentials
+
+log = logging.getLogger(__name__)
 
 # V: a pocket this shallow holds no charge (about kT/e at 90 K), and is not resolved by the
 # grid
@@ -122,9 +126,6 @@ def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) ->
 # part of the file name, so that results of an older solver are not used
 SOLVER_VERSION = 3
 
-_OF_GRID = ("r_mm", "z_mm", "region", "r_steps", "z_steps")
-_OF_NODES = ("point_contact", "bias", "impurities", "tilt", "surface")
-
 
 def cache_file(key: str) -> Path:
     """Cache file of the potentials of a detector with the fingerprint `key`."""
@@ -132,35 +133,27 @@ def cache_file(key: str) -> Path:
     return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
 
 
-def kept_parts(key: str, step_mm: float) -> tuple[Grid, Potentials, float] | None:
+def kept_parts(key: str) -> tuple[Grid, Potentials, float] | None:
     """Load grid, potentials and depletion voltage (V) of `key` from the cache.
 
     Returns None if they are missing or damaged.
     """
     try:
-        kept = read_arrays(cache_file(key))
-        grid = Grid(step_mm=step_mm, **{name: kept[name] for name in _OF_GRID})
-        nodes = {name: kept[name] for name in _OF_NODES}
-        capacitance, depletion = float(kept["capacitance_pF"]), float(kept["depletion_V"])
+        arrays = read_arrays(cache_file(key))
+        kept: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
+        grid = Grid(**{field.name: kept[field.name] for field in fields(Grid)})
+        parts = Potentials(**{field.name: kept[field.name] for field in fields(Potentials)})
+        return grid, parts, kept["depletion_V"]
     except (CpunetError, LookupError):
         return None  # solved again and overwritten
-    return grid, Potentials(**nodes, capacitance_pF=capacitance), depletion
 
 
 def keep_parts(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:
     """Write to the cache atomically. A cache that cannot be written is ignored."""
-    arrays = {name: getattr(grid, name) for name in _OF_GRID}
-    arrays |= {name: getattr(potentials, name) for name in _OF_NODES}
-    arrays["capacitance_pF"] = np.array(potentials.capacitance_pF)
-    arrays["depletion_V"] = np.array(depletion_V)
-    try:
-        with written_aside(cache_file(key)) as aside:
-            np.savez(aside, allow_pickle=False, **arrays)
-    except CpunetError:
-        return  # a read-only home directory must not stop a simulation
+    with suppress(CpunetError), written_aside(cache_file(key)) as aside:
+        arrays = vars(grid) | vars(potentials) | {"depletion_V": depletion_V}
+        np.savez(aside, allow_pickle=False, **arrays)
 
-
-log = logging.getLogger(__name__)
 
 # fields that do not affect the parts of the potential
 NOT_IN_PARTS = (
@@ -296,12 +289,11 @@ def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     unit = detector.model_copy(
         update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
     )
-    if cache and (kept := kept_parts(key, detector.grid_mm)) is not None:
+    if cache and (kept := kept_parts(key)) is not None:
         return Superposition(unit, *kept)
     grid = make_grid(unit)
     log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
     potentials = solve_potentials(unit, grid)
-    log.debug("depletion voltage")
     fixed = potentials.impurities + potentials.surface
     depletion = depletion_voltage(potentials.bias, fixed, grid.region)
     if cache:

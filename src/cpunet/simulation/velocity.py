@@ -10,7 +10,6 @@ field, of the integral of the speed over the field strength,
 
 from __future__ import annotations
 
-import csv
 import math
 from importlib.resources import files
 from typing import NamedTuple
@@ -57,9 +56,9 @@ class VelocityTable(NamedTuple):
 
 def measured_table() -> FloatArray:
     """Speeds at 77 K: field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns."""
-    lines = files("cpunet.simulation").joinpath("drift_velocity.csv").read_text("utf-8")
-    rows = [row for row in csv.reader(lines.splitlines()) if not row[0].startswith("#")]
-    return np.array(rows[1:], dtype=np.float64)
+    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
+    with source.open(encoding="utf-8") as lines:
+        return np.loadtxt(lines, delimiter=",", comments=("#", "field"))
 
 
 def velocity_table(
@@ -72,7 +71,7 @@ def velocity_table(
     .. math:: f = \frac{v_s x}{\sqrt{1 + x^2}}, \qquad x = \frac{\mu_0 E}{v_s}, \qquad
         v_s = B \sqrt{\tanh\frac{\theta}{2T}}, \qquad \mu_0 = A T^p,
 
-    and combined into the coefficients of `drift_velocity`,
+    and combined into the coefficients of `carrier_velocity`,
 
     .. math:: a = \frac{v_{100}}{2} - 4 v_{110} + \frac{9 v_{111}}{2}, \quad
         b = -\frac{5 v_{100}}{2} + 16 v_{110} - \frac{27 v_{111}}{2}, \quad
@@ -93,8 +92,7 @@ def velocity_table(
     Examples
     --------
     >>> table = velocity_table(90.0)
-    >>> speed = drift_velocity(table, [[1000.0, 0.0, 0.0]], HOLE)
-    >>> round(float(speed[0, 0]), 3)
+    >>> round(carrier_velocity(*table, HOLE, 1000.0, 0.0, 0.0)[0], 3)
     0.081
     """
     measured = measured_table()
@@ -112,40 +110,6 @@ def velocity_table(
         columns = (a, b, c, _running_mean(field, b), _running_mean(field, c), v100)
         tables.append(np.stack([np.interp(grid, field, column) for column in columns], 1))
     return VelocityTable(np.ascontiguousarray(tables), 1 / step)
-
-
-def drift_velocity(table: VelocityTable, field: npt.ArrayLike, carrier: int) -> FloatArray:
-    r"""Velocity vectors (n, 3) in mm/ns for field vectors (n, 3) in V/cm.
-
-    With the direction :math:`n_i = E_i/|E|` of the field, :math:`S_k = \sum_i n_i^k` and the
-    coefficients :math:`a`, :math:`b`, :math:`c` of `velocity_table`,
-
-    .. math:: v_i = \pm n_i \left[a + b S_4 + c S_6 + 4 \bar{b} (n_i^2 - S_4)
-        + 6 \bar{c} (n_i^4 - S_6)\right], \qquad \bar{b} = \frac{1}{E} \int_0^E b\, dE',
-
-    positive for holes and negative for electrons. The <100> axes are x, y and z.
-
-    Parameters
-    ----------
-    table
-        Coefficients at the crystal temperature.
-    field
-        Field vectors in V/cm, shape ``(n, 3)``.
-    carrier
-        `ELECTRON` or `HOLE`.
-
-    Examples
-    --------
-    Along <100> the speed is that of the table.
-
-    >>> row = measured_table()[8]
-    >>> speed = drift_velocity(velocity_table(77.0), [[row[0], 0.0, 0.0]], HOLE)[0]
-    >>> bool(abs(speed[0] - row[4]) < 1e-12), speed[1:].tolist()
-    (True, [0.0, 0.0])
-    """
-    vectors = np.ascontiguousarray(field, dtype=np.float64)
-    velocity: FloatArray = _velocities(table, vectors, carrier)
-    return velocity
 
 
 def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> FloatArray:
@@ -193,9 +157,25 @@ def carrier_velocity(
     ey: float,
     ez: float,
 ) -> tuple[float, float, float, float, float, float]:
-    """Velocity (mm/ns), field strength (V/cm), <100> speed and its slope of one charge.
+    r"""Velocity (mm/ns), field strength (V/cm), <100> speed and its slope of one charge.
 
-    Beyond the last field of the table, its last interval is extrapolated linearly.
+    With the direction :math:`n_i = E_i/|E|` of the field, :math:`S_k = \sum_i n_i^k` and the
+    coefficients :math:`a`, :math:`b`, :math:`c` of `velocity_table`,
+
+    .. math:: v_i = \pm n_i \left[a + b S_4 + c S_6 + 4 \bar{b} (n_i^2 - S_4)
+        + 6 \bar{c} (n_i^4 - S_6)\right], \qquad \bar{b} = \frac{1}{E} \int_0^E b\, dE',
+
+    positive for holes and negative for electrons. The <100> axes are x, y and z. Beyond the
+    last field of the table, its last interval is extrapolated linearly.
+
+    Examples
+    --------
+    Along <100> the speed is that of the table.
+
+    >>> row = measured_table()[8]
+    >>> velocity = carrier_velocity(*velocity_table(77.0), HOLE, row[0], 0.0, 0.0)
+    >>> bool(abs(velocity[0] - row[4]) < 1e-12), velocity[1:3]
+    (True, (0.0, 0.0))
     """
     strength = math.sqrt(ex * ex + ey * ey + ez * ez)
     if strength <= 0.0:
@@ -222,19 +202,3 @@ def carrier_velocity(
     vy = sign * ny * (common + b_mean * y2 + c_mean * y4)
     vz = sign * nz * (common + b_mean * z2 + c_mean * z4)
     return vx, vy, vz, strength, speed, slope
-
-
-@kernel
-def _velocities(table: VelocityTable, field: FloatArray, carrier: int) -> FloatArray:
-    out = np.empty_like(field)
-    for i in range(len(field)):
-        vx, vy, vz, _, _, _ = carrier_velocity(
-            table.coefficients,
-            table.fields_per_V_per_cm,
-            carrier,
-            field[i, 0],
-            field[i, 1],
-            field[i, 2],
-        )
-        out[i, 0], out[i, 1], out[i, 2] = vx, vy, vz
-    return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -24,12 +25,12 @@ _BLOCK_HITS = 1_000_000
 _BLOCK_EVENTS = 20_000
 
 
-class WantedLine(NamedTuple):
-    """Requested number of events with an energy from `low_kev` to `high_kev` in keV."""
+class EnergyWindow(NamedTuple):
+    """Energies (keV) from `low_kev` to `high_kev`, both included, under a name."""
 
+    name: str
     low_kev: float
     high_kev: float
-    events: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ def simulate_gammas(
     source_radius_mm: float,
     n_primaries: int,
     seed: int,
-    wanted: Mapping[str, WantedLine] | None = None,
+    wanted: Mapping[EnergyWindow, int] = MappingProxyType({}),
     energy_kev: float = TL208_KEV,
 ) -> tuple[Hits, GammaStatistics]:
     r"""Simulate gammas from a disc above the crystal, in vacuum.
@@ -77,8 +78,8 @@ def simulate_gammas(
     seed
         Seed of the random generator. The same seed gives the same events.
     wanted
-        Energy windows by name. Only events in a window are kept, until each window has
-        the requested number.
+        Number of events requested in each energy window. Only events in a window are kept,
+        until each has its number.
     energy_kev
         Energy of the gammas, 50 to 2700 keV.
 
@@ -95,10 +96,10 @@ def simulate_gammas(
         If a window is empty or beyond the line, or `n_primaries` gammas do not yield the
         requested events.
     """
-    for name, line in (wanted or {}).items():
+    for line in wanted:
         if not line.low_kev < line.high_kev or line.low_kev > energy_kev:
             raise CpunetError(
-                f"{name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
+                f"{line.name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
                 f"the {energy_kev} keV line; give another"
             )
     shape = CrystalShape.of(detector)
@@ -107,11 +108,10 @@ def simulate_gammas(
     source = SourceDisc(
         energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine
     )
-    lines = list((wanted or {}).values())
     # the sum of deposits equals the energy of the line only up to rounding
-    low = np.array([line.low_kev / 1e3 - 1e-9 for line in lines])
-    high = np.array([line.high_kev / 1e3 + 1e-9 for line in lines])
-    missing = np.array([line.events for line in lines], np.int64)
+    low = np.array([line.low_kev / 1e3 - 1e-9 for line in wanted])
+    high = np.array([line.high_kev / 1e3 + 1e-9 for line in wanted])
+    missing = np.array(list(wanted.values()), np.int64)
     spectrum = np.zeros(math.ceil(energy_kev) + 1, np.int64)
     rng = np.random.default_rng(seed)
     hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
@@ -119,7 +119,7 @@ def simulate_gammas(
     primaries = np.empty(_BLOCK_EVENTS, np.int64)
     blocks: list[Hits] = [Hits.of([], [], [0])]
     done = 0
-    while done < n_primaries and not (lines and missing.sum() == 0):
+    while done < n_primaries and not (wanted and missing.sum() == 0):
         tried, kept = simulate_block(
             shape, source, photon_table(), electron_table(), n_primaries - done,
             low, high, missing, spectrum, rng, hits, offsets, primaries,
@@ -131,8 +131,7 @@ def simulate_gammas(
         )
         done += tried
     if missing.any():
-        names = list(wanted or {})
-        short = ", ".join(f"{n} of {name}" for name, n in zip(names, missing, strict=True) if n)
+        short = ", ".join(f"{n} of {w.name}" for w, n in zip(wanted, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
     return Hits.concatenate(blocks), GammaStatistics(done, spectrum)
 
