@@ -26,8 +26,8 @@ from reboost import units
 from reboost.hpge import psd, utils
 
 from cpunet.legend.current_library import read_library
-from cpunet.legend.currents import currents_about_peak, heights
-from cpunet.legend.templates import TemplateTranslator
+from cpunet.legend.currents import PEAK, currents_about_peak
+from cpunet.legend.translate_library import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -72,7 +72,7 @@ def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
     translate = TemplateTranslator(REN.load(folder), 1.0)
     for first in range(0, hits.n_events, 500):
         waveforms = simulate_events(fields, hits[first : first + 500], SETTINGS).waveforms
-        found.append(heights(currents_about_peak(translate(waveforms))[0]) / mode)
+        found.append(currents_about_peak(translate(waveforms))[0][..., PEAK] / mode)
     return np.concatenate(found)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.fft
 
 from cpunet.electronics.exponentials import Exponentials
-from cpunet.legend.currents import currents_about_peak, heights
+from cpunet.legend.currents import PEAK, currents_about_peak
 from cpunet.legend.lithium import LithiumLayer, arrived, delayed
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
@@ -48,7 +48,7 @@ def told(undecayed: Exponentials, fine: np.ndarray) -> tuple[np.ndarray, np.ndar
     signal = signal[:, :LENGTH] / signal[:, PLATEAU : PLATEAU + 1]
     currents, _ = currents_about_peak(signal)
     late = np.arange(PLATEAU) > (signal < 0.8).argmin(axis=1)[:, None]
-    return heights(currents), ((1 - signal[:, :PLATEAU]) * late).sum(axis=1)
+    return currents[..., PEAK], ((1 - signal[:, :PLATEAU]) * late).sum(axis=1)
 
 
 def of_the_layer(chain: Exponentials, detector: Detector, fields: FieldMaps) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -219,13 +220,15 @@ def _look(
 
     recipe = load_recipe("fast")
     if holds_hits(path):
+        told: dict[str, Any] = {}
         inside = None if crystal is None else read_detector(crystal)
         hits = describe_hits(Path(path), frame, recipe.peaks, inside)
         lines = [("file", str(path))]
         for name, one in hits.items():
             lines.append(("detector", name))
             lines += [("hits", one)] if isinstance(one, str) else one.lines
-        return InfoResult(str(path), lines, hits)
+            told[name] = one if isinstance(one, str) else asdict(one)
+        return InfoResult(str(path), lines, told)
     return _file(pulse_file(path, read), recipe)
 
 
@@ -261,7 +264,7 @@ def _detector(detector: Detector, path: str) -> InfoResult:
 
 
 def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
-    from cpunet.pulses.description import describe_tables
+    from cpunet.pulses.reading.opening import table_sizes
 
     path = str(file.path)
     if file.table == ALL:
@@ -273,38 +276,44 @@ def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
                 channels[name] = str(error).removeprefix(f"{path}: ")
         ok = not any(isinstance(one, str) for one in channels.values())
         return InfoResult(path, tables=channels, ok=ok)
-    tables = describe_tables(file.path, file.dt_ns) if file.table is None else {}
+    tables = table_sizes(file.path) if file.table is None else {}
     if len(tables) < 2:
         return _pulses(file, recipe)
+    values: dict[str, Any] = {}
+    for name, number in tables.items():
+        try:
+            source = replace(file, table=name).open()
+        except CpunetError as error:
+            values[name] = str(error).removeprefix(f"{path}: ")
+        else:
+            told = {"n_pulses": number or source.n_pulses, "length": source.length}
+            values[name] = told | {"dt_ns": source.dt_ns, "energy": source.energies.description}
     rows = [
-        [name, "", "", "", one]
-        if isinstance(one, str)
-        else [name, one["n_pulses"], one["length"], f"{one['dt_ns']:g}", one["energy"]]
-        for name, one in tables.items()
+        [name, "", "", "", known]
+        if isinstance(known, str)
+        else [name, known["n_pulses"], known["length"], f"{known['dt_ns']:g}", known["energy"]]
+        for name, known in values.items()
     ]
-    told = text_table(["table", "traces", "samples", "ns", "energies"], rows)
-    lines = [("", told), ("", "one of them: `table` NAME; each in full: `table` all")]
-    return InfoResult(path, lines, tables)
+    text = text_table(["table", "traces", "samples", "ns", "energies"], rows)
+    lines = [("", text), ("", "one of them: `table` NAME; each in full: `table` all")]
+    return InfoResult(path, lines, values)
 
 
 def _pulses(file: PulseFile, recipe: Recipe) -> InfoResult:
     """Describe the pulses of one table."""
-    from cpunet.pulses.description import describe_pulses, pulses_in_words
+    from cpunet.pulses.description import describe_pulses
+    from cpunet.pulses.spectrum import spectrum_figure
 
     source = file.open()
-    told, spectrum = describe_pulses(source, recipe.peaks)
-    lines = pulses_in_words(told)
+    found, spectrum = describe_pulses(source, recipe.peaks)
+    told: dict[str, Any] = {k: v for k, v in asdict(found).items() if v not in ("", {})}
+    lines = found.lines
     if _is_measured(source):
         more, words = _traces(source, recipe)
         told, lines = told | more, lines + words
-
-    def draw() -> Figure:
-        from cpunet.pulses.spectrum_figure import spectrum_figure
-
-        return spectrum_figure(spectrum)
-
     some = bool(np.isfinite(spectrum.values).any())
-    return InfoResult(str(file.path), lines, told, _draw=draw if some else None)
+    draw = partial(spectrum_figure, spectrum) if some else None
+    return InfoResult(str(file.path), lines, told, _draw=draw)
 
 
 def _is_measured(source: PulseSource) -> bool:
@@ -325,12 +334,12 @@ def _traces(
     """Properties of measured traces, and the pile-up tails under them."""
     from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
     from cpunet.pulses.baselines import Baselines
-    from cpunet.pulses.description import BLOCK, trace_properties, traces_in_words
+    from cpunet.pulses.description import BLOCK, trace_properties
 
     told: dict[str, Any] = {}
     try:
-        told["traces"] = trace_properties(source.blocks(BLOCK), recipe)
-        lines = traces_in_words(told["traces"])
+        traces = trace_properties(source.blocks(BLOCK), recipe)
+        told["traces"], lines = asdict(traces), traces.lines
     except CpunetError as error:
         told["traces"] = f"cannot be described: {error}"
         lines = [("", told["traces"])]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 Lines: TypeAlias = Sequence[tuple[str, str]]
 
 NO_VALUE = "–"
 MAX_DIGITS = 9  # after the decimal point
+SHOWN = 6  # names in a list
 
 
 def text_table(
@@ -58,6 +59,22 @@ def counted(counts: Mapping[str, object]) -> str:
     '3 FEP, 2 no peak'
     """
     return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n)
+
+
+def shortened(names: Iterable[str]) -> str:
+    """A readable list of names that stays on one line.
+
+    Examples
+    --------
+    >>> shortened(["FEP", "SEP"])
+    'FEP, SEP'
+    >>> shortened(f"ch{i}" for i in range(20))
+    'ch0, ch1, ch2, ch3, ch4, ch5 and 14 more'
+    """
+    listed = list(names)
+    text = ", ".join(listed[:SHOWN]) or "nothing"
+    rest = len(listed) - SHOWN
+    return f"{text} and {rest} more" if rest > 0 else text
 
 
 def span(ends: Sequence[float] | None, digits: int = 9) -> str:

@@ -19,15 +19,15 @@ from cpunet.legend.currents import (
     PEAK,
     continued,
     currents_about_peak,
-    heights,
     most_frequent,
     with_rings,
 )
 from cpunet.legend.library_files import chosen_libraries, known_detector
 from cpunet.legend.make_library import make_library
-from cpunet.legend.templates import TemplateTranslator
-from cpunet.legend.translate_library import enclosed, translate_library
+from cpunet.legend.translate_library import TemplateTranslator, enclosed, translate_library
 from cpunet.networks.generators import ResponseGenerator
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.writing import write_pulses
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -169,7 +169,7 @@ def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Pa
             assert there[i + di, j + dj].all()
     # the delay of the electronics, some 100 ns, is taken off; what it is depends on the edge
     assert times[0, 3] == pytest.approx(500, abs=10)
-    amplitudes = heights(currents[:6, 3:11][inner])
+    amplitudes = currents[:6, 3:11][inner][..., PEAK].astype(float)
     assert amplitudes.min() < 1 < amplitudes.max()
     numbers = told["V01"]
     assert (numbers["templates"], numbers["translated"]) == (96, 2 * int(inner.sum()))
@@ -324,12 +324,10 @@ def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
     assert known_detector(known) is None
     run = known.model_copy(update={"sim": SideInfo(file=str(sim)), "folder": tmp_path})
     assert known_detector(run) is None
-    with h5py.File(sim, "w") as file:
-        file.create_group("geds/sim").attrs["simulation"] = "no JSON"
-    assert known_detector(run) is None
-    with h5py.File(sim, "a") as file:
-        file["geds/sim"].attrs["simulation"] = json.dumps({"detector": {"name": "V01"}})
-    assert known_detector(run) == "V01"
+    pulses = Pulses.of(np.zeros((1, 8)), dt_ns=16)
+    for told, name in (("no JSON", None), (json.dumps({"detector": {"name": "V01"}}), "V01")):
+        write_pulses(sim, pulses, attrs={"simulation": told}, force=True)
+        assert known_detector(run) == name
     (tmp_path / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
     assert known_detector(run) == "V02"
 
@@ -378,7 +376,7 @@ def full_a_over_e(run: Path, detector: Any, hits: Hits, mode: float) -> Any:
     for first in range(0, hits.n_events, 500):
         events = simulate_events(fields, hits[first : first + 500], SETTINGS)
         currents, _ = currents_about_peak(translate(events.waveforms))
-        found.append(heights(currents) / mode)
+        found.append(currents[..., PEAK].astype(float) / mode)
     return np.concatenate(found)
 
 

@@ -12,12 +12,12 @@ from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.doubts import apart, go_down, second_rate
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.seen import apart, go_down, second_rate
 from cpunet.pulses.writing import PulseWriter, write_pulses
 from cpunet.recipes import load_recipe
 from synthetic import waveform_table

@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.pulses import sets
+from cpunet.pulses import loading
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import load_prepared
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
 from cpunet.pulses.reading.arrays import MemorySource
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.sets import load_prepared
 from synthetic import PREPARATION as CONFIG
 
 DT_NS = 16.0
@@ -267,16 +268,15 @@ def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> Memor
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sets, "BLOCK_SIZE", 4)
+    monkeypatch.setattr(loading, "BLOCK_SIZE", 4)
 
 
-def near_1000(energy_kev: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    return abs(energy_kev - 1000) < 100
+NEAR_1000 = parse_selection("900-1100", {})
 
 
 def test_every_pulse_is_kept_or_counted() -> None:
     energies = [1000, 1001, 50, np.nan, 1002, 1003, 2000, 999, 998, np.nan]
-    prepared = load_prepared(source_of(energies, [4]), SHORT, "measured", select=near_1000)
+    prepared = load_prepared(source_of(energies, [4]), SHORT, "measured", selection=NEAR_1000)
     assert prepared.pulses.energy_kev.tolist() == [1000, 1001, 1003, 999, 998]
     assert prepared.index.tolist() == [0, 1, 5, 7, 8]
     assert prepared.rejections == {"nan": 1, "energy_unknown": 2, "energy_outside_selection": 2}
@@ -290,7 +290,9 @@ def test_every_pulse_is_kept_or_counted() -> None:
 )
 def test_counts_add_up(energies: list[float], max_pulses: int) -> None:
     source = source_of([*energies, 1000.0])
-    prepared = load_prepared(source, SHORT, "measured", select=near_1000, max_pulses=max_pulses)
+    prepared = load_prepared(
+        source, SHORT, "measured", selection=NEAR_1000, max_pulses=max_pulses
+    )
     assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read
     assert prepared.n_read == len(energies) + 1
     assert len(prepared) == min(max_pulses, energies.count(1000.0) + 1)
@@ -300,7 +302,7 @@ def test_counts_add_up(energies: list[float], max_pulses: int) -> None:
 def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     source = source_of([1000.0, 50.0] * 500)
     first, second = (
-        load_prepared(source, SHORT, "measured", select=near_1000, max_pulses=60)
+        load_prepared(source, SHORT, "measured", selection=NEAR_1000, max_pulses=60)
         for _ in range(2)
     )
     assert (len(first), first.n_read) == (60, 1000)
@@ -310,7 +312,7 @@ def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     # rows 0, 2 ... 998, each as likely: their mean is 499 with a scatter of 289 / sqrt(60)
     assert abs(first.index.mean() - 499) < 3 * 289 / 60**0.5
     assert (first.codes[first.index] == 0).all()
-    whole = load_prepared(source, SHORT, "measured", select=near_1000)
+    whole = load_prepared(source, SHORT, "measured", selection=NEAR_1000)
     same = np.isin(whole.index, first.index)
     assert (whole.pulses.waveforms[same] == first.pulses.waveforms).all()
 
@@ -332,7 +334,7 @@ def test_nothing_left_is_one_line_with_counts_and_remedy(
     energies: list[float], broken: list[int], words: list[str]
 ) -> None:
     with pytest.raises(CpunetError) as error:
-        load_prepared(source_of(energies, broken), SHORT, "measured", select=near_1000)
+        load_prepared(source_of(energies, broken), SHORT, "measured", selection=NEAR_1000)
     message = str(error.value)
     assert "\n" not in message
     assert all(word in message for word in words), message

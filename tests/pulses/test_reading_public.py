@@ -58,9 +58,8 @@ def test_one_detector_of_the_majorana_release(tmp_path, monkeypatch):
     np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), traces[rows])
     labels = source.columns["psd_label_low_avse"].read(0, len(rows))
     np.testing.assert_array_equal(labels, rows % 2)
-    told = source.describe()
-    assert (told["format"], told["table"]) == ("Majorana release", "9")
-    assert told["energy"] == "column energy [keV]"
+    assert (source.layout.format, source.layout.table) == ("Majorana release", "9")
+    assert source.energies.description == "column energy [keV]"
 
 
 def test_all_detectors_and_files_without_labels(tmp_path):
@@ -68,7 +67,7 @@ def test_all_detectors_and_files_without_labels(tmp_path):
     write_majorana(file, 6, labels=False, length=40)
     source = open_pulses(file, table="raw_waveform", dt_ns=10)
     assert source.n_pulses == 6
-    assert source.describe()["energy"] == "not known"
+    assert source.energies.description == "not known"
     with h5py.File(file, "r+") as content:
         content["detector"][...] = 5
     assert len(open_pulses(file, dt_ns=10).read()) == 6
@@ -109,9 +108,9 @@ def test_pickled_pulses(tmp_path, lists):
     file = write_pickles(tmp_path / "fep_wf_ornl.pickle", traces, lists=lists, dc_label=0.0)
     source = open_pulses(file, dt_ns=16)
     assert (source.n_pulses, source.length) == (None, 40)
-    told = source.describe()
-    assert (told["format"], told["energy"]) == ("pickled pulses", "column energy [keV]")
-    assert told["columns"] == ["dc_label", "energy", "tp0"]
+    assert source.layout.format == "pickled pulses"
+    assert source.energies.description == "column energy [keV]"
+    assert sorted(source.columns) == ["dc_label", "energy", "tp0"]
     columns = source.columns
     np.testing.assert_array_equal(columns["tp0"].read(3, 5), [403, 404])  # before any trace
     blocks = list(source.blocks(5))

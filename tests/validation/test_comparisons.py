@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cpunet.pulses.binning import data_axis
+from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes import load_recipe
 from cpunet.validation import distances, resampling
 from cpunet.validation.comparisons import ceiling, compare, histogram, iou, iou_error

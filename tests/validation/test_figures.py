@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 from scipy.special import ndtr
 
 from cpunet.electronics.tails_law import TailsLaw
-from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.recipes import load_recipe
 from cpunet.training.sides_figure import sides_figure
 from cpunet.validation import run_figures

@@ -7,7 +7,7 @@ frequent A/E.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.legend.currents import LENGTH, PEAK, Floats, Loss, Values
-from cpunet.legend.library_files import put_column
+from cpunet.legend.library_files import put_array, put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.writing import FileInTheMaking
 
@@ -53,19 +53,8 @@ class NewLibrary:
         name, length = f"waveform_{angle}", LENGTH
         if self.basis is not None:
             name, length = f"coefficients_{angle}", len(self.basis)
-        values = self.group.create_dataset(
-            name,
-            (*shape, length),
-            np.float32,
-            chunks=(1, shape[1], length),
-            compression="gzip",
-            compression_opts=1,
-            shuffle=True,
-        )
-        values.attrs.update({"datatype": "array<3>{real}", "units": ""})
-        times = self.group.create_dataset(f"drift_time_{angle}", shape, np.float32)
-        times.attrs.update({"datatype": "array<2>{real}", "units": "ns"})
-        return values, times
+        values = put_array(self.group, name, (*shape, length), np.float32, "")
+        return values, put_array(self.group, f"drift_time_{angle}", shape, np.float32, "ns")
 
     def stored(self, currents: Floats, loss: Loss) -> Floats:
         """What stands for currents (rows, z, samples): these, or their coefficients."""
@@ -265,8 +254,20 @@ def merge_libraries(
                     )
                 for name in names:
                     axis = _time_axis(file[name])
-                    _require_new(name, path, axis, first)
+                    if name in first:
+                        raise CpunetError(
+                            f"{path}: a second library of {name}, which {first[name][0]} has "
+                            "already; give one of each detector"
+                        )
                     first[name] = (path, axis)
+                    other, (known_path, known) = next(iter(first.items()))
+                    if axis != known:
+                        raise CpunetError(
+                            f"{path}: {name} has {axis[2]} samples of {axis[0]:g} ns from "
+                            f"{axis[1]:g} ns, {other} of {known_path} {known[2]} of "
+                            f"{known[0]:g} ns from {known[1]:g} ns; translate both with one "
+                            "version"
+                        )
                     _copy(file[name], made.h5)
     return sorted(first)
 
@@ -285,26 +286,6 @@ def _time_axis(group: h5py.Group) -> tuple[float, float, int]:
     waveforms = (name for name in group if name.startswith("waveform_"))
     array = _COMPONENTS if _COMPONENTS in group else next(waveforms)
     return group["dt"][()].item(), group["t0"][()].item(), int(group[array].shape[-1])
-
-
-def _require_new(
-    name: str,
-    path: Path,
-    axis: tuple[float, float, int],
-    first: Mapping[str, tuple[Path, tuple[float, float, int]]],
-) -> None:
-    if name in first:
-        raise CpunetError(
-            f"{path}: a second library of {name}, which {first[name][0]} has already; give one "
-            "of each detector"
-        )
-    for other, (file, known) in first.items():
-        if axis != known:
-            raise CpunetError(
-                f"{path}: {name} has {axis[2]} samples of {axis[0]:g} ns from {axis[1]:g} ns, "
-                f"{other} of {file} {known[2]} of {known[0]:g} ns from {known[1]:g} ns; "
-                "translate both with one version"
-            )
 
 
 def expand_library(source: str | Path, out: str | Path, *, force: bool = False) -> list[str]:

@@ -14,7 +14,9 @@ are determined from some of the templates, their error from all of them.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -61,11 +63,6 @@ def currents_about_peak(charge: FloatArray) -> tuple[Floats, Values]:
         return currents, times
     _about_peak(np.ascontiguousarray(charge, np.float32), currents, times)
     return currents, times
-
-
-def heights(currents: FloatArray) -> Values:
-    """A/E of templates of unit charge, i.e. their currents at `PEAK`."""
-    return np.asarray(currents[..., PEAK], np.float64)
 
 
 def most_frequent(amplitudes: Values) -> float:
@@ -173,7 +170,7 @@ def with_rings(templates: Floats, rings: int = RINGS) -> Floats:
     there = ~np.isnan(templates[:, :, 0])
     for _ in range(rings):
         held = np.pad(there, 1)
-        around = np.sum([_moved(held, *step) for step in _NEIGHBOURS], axis=0)
+        around = np.sum([_seen(held, 1, *step) for step in _NEIGHBOURS], axis=0)
         new_r, new_z = np.nonzero(~there & (around > 0))
         total = np.zeros((len(new_r), templates.shape[2]), np.float64)
         for i, j in _NEIGHBOURS:
@@ -206,17 +203,15 @@ def continued(times: Values, rings: int = RINGS) -> Values:
     [[4.0, 6.0, 8.0, 10.0]]
     """
     made = np.pad(times, 2, constant_values=np.nan)
-    n_r, n_z = times.shape
     for _ in range(rings):
         near, far = (
-            np.stack([_seen(made, n * i, n * j, n_r, n_z) for i, j in _NEIGHBOURS])
-            for n in (1, 2)
+            np.stack([_seen(made, 2, n * i, n * j) for i, j in _NEIGHBOURS]) for n in (1, 2)
         )
-        inner = made[2 : 2 + n_r, 2 : 2 + n_z]
+        inner = _seen(made, 2, 0, 0)
         best = _mean(2 * near - far)
         best = np.where(np.isnan(best), _mean(near), best)
         inner[...] = np.where(np.isnan(inner), best, inner)
-    return made[2 : 2 + n_r, 2 : 2 + n_z].copy()
+    return _seen(made, 2, 0, 0).copy()
 
 
 def padded_axis(axis: Values, before: int, after: int) -> Values:
@@ -233,9 +228,10 @@ def padded_axis(axis: Values, before: int, after: int) -> Values:
     return np.concatenate([low, axis, high])
 
 
-def _seen(made: Values, i: int, j: int, n_r: int, n_z: int) -> Values:
-    """Inner part of an array with a padding of two nodes, shifted by (i, j)."""
-    return made[2 + i : 2 + i + n_r, 2 + j : 2 + j + n_z]
+def _seen(padded: npt.NDArray[Any], pad: int, i: int, j: int) -> npt.NDArray[Any]:
+    """Inner part of an array with a padding of `pad` nodes, shifted by (i, j)."""
+    n_r, n_z = padded.shape
+    return padded[pad + i : n_r - pad + i, pad + j : n_z - pad + j]
 
 
 def _mean(values: Values) -> Values:
@@ -244,12 +240,6 @@ def _mean(values: Values) -> Values:
     n = known.sum(axis=0)
     total = np.where(known, values, 0.0).sum(axis=0)
     return np.where(n > 0, total / np.maximum(n, 1), np.nan)
-
-
-def _moved(held: npt.NDArray[np.bool_], i: int, j: int) -> npt.NDArray[np.bool_]:
-    """Inner part of an array with a padding of one node, shifted by (i, j)."""
-    n_r, n_z = held.shape
-    return held[1 + i : n_r - 1 + i, 1 + j : n_z - 1 + j]
 
 
 def components(templates: Floats, rank: int) -> Floats:
@@ -291,10 +281,10 @@ class Loss:
 
     largest: float = 0.0
     a_over_e_percent: float = 0.0
-    rms: float = 0.0
-    a_over_e_rms_percent: float = 0.0
-    _samples: int = field(default=0, repr=False)
-    _templates: int = field(default=0, repr=False)
+    _squares: float = 0.0
+    _of_heights: float = 0.0
+    _samples: int = 0
+    _templates: int = 0
 
     def add(self, templates: Floats, coefficients: Floats, basis: Floats) -> None:
         """Add templates, shape ``(n, samples)``, with coefficients ``(n, rank)``."""
@@ -304,18 +294,16 @@ class Loss:
         of_height = 100 * (apart[:, PEAK] / templates[:, PEAK]).astype(float)
         self.largest = max(self.largest, float(np.abs(apart).max()))
         self.a_over_e_percent = max(self.a_over_e_percent, float(np.abs(of_height).max()))
-        squares = float(np.square(apart, dtype=float).sum())
-        self.rms = _merged(self.rms, self._samples, squares, apart.size)
-        self.a_over_e_rms_percent = _merged(
-            self.a_over_e_rms_percent, self._templates, float(of_height @ of_height), len(apart)
-        )
+        self._squares += float(np.square(apart, dtype=float).sum())
+        self._of_heights += float(of_height @ of_height)
         self._samples += apart.size
         self._templates += len(apart)
 
     def told(self) -> dict[str, float]:
         """Errors by name."""
-        return {name: v for name, v in asdict(self).items() if not name.startswith("_")}
-
-
-def _merged(rms: float, n: int, squares: float, more: int) -> float:
-    return float(np.sqrt((n * rms**2 + squares) / (n + more)))
+        return {
+            "largest": self.largest,
+            "a_over_e_percent": self.a_over_e_percent,
+            "rms": math.sqrt(self._squares / self._samples),
+            "a_over_e_rms_percent": math.sqrt(self._of_heights / self._templates),
+        }

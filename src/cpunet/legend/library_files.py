@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,13 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import is_column, text_attribute
+from cpunet.pulses.provenance import recorded_detector
 from cpunet.pulses.reading.energies import TIME_UNITS
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.settings import read_values
 from cpunet.training.run import Run
 
 PERIOD_NS = 1.0
-PULSES = "geds/sim"  # table of `cpunet simulate` with its provenance
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
@@ -176,16 +176,9 @@ def known_detector(run: Run) -> str | None:
         with suppress(CpunetError):  # there for a calibrated run
             if name := read_values(run.folder / "detector.yaml").get("name"):
                 return str(name)
-    file = None if run.sim.file is None else Path(run.sim.file)
-    if file is None or not file.is_file():
-        return None
     try:
-        with opened(file) as content:
-            pulses = content.get(PULSES)
-            told = pulses.attrs.get("simulation") if pulses is not None else None
-        made = json.loads(str(told)) if told else {}
-        return str(made["detector"]["name"]) or None
-    except (CpunetError, ValueError, KeyError, TypeError):
+        return run.sim.file and recorded_detector(PulseFile(Path(run.sim.file)).open())
+    except CpunetError:
         return None
 
 
@@ -254,3 +247,21 @@ def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) 
     dimensions = group[name].ndim
     kind = f"array<{dimensions}>{{real}}" if dimensions else "real"
     group[name].attrs.update({"datatype": kind, "units": units})
+
+
+def put_array(
+    group: h5py.Group, name: str, shape: tuple[int, ...], kind: npt.DTypeLike, units: str
+) -> h5py.Dataset:
+    """Create an array of NaN with LH5 attributes, in chunks of one row of grid points."""
+    made = group.create_dataset(
+        name,
+        shape,
+        kind,
+        chunks=(1, *shape[1:]),
+        compression="gzip",
+        compression_opts=1,
+        shuffle=True,
+        fillvalue=np.nan,
+    )
+    made.attrs.update({"datatype": f"array<{len(shape)}>{{real}}", "units": units})
+    return made

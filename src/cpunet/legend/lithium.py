@@ -60,12 +60,8 @@ class LithiumLayer:
     diffusion_cm2_per_s: float = 290.0
 
     def __post_init__(self) -> None:
-        numbers = {
-            "thickness_mm": self.thickness_mm,
-            "lifetime_ns": self.lifetime_ns,
-            "diffusion_cm2_per_s": self.diffusion_cm2_per_s,
-        }
-        for name, value in numbers.items():
+        for name in ("thickness_mm", "lifetime_ns", "diffusion_cm2_per_s"):
+            value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise CpunetError(f"lithium layer: {name} is {value}; give a number above 0")
         if not 0 <= self.recombination_depth_mm <= self.thickness_mm:

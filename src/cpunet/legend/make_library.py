@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.legend.library_files import put_column
+from cpunet.legend.library_files import put_array, put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
@@ -28,7 +28,7 @@ ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
 ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
-@dataclass(frozen=True)
+@dataclass
 class MadeLibrary:
     """A library of charge pulses that was made.
 
@@ -44,10 +44,10 @@ class MadeLibrary:
     """
 
     path: Path
-    templates: int
-    written: int
-    outside: int
-    late: int
+    templates: int = 0
+    written: int = 0
+    outside: int = 0
+    late: int = 0
 
     def __str__(self) -> str:
         return (
@@ -119,8 +119,7 @@ def make_library(
     angles_deg = _degrees(angles)
     sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS} if settings_file is None else {}
     wanted = read_settings(SimulationSettings, settings_file, sampling | of_settings)
-    counts = _write(detector, out, wanted, grid_mm, angles_deg)
-    return MadeLibrary(out, **counts)
+    return _write(detector, out, wanted, grid_mm, angles_deg)
 
 
 def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:
@@ -141,13 +140,13 @@ def _write(
     settings: SimulationSettings,
     grid_mm: float,
     angles_deg: tuple[int, ...],
-) -> dict[str, int]:
+) -> MadeLibrary:
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
     with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
-    counts = {"templates": 0, "written": 0, "outside": 0, "late": 0}
+    counts = MadeLibrary(out)
     total = len(angles_deg) * len(r_mm) * len(z_mm)
     with (
         written_aside(out) as aside,
@@ -162,12 +161,8 @@ def _write(
         for angle in angles_deg:
             _fill(library, angle, fields, settings, counts, bar)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
-        if not counts["written"]:
-            raise CpunetError(
-                f"{out}: none of {counts['templates']} grid points has a template: "
-                f"{counts['outside']} give no signal, {counts['late']} are not collected in "
-                "time; give a finer grid or longer records"
-            )
+        if not counts.written:
+            raise CpunetError(f"{counts}; give a finer grid or longer records")
     return counts
 
 
@@ -181,15 +176,15 @@ def _fill(
     angle_deg: int,
     fields: FieldMaps,
     settings: SimulationSettings,
-    counts: dict[str, int],
+    counts: MadeLibrary,
     bar: Stage,
 ) -> None:
     """Simulate the grid points of one azimuth, row by row in r."""
     r_mm, z_mm = library["r"][()], library["z"][()]
     shape = (len(r_mm), len(z_mm))
-    waveforms = _array(library, f"waveform_{angle_deg:03d}_deg", shape, settings.n_samples)
-    drift_times = _array(library, f"drift_time_{angle_deg:03d}_deg", shape)
-    waveforms.attrs["units"], drift_times.attrs["units"] = "", "ns"
+    angle, whole = f"{angle_deg:03d}_deg", (*shape, settings.n_samples)
+    waveforms = put_array(library, f"waveform_{angle}", whole, np.float32, "")
+    drift_times = put_array(library, f"drift_time_{angle}", shape, np.float64, "ns")
     phi = math.radians(angle_deg)
     for i, r in enumerate(r_mm):
         x, y = r * math.cos(phi), r * math.sin(phi)
@@ -197,27 +192,8 @@ def _fill(
         good = signals.valid & signals.collected
         waveforms[i] = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
         drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
-        counts["templates"] += len(z_mm)
-        counts["written"] += int(good.sum())
-        counts["outside"] += int((~signals.valid).sum())
-        counts["late"] += int((signals.valid & ~signals.collected).sum())
+        counts.templates += len(z_mm)
+        counts.written += int(good.sum())
+        counts.outside += int((~signals.valid).sum())
+        counts.late += int((signals.valid & ~signals.collected).sum())
         bar.update(len(z_mm))
-
-
-def _array(
-    library: h5py.Group, name: str, shape: tuple[int, int], *samples: int
-) -> h5py.Dataset:
-    """Create a dataset of NaN with LH5 attributes, in chunks of whole templates."""
-    whole = (*shape, *samples)
-    made = library.create_dataset(
-        name,
-        whole,
-        np.float32 if samples else np.float64,
-        chunks=(1, *whole[1:]),
-        compression="gzip",
-        compression_opts=1,
-        shuffle=True,
-        fillvalue=np.nan,
-    )
-    made.attrs["datatype"] = f"array<{len(whole)}>{{real}}"
-    return made

@@ -2,10 +2,15 @@
 
 The layout is that of LEGEND's production (legend-simflow): per detector a ``struct{r, z, dt,
 t0, waveform_000_deg, drift_time_000_deg, ...}`` of currents in units of the most frequent A/E.
+
+A template is the charge pulse of one position in the detector.  Users of the library sum
+templates weighted by energy.  Templates must therefore not be aligned or normalised, unlike in
+`Translator.translate`: a readout chain acts directly on the template.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 import numpy.typing as npt
+import torch
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -23,13 +29,13 @@ from cpunet.legend.current_library import TOLD, NewLibrary, describe
 from cpunet.legend.currents import (
     LENGTH,
     MAX_TEMPLATES,
+    PEAK,
     RINGS,
     Floats,
     Loss,
     components,
     continued,
     currents_about_peak,
-    heights,
     most_frequent,
     padded_axis,
     with_rings,
@@ -43,13 +49,59 @@ from cpunet.legend.library_files import (
     require_charge,
     require_complete,
 )
-from cpunet.legend.templates import TemplateTranslator
+from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
+from cpunet.pulses.container import FloatArray
 from cpunet.pulses.writing import FileInTheMaking
 from cpunet.training.devices import resolve_device
 from cpunet.training.run import RunLike, as_run
-from cpunet.translation.translator import REN
+from cpunet.translation.translator import BATCH, REN
+
+
+class TemplateTranslator:
+    """Translates templates without noise; sample k of the result is at the time of sample k.
+
+    A readout chain responds to a template of any height.  Its poles and decays are times, so
+    the sampling period can differ from that of the training.
+
+    Parameters
+    ----------
+    ren
+        Trained run.
+    dt_ns
+        Sampling period of the templates in ns.
+
+    Raises
+    ------
+    CpunetError
+        If the run has a network, which translates prepared pulses alone.
+    """
+
+    def __init__(self, ren: REN, dt_ns: float) -> None:
+        if ren.backend.chain is None or ren.recipe.generator.name == "learned":
+            raise CpunetError(
+                "the run's network translates whole pulses, not the templates that they are "
+                "summed from; give a run of the recipe fast"
+            )
+        self._device = ren.backend.device
+        self._chain = copy.deepcopy(ren.backend.chain)
+        self._chain.response.dt_ns.fill_(dt_ns)
+        if self._chain.response.drift is not None:
+            self._chain.response.drift.keeps_begin = True  # templates are summed by time
+
+    def __call__(self, templates: FloatArray) -> FloatArray:
+        """Translate templates of charge, 0 before it moves, shape (n, samples)."""
+        results = np.empty(templates.shape, np.float32)
+        inside = slice(PADDING_BEFORE, PADDING_BEFORE + templates.shape[1])
+        with torch.inference_mode():
+            for first in range(0, len(templates), BATCH):
+                rows = slice(first, first + BATCH)
+                charge = torch.from_numpy(np.ascontiguousarray(templates[rows], np.float32))
+                records = self._chain(charge.to(self._device))
+                results[rows] = records[:, inside].cpu().numpy()
+        return results
+
 
 ROWS = 16  # rows of r translated at a time
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
@@ -206,7 +258,7 @@ def _look(
                 mask[first : first + len(block)] = there
                 moving += int(good.sum())
                 not_ending += n_not_ending(templates[good])
-                amplitudes.append(heights(currents[good]))
+                amplitudes.append(currents[good, PEAK].astype(float))
                 kept.append(currents[good][rng.random(int(good.sum())) < share])
                 bar.update(block.shape[0] * block.shape[1])
             inside[angle] = mask
@@ -322,10 +374,8 @@ def _charge(values: npt.NDArray[Any]) -> Floats:
 
 def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Mask of grid points between others on all four sides, at any distance."""
-    sides = [
-        np.logical_or.accumulate(np.flip(mask, axis) if back else mask, axis)
-        for axis in (0, 1)
-        for back in (False, True)
-    ]
-    below, above, left, right = sides
-    return np.asarray(below & np.flip(above, 0) & left & np.flip(right, 1))
+    held = np.ones_like(mask)
+    for axis in (0, 1):
+        back = np.flip(np.logical_or.accumulate(np.flip(mask, axis), axis), axis)
+        held &= np.logical_or.accumulate(mask, axis) & back
+    return held

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.provenance import provenance
-from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.energies import amplitude
-from cpunet.pulses.reading.opening import table_sizes
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.spectrum import Spectrum, Values, suggested_calibration
 from cpunet.recipes.schema import PeakConfig, Recipe
@@ -31,7 +28,60 @@ MIN_NUMBER = 10  # minimum number of traces
 SHORTEST = 0.05  # share of the traces whose baseline may be shorter than reported
 
 
-def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]:
+@dataclass(frozen=True)
+class TracesInfo:
+    """Properties of the traces of a digitiser.
+
+    Parameters
+    ----------
+    looked_at
+        Number of traces.
+    trigger_sample
+        5, 50 and 95 % quantiles of the sample at half of the height.
+    baseline_samples
+        Number of samples before nearly all pulses.
+    noise_adc, noise_kev
+        Median RMS of the baselines; None in keV without known energies.
+    decay_us
+        Decay time by the median of the tails; None if these do not decay.
+    rejected
+        Number of traces by reason: the selection of preparation and quality cuts without
+        energies.
+    saturated_percent, pile_up_percent
+        Shares of saturated traces, and of tails that do not fit a decay.
+    """
+
+    looked_at: int
+    trigger_sample: list[int]
+    baseline_samples: int
+    noise_adc: float
+    noise_kev: float | None
+    decay_us: float | None
+    rejected: dict[str, int]
+    saturated_percent: float
+    pile_up_percent: float
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Names and texts."""
+        low, middle, high = self.trigger_sample
+        noise = f"{self.noise_adc:.3g} ADC"
+        if self.noise_kev is not None:
+            noise += f", {self.noise_kev:.3g} keV"
+        decay = f"{self.decay_us:.3g} µs" if self.decay_us else "the tails do not decay"
+        piled = f"{percent(self.pile_up_percent)} (tails that are no single decay)"
+        return [
+            ("trigger", f"half of the height at sample {middle} (90 % from {low} to {high})"),
+            ("baseline", f"{self.baseline_samples} samples before nearly all pulses"),
+            ("decay", decay),
+            ("noise", f"{noise} (RMS of a baseline, median)"),
+            ("saturated", percent(self.saturated_percent)),
+            ("pile-up", piled),
+            ("left out", f"{counted(self.rejected) or 'none'} of {self.looked_at} traces"),
+        ]
+
+
+def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> TracesInfo:
     """Describe the traces of a digitiser.
 
     Parameters
@@ -40,16 +90,6 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
         Measured traces of one channel; the first few thousand are used.
     recipe
         Settings of preparation and quality cuts.
-
-    Returns
-    -------
-    dict
-        ``looked_at`` (number of traces); ``trigger_sample`` (5, 50 and 95 % quantiles of the
-        sample at half of the height); ``baseline_samples`` (before nearly all pulses);
-        ``noise_adc`` and, with known energies, ``noise_kev`` (median RMS of the baselines);
-        ``decay_us`` (median of the tails); ``rejected`` (number of traces by reason: the
-        selection of preparation and quality cuts without energies), with ``saturated`` and
-        ``pile_up`` (tails that do not fit a decay) also as shares in percent.
 
     Raises
     ------
@@ -66,47 +106,27 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> dict[str, Any]
     with_pulse = np.isfinite(half)
     if with_pulse.sum() < MIN_NUMBER:
         raise CpunetError(f"only {with_pulse.sum()} of {len(half)} traces hold a pulse")
-    told: dict[str, Any] = {
-        "looked_at": len(half),
-        "trigger_sample": [round(float(q)) for q in np.nanquantile(half, (0.05, 0.5, 0.95))],
-        "baseline_samples": int(np.nanquantile(start, SHORTEST)),
-        "noise_adc": float(np.nanmedian(noise)),
-    }
     kev = np.concatenate([block.energy_kev for block in seen])[with_pulse]
     kev /= np.concatenate([amplitude(block.waveforms) for block in seen])[with_pulse]
-    if np.isfinite(kev).sum() >= MIN_NUMBER:
-        told["noise_kev"] = told["noise_adc"] * float(np.nanmedian(kev))
+    known = np.isfinite(kev).sum() >= MIN_NUMBER
+    noise_adc, slope = float(np.nanmedian(noise)), 0.0
     prepared = Prepared.concatenate([prepare(b, recipe.preparation, "measured") for b in seen])
     if len(prepared) >= MIN_NUMBER:
         slope = float(np.median(prepared.tail_slope))
-        if slope < 0:
-            told["decay_us"] = -1e3 / slope
         prepared = apply_cuts(prepared, fit_cuts(prepared, recipe.cuts))
     reasons = prepared.rejections
     piled = sum(reasons.get(r.label, 0) for r in (Rejection.TAIL_SLOPE, Rejection.CHI2))
-    return told | {
-        "rejected": reasons,
-        "saturated_percent": 100 * reasons.get(Rejection.SATURATED.label, 0) / len(half),
-        "pile_up_percent": 100 * piled / len(half),
-    }
-
-
-def traces_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Names and texts for the result of `trace_properties`."""
-    low, middle, high = told["trigger_sample"]
-    noise = f"{told['noise_adc']:.3g} ADC"
-    if "noise_kev" in told:
-        noise += f", {told['noise_kev']:.3g} keV"
-    decay = told.get("decay_us")
-    return [
-        ("trigger", f"half of the height at sample {middle} (90 % from {low} to {high})"),
-        ("baseline", f"{told['baseline_samples']} samples before nearly all pulses"),
-        ("decay", f"{decay:.3g} µs" if decay else "the tails do not decay"),
-        ("noise", f"{noise} (RMS of a baseline, median)"),
-        ("saturated", percent(told["saturated_percent"])),
-        ("pile-up", f"{percent(told['pile_up_percent'])} (tails that are no single decay)"),
-        ("left out", f"{counted(told['rejected']) or 'none'} of {told['looked_at']} traces"),
-    ]
+    return TracesInfo(
+        looked_at=len(half),
+        trigger_sample=[round(float(q)) for q in np.nanquantile(half, (0.05, 0.5, 0.95))],
+        baseline_samples=int(np.nanquantile(start, SHORTEST)),
+        noise_adc=noise_adc,
+        noise_kev=noise_adc * float(np.nanmedian(kev)) if known else None,
+        decay_us=-1e3 / slope if slope < 0 else None,
+        rejected=reasons,
+        saturated_percent=100 * reasons.get(Rejection.SATURATED.label, 0) / len(half),
+        pile_up_percent=100 * piled / len(half),
+    )
 
 
 def _edges(block: Pulses) -> tuple[Values, Values, Values]:
@@ -138,9 +158,78 @@ def _last_below(
     return np.where(below.any(axis=1), samples, 0)
 
 
+@dataclass(frozen=True)
+class PulsesInfo:
+    """What is known of the pulses of one table.
+
+    Parameters
+    ----------
+    path, format, table, columns, length, dt_ns, energy
+        File, and what it says before any pulse is read.
+    n_pulses
+        Number of pulses.
+    energy_kev, n_without_energy
+        Lowest and highest energy (None if unknown), and number of pulses without one.
+    peaks
+        Number of pulses by line.
+    found
+        Source whose lines are there, and at which share of their energies.
+    amplitudes
+        A suggested calibration, if no energy is known.
+    samples
+        Lowest and highest value of the finite traces.
+    n_not_finite, n_constant
+        Numbers of such traces.
+    provenance
+        How they were made, if the file records it.
+    """
+
+    path: str
+    format: str
+    table: str
+    columns: list[str]
+    length: int
+    dt_ns: float
+    energy: str
+    n_pulses: int
+    energy_kev: list[float] | None
+    n_without_energy: int
+    peaks: dict[str, int]
+    found: str
+    amplitudes: str
+    samples: list[float] | None
+    n_not_finite: int
+    n_constant: int
+    provenance: dict[str, str]
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Names and texts."""
+        energy = self.energy
+        if self.energy_kev:
+            energy += f", {span(self.energy_kev)} keV"
+            if self.n_without_energy:
+                energy += f"; {self.n_without_energy} pulses have none"
+        odd = {"not finite": self.n_not_finite, "constant": self.n_constant}
+        odds = "".join(f"; {n} traces {what}" for what, n in odd.items() if n)
+        size = f"{self.n_pulses} of {self.length} samples, every {self.dt_ns:g} ns"
+        return [
+            ("file", self.path),
+            ("format", f"{self.format}, table {self.table}"),
+            ("traces", size),
+            ("columns", ", ".join(self.columns)),
+            *self.provenance.items(),
+            ("energy", energy),
+            ("lines", counted(self.peaks)),
+            ("source", self.found),
+            ("amplitudes", self.amplitudes),
+            ("samples", f"values {span(self.samples)}{odds}"),
+        ]
+
+
 def describe_pulses(
     source: PulseSource, peaks: Mapping[str, PeakConfig]
-) -> tuple[dict[str, Any], Spectrum]:
+) -> tuple[PulsesInfo, Spectrum]:
     """Describe the pulses of one table; also return their spectrum.
 
     The file is read in blocks; only energies or amplitudes of all pulses are held in memory.
@@ -154,140 +243,56 @@ def describe_pulses(
 
     Returns
     -------
-    dict
-        The result of `PulseSource.describe`, and: ``n_pulses``; ``energy_kev`` (lowest and
-        highest, None if unknown) and ``n_without_energy``; ``peaks`` (number of pulses by
-        line); ``amplitudes``, a suggested calibration if no energy is known, or else
-        ``found``, the source whose lines are there, and at which share of their energies;
-        ``samples`` (lowest and highest of the finite traces); the numbers ``n_not_finite``
-        and ``n_constant`` of traces; ``provenance``, if the file records it.
+    PulsesInfo
+        What is known.
     Spectrum
-        Energies, or amplitudes if no energy is known.
+        Energies, or amplitudes if no energy is known, with the lines found.
     """
-    counts = _Counts(dict.fromkeys(peaks, 0))
+    energies, heights, extremes = [], [], [np.empty(0)]
+    n_pulses = n_not_finite = n_constant = 0
     for block in source.blocks():
-        counts.add(block, peaks)
-    spectrum = counts.spectrum()
-    told = {"path": str(source.path), **source.describe(), **counts.summary(spectrum)}
-    made = provenance(source)
-    return told | ({"provenance": made} if made else {}), spectrum
-
-
-def describe_tables(path: Path, dt_ns: float | None) -> dict[str, Any]:
-    """Description of each table without reading its traces, or why it cannot be read."""
-    told: dict[str, Any] = {}
-    for table, number in table_sizes(path).items():
-        try:
-            source = open_pulses(path, table=table, dt_ns=dt_ns)
-        except CpunetError as error:
-            told[table] = str(error).removeprefix(f"{path}: ")
-        else:
-            told[table] = source.describe()
-            if number is not None:
-                told[table]["n_pulses"] = number
-    return told
-
-
-def pulses_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Names and texts for the result of `describe_pulses`."""
-    lines = [
-        ("file", str(told["path"])),
-        ("format", f"{told['format']}, table {told['table']}"),
-        (
-            "traces",
-            f"{told['n_pulses']} of {told['length']} samples, every {told['dt_ns']:g} ns",
-        ),
-        ("columns", ", ".join(told["columns"])),
-        *((name, text) for name, text in told.get("provenance", {}).items()),
-        ("energy", _energy(told)),
-        ("lines", counted(told["peaks"])),
-        ("source", told.get("found", "")),
-        ("amplitudes", told.get("amplitudes", "")),
-        ("samples", f"values {span(told['samples'])}{_odd(told)}"),
-    ]
-    return [(name, text) for name, text in lines if text]
-
-
-def _energy(told: Mapping[str, Any]) -> str:
-    text = str(told["energy"])
-    if told["energy_kev"]:
-        text += f", {span(told['energy_kev'])} keV"
-        if told["n_without_energy"]:
-            text += f"; {told['n_without_energy']} pulses have none"
-    return text
-
-
-def _odd(told: Mapping[str, Any]) -> str:
-    """Numbers of traces that are not pulses, if any."""
-    counts = {"not finite": told["n_not_finite"], "constant": told["n_constant"]}
-    return "".join(f"; {n} traces {what}" for what, n in counts.items() if n)
-
-
-@dataclass
-class _Counts:
-    """Sums and extremes over blocks."""
-
-    peaks: dict[str, int]
-    n_pulses: int = 0
-    n_without_energy: int = 0
-    n_not_finite: int = 0
-    n_constant: int = 0
-    amplitudes: list[Values] = field(default_factory=list)
-    energies: list[Values] = field(default_factory=list)
-    energy_kev: list[float] = field(default_factory=list)
-    samples: list[float] = field(default_factory=list)
-
-    def add(self, block: Pulses, peaks: Mapping[str, PeakConfig]) -> None:
-        self.n_pulses += len(block)
-        known = block.energy_kev[np.isfinite(block.energy_kev)]
-        self.n_without_energy += len(block) - len(known)
-        if len(known):
-            self.energies.append(known)
-        else:
-            self.amplitudes.append(amplitude(block.waveforms))
-        self.energy_kev = _range([*self.energy_kev, *_extremes(known)])
-        names, counts = np.unique(label_peaks(known, peaks), return_counts=True)
-        for name, count in zip(names, counts, strict=True):
-            if name:
-                self.peaks[str(name)] += int(count)
+        n_pulses += len(block)
+        energies.append(known := block.energy_kev[np.isfinite(block.energy_kev)])
+        if not len(known):
+            heights.append(amplitude(block.waveforms))
         # A sum is NaN or infinite if any sample is; this needs no mask as large as the block.
         with np.errstate(invalid="ignore", over="ignore"):
             finite = np.isfinite(block.waveforms.sum(axis=1, dtype=np.float64))
-        self.n_not_finite += int((~finite).sum())
+        n_not_finite += int((~finite).sum())
         good = block.waveforms if finite.all() else block.waveforms[finite]
         low, high = good.min(axis=1), good.max(axis=1)
-        self.n_constant += int((low == high).sum())
-        self.samples = _range([*self.samples, *_extremes(low), *_extremes(high)])
+        n_constant += int((low == high).sum())
+        extremes += [low, high]
+    kev, samples = np.concatenate(energies), np.concatenate(extremes)
+    values = kev if len(kev) else np.concatenate(heights)
+    spectrum = Spectrum(values, in_kev=len(kev) > 0, found=suggested_calibration(values))
+    found, amplitudes, lines = spectrum.found, "", label_peaks(kev, peaks)
+    if not spectrum.in_kev:
+        amplitudes = "no lines that stand out" if found is None else f"like {found}"
+    elif found is not None:
+        place = f"{1 / found.kev_per_adc:.4f} of their energies"
+    layout = source.layout
+    told = PulsesInfo(
+        path=str(source.path),
+        format=layout.format,
+        table=layout.table,
+        columns=sorted(layout.columns),
+        length=source.length,
+        dt_ns=source.dt_ns,
+        energy=source.energies.description,
+        n_pulses=n_pulses,
+        energy_kev=_ends(kev),
+        n_without_energy=n_pulses - len(kev),
+        peaks={name: int((lines == name).sum()) for name in peaks},
+        found=f"lines of {found.source}, at {place}" if found and spectrum.in_kev else "",
+        amplitudes=amplitudes,
+        samples=_ends(samples),
+        n_not_finite=n_not_finite,
+        n_constant=n_constant,
+        provenance=provenance(source),
+    )
+    return told, spectrum
 
-    def spectrum(self) -> Spectrum:
-        """Energies of the pulses, or their amplitudes if no energy is known, with lines."""
-        known = bool(self.energies)
-        values = np.concatenate(self.energies or self.amplitudes or [np.empty(0)])
-        return Spectrum(values, in_kev=known, found=suggested_calibration(values))
 
-    def summary(self, spectrum: Spectrum) -> dict[str, Any]:
-        found = spectrum.found
-        lines = {} if spectrum.in_kev else {"amplitudes": "no lines that stand out"}
-        if found is not None and spectrum.in_kev:
-            place = 1 / found.kev_per_adc
-            lines = {"found": f"lines of {found.source}, at {place:.4f} of their energies"}
-        elif found is not None:
-            lines = {"amplitudes": f"like {found}"}
-        return {
-            "n_pulses": self.n_pulses,
-            "energy_kev": self.energy_kev or None,
-            "n_without_energy": self.n_without_energy,
-            "peaks": self.peaks,
-            **lines,
-            "samples": self.samples or None,
-            "n_not_finite": self.n_not_finite,
-            "n_constant": self.n_constant,
-        }
-
-
-def _extremes(values: np.typing.NDArray[Any]) -> list[float]:
-    return [float(values.min()), float(values.max())] if values.size else []
-
-
-def _range(values: list[float]) -> list[float]:
-    return [min(values), max(values)] if values else []
+def _ends(values: npt.NDArray[Any]) -> list[float] | None:
+    return [float(values.min()), float(values.max())] if len(values) else None

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses import _current_kernels
+from cpunet.pulses import _parameter_kernels as kernels
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
@@ -265,7 +265,7 @@ def _by_blocks(
 
 def _current_amplitude(waveforms: FloatArray) -> Values:
     n, length = waveforms.shape
-    current, steepest = _current_kernels.currents(waveforms)
+    current, steepest = kernels.currents(waveforms)
     start = np.zeros(n, np.int64)
     if length - 1 <= NEIGHBOURHOOD:
         return _maximum(current, start, length - 1, 0)
@@ -273,9 +273,7 @@ def _current_amplitude(waveforms: FloatArray) -> Values:
     # near the ends of the neighbourhood the averages differ from those of the whole pulse
     values = _maximum(current, first, NEIGHBOURHOOD, REACH)
     # samples that those averages do not reach
-    elsewhere = _current_kernels.maxima_elsewhere(
-        current, first + 2 * REACH, NEIGHBOURHOOD - 4 * REACH
-    )
+    elsewhere = kernels.maxima_elsewhere(current, first + 2 * REACH, NEIGHBOURHOOD - 4 * REACH)
     unsure = np.flatnonzero(~(elsewhere <= values))
     if len(unsure):
         values[unsure] = _maximum(current[unsure], start, length - 1, 0)
@@ -286,7 +284,7 @@ def _maximum(
     current: FloatArray, first: npt.NDArray[np.int64], samples: int, ends: int
 ) -> Values:
     """Maximum of the averaged current, excluding `ends` samples at each end."""
-    return _current_kernels.averaged_maxima(
+    return kernels.averaged_maxima(
         current,
         first,
         samples,

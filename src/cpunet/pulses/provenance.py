@@ -123,11 +123,10 @@ def recorded_side(source: PulseSource) -> Recognised | None:
 
 def recorded_attributes(source: PulseSource) -> dict[str, str]:
     """Attributes in which this program records how it made the pulses; none in other files."""
-    told = source.describe()
-    if told["format"] not in ("LH5", "HDF5"):
+    if source.layout.format not in ("LH5", "HDF5"):
         return {}
     with opened(source.path) as file:
-        table = file[told["table"].rpartition("/")[0] or "/"]
+        table = file[source.layout.table.rpartition("/")[0] or "/"]
         names = (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION)
         found = {name: text_attribute(table, name) for name in names}
         found[TRANSLATION] = text_attribute(file, TRANSLATION)

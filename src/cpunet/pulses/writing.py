@@ -206,12 +206,8 @@ def write_pulses(
     path: str | Path,
     blocks: Pulses | Iterable[Pulses],
     *,
-    table: str = "geds/sim",
-    waveform_units: str = "",
-    t0_ns: float = 0.0,
     columns: Columns | None = None,
-    attrs: Mapping[str, str | float] | None = None,
-    force: bool = False,
+    **options: Any,
 ) -> int:
     """Write pulses to an LH5 file (see `PulseWriter`), at once or in blocks.
 
@@ -221,11 +217,11 @@ def write_pulses(
         The file to write.
     blocks
         Pulses, at once or in blocks; only one block is in memory at a time.
-    table, waveform_units, t0_ns, attrs, force
-        See `PulseWriter`.
     columns
         Further values per event for all blocks together: name → (array of shape
         ``(total,)``, units).
+    **options
+        See `PulseWriter`.
 
     Returns
     -------
@@ -238,15 +234,7 @@ def write_pulses(
         As for `PulseWriter`, and if a column does not have one value per pulse.
     """
     extra = {name: (np.asarray(v), units) for name, (v, units) in (columns or {}).items()}
-    writer = PulseWriter(
-        path,
-        table=table,
-        waveform_units=waveform_units,
-        t0_ns=t0_ns,
-        attrs=attrs,
-        force=force,
-    )
-    with writer:
+    with PulseWriter(path, **options) as writer:
         for block in [blocks] if isinstance(blocks, Pulses) else blocks:
             rows = slice(writer.n_pulses, writer.n_pulses + len(block))
             writer.append(block, {name: (v[rows], u) for name, (v, u) in extra.items()})

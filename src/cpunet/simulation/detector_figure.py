@@ -143,7 +143,7 @@ def _collection_times(
     top = float(np.nanmax(times))
     times = _filled(times)
     image = axes.pcolormesh(r, z, times.T, cmap="YlOrRd", vmin=0, vmax=top, rasterized=True)
-    levels = MaxNLocator(10, steps=[1, 2, 5, 10]).tick_values(0, top)[1:-1]
+    levels = MaxNLocator(12, steps=[1, 2, 5, 10]).tick_values(0, top)[1:-1]
     lines = axes.contour(r, z, times.T, levels, colors="black", linewidths=0.7)
     axes.clabel(lines, levels=levels[1::2], fmt="%g", fontsize=7.5)
     axes.set_title("Hole collection time")

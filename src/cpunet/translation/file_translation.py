@@ -266,10 +266,9 @@ def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
 
 def _other_columns(pulses: PulseSource) -> RowColumns:
     """Find the columns to be copied to the output, and report those left out."""
-    described = pulses.describe()
-    if described["format"] in ("LH5", "HDF5"):
-        n_pulses = pulses.n_pulses or 0
-        others = RowColumns.of_hdf5(pulses.path, described["table"], n_pulses, OWN_COLUMNS)
+    if pulses.layout.format in ("LH5", "HDF5"):
+        n_pulses, table = pulses.n_pulses or 0, pulses.layout.table
+        others = RowColumns.of_hdf5(pulses.path, table, n_pulses, OWN_COLUMNS)
     else:
         others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
     for column, reason in others.left_out.items():

@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 from cpunet.errors import CpunetError, named
 from cpunet.html_pages import notebook_picture, part
 from cpunet.plotting import COLOURS, styled
-from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.pulses.shape_parameters import MAX_BINS, all_parameters, data_axis, labelled
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.forms import Formed

@@ -14,7 +14,7 @@ import hist
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.pulses.binning import data_axis
+from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes.schema import ScoreConfig
 from cpunet.validation.distances import (
     distance_errors,

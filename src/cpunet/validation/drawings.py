@@ -11,9 +11,9 @@ import torch
 from matplotlib.figure import Figure
 
 from cpunet.networks.learned_response import DriftUNet
-from cpunet.pulses.binning import data_axis
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.shape_parameters import data_axis
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_drift_time import ae_figure
 from cpunet.validation.ae_energy import ae_energy_figure

@@ -154,7 +154,7 @@ class Report:
         """
         import hist
 
-        from cpunet.pulses.binning import MAX_BINS, data_axis, labelled
+        from cpunet.pulses.shape_parameters import MAX_BINS, data_axis, labelled
 
         of_peak = named(self.values, peak, "scored peak")
         data = named(of_peak["data"], parameter, "parameter")

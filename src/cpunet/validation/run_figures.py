@@ -27,10 +27,9 @@ from cpunet.plotting import (
     linear_within,
     styled,
 )
-from cpunet.pulses.binning import data_axis
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.validation.comparisons import Compared, histogram
 from cpunet.validation.slices import BEFORE, MeanPulse
 

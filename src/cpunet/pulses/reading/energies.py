@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,13 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.tables import shortened
+
+log = logging.getLogger(__name__)
 
 # Factors to keV and ns.  A dictionary rather than a units library: only these units occur
 # beside waveforms, and any other must be refused, not converted.
 ENERGY_UNITS = {"eV": 1e-3, "keV": 1.0, "MeV": 1e3}
 TIME_UNITS = {"ps": 1e-3, "ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9}
-
-_SHOWN = 6
 
 
 class Column(Protocol):
@@ -64,22 +65,6 @@ class MemoryColumn:
         return self.values[start:stop]
 
 
-def shortened(names: Iterable[str]) -> str:
-    """A readable list of names that stays on one line.
-
-    Examples
-    --------
-    >>> shortened(["FEP", "SEP"])
-    'FEP, SEP'
-    >>> shortened(f"ch{i}" for i in range(20))
-    'ch0, ch1, ch2, ch3, ch4, ch5 and 14 more'
-    """
-    listed = list(names)
-    text = ", ".join(listed[:_SHOWN]) or "nothing"
-    rest = len(listed) - _SHOWN
-    return f"{text} and {rest} more" if rest > 0 else text
-
-
 def require_length(path: Path, name: str, column: Column, n_pulses: int | None) -> None:
     """Raise a `CpunetError` unless `column` has one value per pulse, or one for all."""
     if n_pulses is not None and not column.constant and len(column) != n_pulses:
@@ -88,8 +73,6 @@ def require_length(path: Path, name: str, column: Column, n_pulses: int | None) 
             "give the column of the same events"
         )
 
-
-log = logging.getLogger(__name__)
 
 # Columns by which the rows of two files are joined.
 EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
@@ -218,7 +201,7 @@ def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Col
             f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
         )
     # Imported late: the LH5 library takes seconds to load, and most files do not need it.
-    from cpunet.pulses.reading.hdf5_columns import column_of, columns_beside
+    from cpunet.hdf5_files import column_of, columns_beside
 
     column = column_of(Path(file), inner)
     return _joined(path, columns, energy, column, columns_beside(Path(file), inner))

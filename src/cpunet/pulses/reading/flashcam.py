@@ -14,9 +14,10 @@ import numpy.typing as npt
 from fcio import FCIO, Tags, fcio_open
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.energies import MemoryColumn, shortened
+from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
+from cpunet.tables import shortened
 
 
 class FlashCamSource(PulseSource):

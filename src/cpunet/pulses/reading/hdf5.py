@@ -13,12 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import lh5_rows, opened, text_attribute
-from cpunet.pulses.reading.energies import shortened
+from cpunet.hdf5_files import Hdf5Column, columns_of, lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.hdf5_columns import Hdf5Column, columns_of
 from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
+from cpunet.tables import shortened
 
 # preference among several waveform columns of a table: full record, then full-rate window
 _PREFERRED = ("waveform", "waveform_windowed")

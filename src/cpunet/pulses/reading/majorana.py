@@ -18,9 +18,10 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
-from cpunet.pulses.reading.energies import MemoryColumn, shortened
+from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
+from cpunet.tables import shortened
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file

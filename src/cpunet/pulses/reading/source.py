@@ -113,6 +113,10 @@ class PulseSource(ABC):
         Number of pulses; None if it is unknown without reading the whole file.
     length : int
         Samples per pulse.
+    layout : Layout
+        Content of the file.
+    energies : Energies
+        Rule that gives each pulse its energy.
     """
 
     def __init__(self, options: PulseFile, layout: Layout) -> None:
@@ -124,7 +128,7 @@ class PulseSource(ABC):
         self.path = options.path
         self.n_pulses = layout.n_pulses
         self.length = layout.length
-        self._layout = layout
+        self.layout = layout
         self._sampling = resolve_sampling(
             options.path,
             layout.period_name,
@@ -134,7 +138,7 @@ class PulseSource(ABC):
             hint=layout.period_hint,
         )
         self.dt_ns = self._sampling.dt_ns
-        self._energies = resolve_energies(
+        self.energies = resolve_energies(
             options.path,
             layout.columns,
             energy=options.energy,
@@ -169,7 +173,7 @@ class PulseSource(ABC):
             start += len(traces.waveforms)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
-        column = self._energies.column
+        column = self.energies.column
         if column is not None and not column.constant and len(column) != start:
             raise CpunetError(
                 f"{self.path}: {start} waveforms, but {len(column)} energies; "
@@ -183,19 +187,7 @@ class PulseSource(ABC):
     @property
     def columns(self) -> Mapping[str, Column]:
         """Columns with one value per event, by name."""
-        return self._layout.columns
-
-    def describe(self) -> dict[str, Any]:
-        """Describe the file without reading its waveforms."""
-        return {
-            "format": self._layout.format,
-            "table": self._layout.table,
-            "columns": sorted(self._layout.columns),
-            "n_pulses": self.n_pulses,
-            "length": self.length,
-            "dt_ns": self.dt_ns,
-            "energy": self._energies.description,
-        }
+        return self.layout.columns
 
     def _pulses(self, start: int, traces: Traces) -> Pulses:
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
@@ -203,10 +195,10 @@ class PulseSource(ABC):
         stop = start + len(waveforms)
         numbers = traces.event_number
         if self._number_column is not None:
-            numbers = self._layout.columns[self._number_column].read(start, stop)
+            numbers = self.layout.columns[self._number_column].read(start, stop)
         elif numbers is None:
             numbers = np.arange(start, stop)
-        energy_kev = self._energies.of(start, waveforms)
+        energy_kev = self.energies.of(start, waveforms)
         if len(energy_kev) != len(waveforms):
             raise CpunetError(
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "

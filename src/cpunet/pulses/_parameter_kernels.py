@@ -1,0 +1,278 @@
+"""Compiled loops of the pulse-shape parameters: several pulses in, their numbers out.
+
+Each step of dspeed's moving windows depends on the one before, so a single pulse leaves most of
+a processor idle.  Here each step of the current amplitude is done for `LANES` pulses at once.
+All its values are float32 and result from the same operations in the same order as in dspeed's
+``upsampler`` and ``moving_window_multi``, so the results are equal to the last bit.
+
+All sums of the other parameters are float64.  An undefined value is NaN and never raises an
+exception.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.kernels import kernel
+from cpunet.pulses.container import FloatArray
+
+Values = npt.NDArray[np.float64]
+
+LANES = 32
+
+_compiled: Any = kernel(error_model="numpy")
+
+
+@_compiled
+def _window(values, steps, averaged):  # type: ignore[no-untyped-def]
+    """Mean of each value and the `steps` - 1 before it, in reverse order.
+
+    The windows alternate between looking back and ahead: on reversed values, back is ahead.
+    """
+    width, last, total = np.float32(steps), len(values) - 1, values[0].copy()
+    averaged[last] = total
+    for i in range(1, steps):
+        for lane in range(len(total)):
+            total[lane] += (values[i, lane] - values[0, lane]) / width
+            averaged[last - i, lane] = total[lane]
+    leaving = values[: len(values) - steps]
+    for i in range(len(leaving)):
+        for lane in range(len(total)):
+            total[lane] += (values[i + steps, lane] - leaving[i, lane]) / width
+            averaged[last - steps - i, lane] = total[lane]
+
+
+@_compiled
+def _maxima(current, first, samples, upsampling, steps, averages, ends, maxima):  # type: ignore[no-untyped-def]
+    n, fine = len(current), (samples - 1) * upsampling
+    values = np.empty((fine, LANES), np.float32)
+    averaged = np.empty((fine, LANES), np.float32)
+    highest = np.empty(LANES, np.float32)
+    for begin in range(0, n, LANES):
+        for sample in range(samples):
+            for lane in range(LANES):
+                row = min(begin + lane, n - 1)  # repeat the last pulse in unused lanes
+                highest[lane] = current[row, first[row] + sample]
+            # dspeed centres each sample on its steps
+            start = sample * upsampling - upsampling // 2
+            for i in range(max(start, 0), min(start + upsampling, fine)):
+                values[i] = highest
+        for _ in range(averages):
+            _window(values, steps, averaged)
+            values, averaged = averaged, values
+        highest[:] = values[ends]
+        for i in range(ends, fine - ends):
+            for lane in range(LANES):
+                # a NaN is kept
+                if not values[i, lane] <= highest[lane]:
+                    highest[lane] = values[i, lane]
+        for lane in range(min(LANES, n - begin)):
+            maxima[begin + lane] = highest[lane]
+
+
+@_compiled
+def _currents(waveforms, current, steepest):  # type: ignore[no-untyped-def]
+    samples = waveforms.shape[1] - 1
+    for row in range(len(waveforms)):
+        unknown = False
+        best = 0
+        for i in range(samples):
+            current[row, i] = waveforms[row, i + 1] - waveforms[row, i]
+            unknown |= math.isnan(waveforms[row, i])
+        unknown |= math.isnan(waveforms[row, samples])
+        if unknown:
+            current[row] = math.nan
+        for i in range(samples):
+            if current[row, i] > current[row, best]:
+                best = i
+        steepest[row] = best
+
+
+@_compiled
+def _elsewhere(current, first, samples, highest):  # type: ignore[no-untyped-def]
+    for row in range(len(current)):
+        highest[row] = -math.inf
+        for i in range(current.shape[1]):
+            inside = first[row] <= i < first[row] + samples
+            if not (inside or current[row, i] <= highest[row]):
+                highest[row] = current[row, i]
+
+
+def currents(waveforms: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Differences of neighbouring samples, and the index of the largest one of each pulse.
+
+    A pulse with a NaN has a current of NaN.
+    """
+    n, length = waveforms.shape
+    current, steepest = np.empty((n, length - 1), np.float32), np.empty(n, np.int64)
+    _currents(waveforms, current, steepest)
+    return current, steepest
+
+
+def maxima_elsewhere(
+    current: FloatArray, first: npt.NDArray[np.int64], samples: int
+) -> FloatArray:
+    """Largest current of each pulse outside the `samples` samples that start at `first`."""
+    highest = np.empty(len(current), np.float32)
+    _elsewhere(current, first, samples, highest)
+    return highest
+
+
+def averaged_maxima(
+    current: FloatArray,
+    first: npt.NDArray[np.int64],
+    samples: int,
+    *,
+    upsampling: int,
+    steps: int,
+    averages: int,
+    ends: int,
+) -> Values:
+    """Maximum of the averaged current of each pulse in the `samples` samples from `first` on.
+
+    Parameters
+    ----------
+    current
+        Float32, shape ``(n, length - 1)``.
+    first, samples
+        First sample that is averaged, shape ``(n,)``, and number of averaged samples.
+    upsampling
+        Steps per sample.
+    steps, averages
+        Width of the moving average in steps, and number of successive averages.
+    ends
+        Steps at each end that are excluded from the search.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float64, shape ``(n,)``; NaN if a searched value is NaN.
+    """
+    maxima = np.empty(len(current), np.float32)
+    _maxima(current, first, samples, upsampling, steps, averages, ends, maxima)
+    return maxima.astype(float)
+
+
+# Half a sample from its maximum, the smoothed current is still within 6 % of it: the
+# averages alone smear it with a sigma of 1.5 samples.
+_NEAR_MAXIMUM = 0.8
+# For sums over finite values, which the compiler can then reorder and vectorise.
+_compiled_sum: Any = kernel(
+    error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
+)
+
+
+@_compiled
+def _missing(pulse, start, stop, height):  # type: ignore[no-untyped-def]
+    """Area between `height` and the pulse from time `start` to sample `stop`, over `height`."""
+    first = math.ceil(start)
+    if first >= stop:
+        return math.nan
+    # straight lines between samples, with a partial interval at the start
+    share = first - start
+    area = 0.0
+    if share > 0:
+        at_start = pulse[first] + share * (pulse[first - 1] - pulse[first])
+        area = share * (height - 0.5 * (at_start + pulse[first]))
+    for i in range(first, stop):
+        area += height - 0.5 * (pulse[i] + pulse[i + 1])
+    return area / height
+
+
+@_compiled
+def _missing_areas(waveforms, starts, stops, areas):  # type: ignore[no-untyped-def]
+    for i in range(len(waveforms)):
+        areas[i] = math.nan
+        if starts[i] >= 0 and stops[i] > starts[i]:
+            stop = int(stops[i])
+            areas[i] = _missing(waveforms[i], starts[i], stop, np.float64(waveforms[i, stop]))
+
+
+@_compiled_sum
+def _smoothed(current, weights, step):  # type: ignore[no-untyped-def]
+    """The smoothed current at a step of the fine grid."""
+    steps, taps = weights.shape
+    first, phase = step // steps - taps // 2, step % steps
+    total = 0.0
+    for i in range(taps):
+        total += weights[phase, i] * current[first + i]
+    return total
+
+
+@_compiled
+def _current_maximum(current, weights, samples):  # type: ignore[no-untyped-def]
+    """Step and value of the smoothed current's maximum; `samples` is a buffer."""
+    steps, reach = len(weights), weights.shape[1] // 2
+    stop = len(current) - reach
+    rough = -math.inf
+    for i in range(reach, stop):
+        samples[i] = _smoothed(current, weights, i * steps)
+        rough = max(rough, samples[i])
+    best, highest = -1, 0.0
+    if not rough > 0:
+        return best, highest
+    for i in range(reach, stop):
+        if max(samples[i], samples[min(i + 1, stop - 1)]) >= _NEAR_MAXIMUM * rough:
+            for step in range(i * steps, (i + 1) * steps):
+                value = _smoothed(current, weights, step)
+                if value > highest:
+                    best, highest = step, value
+    return best, highest
+
+
+@_compiled
+def _half_width(current, weights, top, highest, direction):  # type: ignore[no-untyped-def]
+    """Steps from the maximum to half of it, on the left (-1) or right (+1)."""
+    steps, reach = len(weights), weights.shape[1] // 2
+    first, last = reach * steps, (len(current) - reach) * steps - 1
+    step, before = top, highest
+    while first <= step + direction <= last:
+        step += direction
+        value = _smoothed(current, weights, step)
+        if value <= 0.5 * highest:
+            return abs(step - top) - 1 + (before - 0.5 * highest) / (before - value)
+        before = value
+    return math.nan
+
+
+@_compiled
+def _current_widths(waveforms, weights, widths):  # type: ignore[no-untyped-def]
+    current, samples = np.empty(waveforms.shape[1] - 1), np.empty(waveforms.shape[1] - 1)
+    for i in range(len(waveforms)):
+        widths[i] = math.nan
+        for j in range(len(current)):
+            current[j] = waveforms[i, j + 1] - waveforms[i, j]
+        if math.isfinite(current.sum()):  # a current with a NaN has no maximum
+            top, highest = _current_maximum(current, weights, samples)
+            if top >= 0:
+                left = _half_width(current, weights, top, highest, -1)
+                right = _half_width(current, weights, top, highest, 1)
+                widths[i] = (left + right) / len(weights)
+
+
+def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Values:
+    r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
+
+    .. math:: \frac{1}{x(t_1)} \int_{t_0}^{t_1} [x(t_1) - x(t)] \, dt
+
+    from the time :math:`t_0` in `starts` (NaN for no value) to the sample :math:`t_1` in
+    `stops`, with straight lines between samples.
+    """
+    areas = np.empty(len(waveforms))
+    _missing_areas(waveforms, np.ascontiguousarray(starts), stops, areas)
+    return areas
+
+
+def current_widths(waveforms: FloatArray, weights: FloatArray) -> Values:
+    """Full width at half maximum of the smoothed current of ``(n, length)``, in samples.
+
+    The weights are those of `cpunet.pulses.parameters.current_amplitude_kernel`.
+    """
+    widths = np.empty(len(waveforms))
+    # negative weights are rounding errors that would make the current of a falling pulse > 0
+    _current_widths(waveforms, np.clip(weights.astype(float), 0, None), widths)
+    return widths
