@@ -181,15 +181,10 @@ def export_legend(
     }
     pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}} | ae_pars
     with folder_written_aside(out, LEGEND_PARS, *given, force=force) as folder:
-        for kind, content in pars.items():
-            _write(folder / f"{kind}.yaml", {name: content})
-        _write(folder / WHOLE, {name: whole})
+        for kind, content in (pars | {"cpunet": whole}).items():
+            text = yaml.safe_dump(plain({name: content}), sort_keys=False, allow_unicode=True)
+            (folder / f"{kind}.yaml").write_text(text, encoding="utf-8")
     return LegendParameters(out, name, whole)
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    text = yaml.safe_dump(plain(content), sort_keys=False, allow_unicode=True)
-    path.write_text(text, encoding="utf-8")
 
 
 def _against_energy(

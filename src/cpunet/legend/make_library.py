@@ -117,32 +117,10 @@ def make_library(
     if not isinstance(detector, Detector):
         detector = read_detector(detector, of_detector)
     angles_deg = _degrees(angles)
-    sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS} if settings_file is None else {}
-    wanted = read_settings(SimulationSettings, settings_file, sampling | of_settings)
-    return _write(detector, out, wanted, grid_mm, angles_deg)
-
-
-def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:
-    words = angles.split(",") if isinstance(angles, str) else angles
-    try:
-        degrees = tuple(int(word) for word in words)
-    except ValueError:
-        raise CpunetError(f"`angles` {angles}: give whole degrees, as 0,45") from None
-    wrong = [angle for angle in degrees if not 0 <= angle < 360]
-    if wrong or not degrees or len(set(degrees)) < len(degrees):
-        raise CpunetError(f"`angles` {angles}: give different ones from 0 to 359 degrees")
-    return degrees
-
-
-def _write(
-    detector: Detector,
-    out: Path,
-    settings: SimulationSettings,
-    grid_mm: float,
-    angles_deg: tuple[int, ...],
-) -> MadeLibrary:
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
+    sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS} if settings_file is None else {}
+    wanted = read_settings(SimulationSettings, settings_file, sampling | of_settings)
     with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
@@ -156,14 +134,26 @@ def _write(
         library = made.h5.create_group(detector.name or "detector")
         put_column(library, "r", r_mm, "mm")
         put_column(library, "z", z_mm, "mm")
-        put_column(library, "dt", settings.dt_ns, "ns")
+        put_column(library, "dt", wanted.dt_ns, "ns")
         put_column(library, "t0", 0.0, "ns")
         for angle in angles_deg:
-            _fill(library, angle, fields, settings, counts, bar)
+            _fill(library, angle, fields, wanted, counts, bar)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
         if not counts.written:
             raise CpunetError(f"{counts}; give a finer grid or longer records")
     return counts
+
+
+def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:
+    words = angles.split(",") if isinstance(angles, str) else angles
+    try:
+        degrees = tuple(int(word) for word in words)
+    except ValueError:
+        raise CpunetError(f"`angles` {angles}: give whole degrees, as 0,45") from None
+    wrong = [angle for angle in degrees if not 0 <= angle < 360]
+    if wrong or not degrees or len(set(degrees)) < len(degrees):
+        raise CpunetError(f"`angles` {angles}: give different ones from 0 to 359 degrees")
+    return degrees
 
 
 def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:

@@ -15,12 +15,8 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.pulses.container import FloatArray
-
-Values = npt.NDArray[np.float64]
 
 LANES = 32
 
@@ -47,7 +43,28 @@ def _window(values, steps, averaged):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _maxima(current, first, samples, upsampling, steps, averages, ends, maxima):  # type: ignore[no-untyped-def]
+def averaged_maxima(current, first, samples, upsampling, steps, averages, ends):  # type: ignore[no-untyped-def]
+    """Maximum of the averaged current of each pulse in the `samples` samples from `first` on.
+
+    Parameters
+    ----------
+    current
+        Float32, shape ``(n, length - 1)``.
+    first, samples
+        First sample that is averaged, shape ``(n,)``, and number of averaged samples.
+    upsampling
+        Steps per sample.
+    steps, averages
+        Width of the moving average in steps, and number of successive averages.
+    ends
+        Steps at each end that are excluded from the search.
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32, shape ``(n,)``; NaN if a searched value is NaN.
+    """
+    maxima = np.empty(len(current), np.float32)
     n, fine = len(current), (samples - 1) * upsampling
     values = np.empty((fine, LANES), np.float32)
     averaged = np.empty((fine, LANES), np.float32)
@@ -72,11 +89,17 @@ def _maxima(current, first, samples, upsampling, steps, averages, ends, maxima):
                     highest[lane] = values[i, lane]
         for lane in range(min(LANES, n - begin)):
             maxima[begin + lane] = highest[lane]
+    return maxima
 
 
 @_compiled
-def _currents(waveforms, current, steepest):  # type: ignore[no-untyped-def]
-    samples = waveforms.shape[1] - 1
+def currents(waveforms):  # type: ignore[no-untyped-def]
+    """Differences of neighbouring samples, and the index of the largest one of each pulse.
+
+    A pulse with a NaN has a current of NaN.
+    """
+    n, samples = waveforms.shape[0], waveforms.shape[1] - 1
+    current, steepest = np.empty((n, samples), np.float32), np.empty(n, np.int64)
     for row in range(len(waveforms)):
         unknown = False
         best = 0
@@ -90,71 +113,20 @@ def _currents(waveforms, current, steepest):  # type: ignore[no-untyped-def]
             if current[row, i] > current[row, best]:
                 best = i
         steepest[row] = best
+    return current, steepest
 
 
 @_compiled
-def _elsewhere(current, first, samples, highest):  # type: ignore[no-untyped-def]
+def maxima_elsewhere(current, first, samples):  # type: ignore[no-untyped-def]
+    """Largest current of each pulse outside the `samples` samples that start at `first`."""
+    highest = np.empty(len(current), np.float32)
     for row in range(len(current)):
         highest[row] = -math.inf
         for i in range(current.shape[1]):
             inside = first[row] <= i < first[row] + samples
             if not (inside or current[row, i] <= highest[row]):
                 highest[row] = current[row, i]
-
-
-def currents(waveforms: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Differences of neighbouring samples, and the index of the largest one of each pulse.
-
-    A pulse with a NaN has a current of NaN.
-    """
-    n, length = waveforms.shape
-    current, steepest = np.empty((n, length - 1), np.float32), np.empty(n, np.int64)
-    _currents(waveforms, current, steepest)
-    return current, steepest
-
-
-def maxima_elsewhere(
-    current: FloatArray, first: npt.NDArray[np.int64], samples: int
-) -> FloatArray:
-    """Largest current of each pulse outside the `samples` samples that start at `first`."""
-    highest = np.empty(len(current), np.float32)
-    _elsewhere(current, first, samples, highest)
     return highest
-
-
-def averaged_maxima(
-    current: FloatArray,
-    first: npt.NDArray[np.int64],
-    samples: int,
-    *,
-    upsampling: int,
-    steps: int,
-    averages: int,
-    ends: int,
-) -> Values:
-    """Maximum of the averaged current of each pulse in the `samples` samples from `first` on.
-
-    Parameters
-    ----------
-    current
-        Float32, shape ``(n, length - 1)``.
-    first, samples
-        First sample that is averaged, shape ``(n,)``, and number of averaged samples.
-    upsampling
-        Steps per sample.
-    steps, averages
-        Width of the moving average in steps, and number of successive averages.
-    ends
-        Steps at each end that are excluded from the search.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float64, shape ``(n,)``; NaN if a searched value is NaN.
-    """
-    maxima = np.empty(len(current), np.float32)
-    _maxima(current, first, samples, upsampling, steps, averages, ends, maxima)
-    return maxima.astype(float)
 
 
 # Half a sample from its maximum, the smoothed current is still within 6 % of it: the
@@ -184,12 +156,21 @@ def _missing(pulse, start, stop, height):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _missing_areas(waveforms, starts, stops, areas):  # type: ignore[no-untyped-def]
+def missing_areas(waveforms, starts, stops):  # type: ignore[no-untyped-def]
+    r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
+
+    .. math:: \frac{1}{x(t_1)} \int_{t_0}^{t_1} [x(t_1) - x(t)] \, dt
+
+    from the time :math:`t_0` in `starts` (NaN for no value) to the sample :math:`t_1` in
+    `stops`, with straight lines between samples.
+    """
+    areas = np.empty(len(waveforms))
     for i in range(len(waveforms)):
         areas[i] = math.nan
         if starts[i] >= 0 and stops[i] > starts[i]:
             stop = int(stops[i])
             areas[i] = _missing(waveforms[i], starts[i], stop, np.float64(waveforms[i, stop]))
+    return areas
 
 
 @_compiled_sum
@@ -240,7 +221,13 @@ def _half_width(current, weights, top, highest, direction):  # type: ignore[no-u
 
 
 @_compiled
-def _current_widths(waveforms, weights, widths):  # type: ignore[no-untyped-def]
+def current_widths(waveforms, weights):  # type: ignore[no-untyped-def]
+    """Full width at half maximum of the smoothed current of ``(n, length)``, in samples.
+
+    The weights are those of `cpunet.pulses.parameters.current_amplitude_kernel`, in float64
+    and without rounding errors below 0, which would make the current of a falling pulse > 0.
+    """
+    widths = np.empty(len(waveforms))
     current, samples = np.empty(waveforms.shape[1] - 1), np.empty(waveforms.shape[1] - 1)
     for i in range(len(waveforms)):
         widths[i] = math.nan
@@ -252,27 +239,4 @@ def _current_widths(waveforms, weights, widths):  # type: ignore[no-untyped-def]
                 left = _half_width(current, weights, top, highest, -1)
                 right = _half_width(current, weights, top, highest, 1)
                 widths[i] = (left + right) / len(weights)
-
-
-def missing_areas(waveforms: FloatArray, starts: Values, stops: Values) -> Values:
-    r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
-
-    .. math:: \frac{1}{x(t_1)} \int_{t_0}^{t_1} [x(t_1) - x(t)] \, dt
-
-    from the time :math:`t_0` in `starts` (NaN for no value) to the sample :math:`t_1` in
-    `stops`, with straight lines between samples.
-    """
-    areas = np.empty(len(waveforms))
-    _missing_areas(waveforms, np.ascontiguousarray(starts), stops, areas)
-    return areas
-
-
-def current_widths(waveforms: FloatArray, weights: FloatArray) -> Values:
-    """Full width at half maximum of the smoothed current of ``(n, length)``, in samples.
-
-    The weights are those of `cpunet.pulses.parameters.current_amplitude_kernel`.
-    """
-    widths = np.empty(len(waveforms))
-    # negative weights are rounding errors that would make the current of a falling pulse > 0
-    _current_widths(waveforms, np.clip(weights.astype(float), 0, None), widths)
     return widths

@@ -89,7 +89,10 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
     """
     measured = channels_of(data)
     if CHANNEL in str(sim.path):
-        return {name: (_own_file(sim, name), file) for name, file in measured.items()}
+        return {
+            name: (replace(sim, path=Path(str(sim.path).replace(CHANNEL, name))), file)
+            for name, file in measured.items()
+        }
     if sim.table != ALL:
         return {name: (sim, file) for name, file in measured.items()}
     simulated = channels_of(sim)
@@ -100,10 +103,6 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
         else CpunetError(f"{sim.path}: no table of {name}; there are those of {there}")
         for name, file in measured.items()
     }
-
-
-def _own_file(sim: PulseFile, name: str) -> PulseFile:
-    return replace(sim, path=Path(str(sim.path).replace(CHANNEL, name)))
 
 
 @dataclass(frozen=True)

@@ -134,6 +134,8 @@ def _edges(block: Pulses) -> tuple[Values, Values, Values]:
 
     NaN where a trace has no pulse; shape ``(n,)`` each.
     """
+    from cpunet.pulses.half_maximum import last_below  # compiled loops
+
     waveforms = np.asarray(block.waveforms, np.float32)
     few = max(MIN_BASELINE, waveforms.shape[1] // 20)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -142,20 +144,11 @@ def _edges(block: Pulses) -> tuple[Values, Values, Values]:
         height = waveforms.max(axis=1) - baseline
         rms = waveforms[:, :few].std(axis=1)
         pulse = np.isfinite(height) & (height > START_SIGMAS * rms) & (top > 0)
-        half = _last_below(waveforms, top, baseline + height / 2)
-        level = np.maximum(START * height, START_SIGMAS * rms)
-        start = _last_below(waveforms, top, baseline + level)
+        half, start = (
+            np.where(*last_below(waveforms, top, baseline + level), -1) + 1
+            for level in (height / 2, np.maximum(START * height, START_SIGMAS * rms))
+        )
     return tuple(np.where(pulse, v, np.nan).astype(float) for v in (half, start, rms))  # type: ignore[return-value]
-
-
-def _last_below(
-    waveforms: npt.NDArray[np.float32], top: npt.NDArray[np.intp], level: npt.NDArray[Any]
-) -> npt.NDArray[np.intp]:
-    """Number of samples up to the last one below a level before the maximum."""
-    below = waveforms < level[:, np.newaxis]
-    below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
-    samples = waveforms.shape[1] - below[:, ::-1].argmax(axis=1)
-    return np.where(below.any(axis=1), samples, 0)
 
 
 @dataclass(frozen=True)

@@ -119,14 +119,21 @@ def last_below_half(
     tuple of numpy.ndarray
         Mask of the finite pulses with such a crossing, and the sample before it.
     """
-    length = waveforms.shape[1]
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
-    below = waveforms < 0.5 * height[:, np.newaxis]
-    below &= np.arange(length) < top[:, np.newaxis]
-    last = length - 1 - below[:, ::-1].argmax(axis=1)
-    return finite & (height > 0) & below.any(axis=1), last
+    there, last = last_below(waveforms, top, 0.5 * height)
+    return finite & (height > 0) & there, last
+
+
+def last_below(
+    waveforms: FloatArray | Values, top: npt.NDArray[np.intp], level: FloatArray | Values
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
+    """Whether each pulse is below a level before its `top`, and the last such sample."""
+    below = waveforms < level[:, np.newaxis]
+    below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
+    there = np.asarray(below.any(axis=1))
+    return there, waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
 
 
 def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:

@@ -284,15 +284,11 @@ def _maximum(
     current: FloatArray, first: npt.NDArray[np.int64], samples: int, ends: int
 ) -> Values:
     """Maximum of the averaged current, excluding `ends` samples at each end."""
-    return kernels.averaged_maxima(
-        current,
-        first,
-        samples,
-        upsampling=UPSAMPLING,
-        steps=AVERAGE_STEPS,
-        averages=AVERAGES,
-        ends=ends * UPSAMPLING,
+    ends *= UPSAMPLING
+    found: FloatArray = kernels.averaged_maxima(
+        current, first, samples, UPSAMPLING, AVERAGE_STEPS, AVERAGES, ends
     )
+    return found.astype(float)
 
 
 def _averaged(current: FloatArray) -> FloatArray:

@@ -247,19 +247,11 @@ def _of_simulation(made: Mapping[str, Any]) -> dict[str, str]:
     ]
     if isinstance(settings.get("cloud_fwhm_mm"), int | float):
         physics.append(f"charge clouds of {settings['cloud_fwhm_mm']:g} mm")
-    return {
-        "detector": ", ".join(physics),
-        "hits": _of_hits(hits),
-        "events": _of_events(made),
-    }
-
-
-def _of_events(made: Mapping[str, Any]) -> str:
-    """Numbers of events and the seed; a stand records them in its ``stand.json``."""
-    if "events" not in made:
-        return ""
-    lost = made.get("events_without_signal")
-    return f"{made['events']}, of which {lost} without a signal; seed {made.get('seed')}"
+    words = {"detector": ", ".join(physics), "hits": _of_hits(hits)}
+    if "events" in made:  # a stand records them in its ``stand.json``
+        lost, seed = made.get("events_without_signal"), made.get("seed")
+        words["events"] = f"{made['events']}, of which {lost} without a signal; seed {seed}"
+    return words
 
 
 def _of_hits(hits: Mapping[str, Any]) -> str:

@@ -184,7 +184,7 @@ def _of_block(
     scores: ScoreConfig,
     amplitudes: Values | None,
 ) -> dict[str, Values]:
-    weights = current_amplitude_kernel()
+    weights = np.clip(current_amplitude_kernel().astype(float), 0, None)
     return {
         "current_amplitude": current_amplitude(block) if amplitudes is None else amplitudes,
         "current_width": kernels.current_widths(block, weights) * dt_ns,
@@ -212,7 +212,7 @@ def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
         zip(TIME_POINTS, ((samples - aligned) * dt_ns).T, strict=True)
     )
     rises = {name: times[end] - times[begin] for name, (begin, end) in RISE_TIMES.items()}
-    areas = kernels.missing_areas(block, samples[:, 0], stop.astype(float))
+    areas = kernels.missing_areas(block, samples[:, 0].copy(), stop.astype(float))
     return {**times, **rises, "effective_drift_time": areas * dt_ns}
 
 

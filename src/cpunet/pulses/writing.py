@@ -141,7 +141,12 @@ class PulseWriter:
             "event_number": Array(pulses.event_number),
         }
         for name, (values, units) in extra.items():
-            content[name] = self._column(name, values, units, len(pulses))
+            if np.shape(values) != (len(pulses),):
+                raise CpunetError(
+                    f"{self.path}: column {name} has shape {np.shape(values)} beside "
+                    f"{len(pulses)} pulses; give one value per pulse"
+                )
+            content[name] = _column(values, units)
         block = Table(col_dict=content | others, attrs=dict(self._attrs))
         group, _, name = self._table.rpartition("/")
         self._file.write(block, name, group or "/")
@@ -158,12 +163,8 @@ class PulseWriter:
             Name → (array of shape ``(rows,)``, units); the same names each time.
         """
         assert self._file is not None  # within the writer's with block
-        rows = {name: (np.asarray(values), units) for name, (values, units) in columns.items()}
         group, _, name = table.strip("/").rpartition("/")
-        content = {
-            key: Array(values, attrs={"units": units} if units else {})
-            for key, (values, units) in rows.items()
-        }
+        content = {key: _column(values, units) for key, (values, units) in columns.items()}
         if len(next(iter(content.values()))) > 0:
             self._file.write(Table(content), name, group or "/")
 
@@ -176,15 +177,6 @@ class PulseWriter:
         """Set an attribute of the file, such as its provenance record."""
         assert self._file is not None  # within the writer's with block
         self._file.h5.attrs[name] = text
-
-    def _column(self, name: str, values: npt.ArrayLike, units: str, n: int) -> Array:
-        array = np.asarray(values)
-        if array.shape != (n,):
-            raise CpunetError(
-                f"{self.path}: column {name} has shape {array.shape} beside {n} pulses; "
-                "give one value per pulse"
-            )
-        return Array(array, attrs={"units": units} if units else {})
 
     def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
         taken = {"waveform", "energy", "event_number"} & set(extra)
@@ -200,6 +192,10 @@ class PulseWriter:
                 f"{self.path}: a block of {_in_words(shape)} after one of "
                 f"{_in_words(self._shape)}; write them to separate files"
             )
+
+
+def _column(values: npt.ArrayLike, units: str) -> Array:
+    return Array(np.asarray(values), attrs={"units": units} if units else {})
 
 
 def write_pulses(

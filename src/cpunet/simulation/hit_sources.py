@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
+from cpunet.processes import usable_cores
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas.sample import EnergyWindow, GammaStatistics, simulate_gammas
@@ -148,7 +148,8 @@ class HitFile:
         n_events = n_late = n_hits = n_outside = 0
         low_mm, high_mm = np.full((2, 3), [[np.inf], [-np.inf]])
         for part in parts():
-            hits, place = chosen(part), chosen(part).position_mm
+            hits = chosen(part)
+            place = hits.position_mm
             n_events, n_late = n_events + hits.n_events, n_late + part.n_late
             n_hits += len(place)
             n_outside += int((~detector.inside(np.hypot(*place.T[:2]), hits.z_mm)).sum())
@@ -254,9 +255,7 @@ class GammaSource:
         Each round has its own seed, so the events do not depend on the number of cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
-        has_affinity = hasattr(os, "sched_getaffinity")
-        cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-        workers = min(cores, _MAX_WORKERS, rounds)
+        workers = min(usable_cores(), _MAX_WORKERS, rounds)
         waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
         pool = ThreadPoolExecutor(workers)
         primaries = 0
