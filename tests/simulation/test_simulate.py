@@ -320,7 +320,7 @@ def test_wrong_settings_name_the_file(tmp_path: Path, text: str, said: str):
 def test_a_library_without_templates_is_not_written(ppc, tmp_path):
     short = SimulationSettings(dt_ns=1, length_ns=50)
     for grid_mm, said in (
-        (100, "none of 2 .* 2 give no signal"),
+        (100, "0 of 2 places .* 2 give no signal"),
         (20, r"\d+ are not collected in time"),
     ):
         with pytest.raises(CpunetError, match=said):

@@ -102,7 +102,12 @@ def _merge(
                 mine = queue[done]
                 done += 1
                 for other in range(first + 1, end):
-                    if label[other] < 0 and _near(position, mine, other, distance2):
+                    if label[other] >= 0:
+                        continue
+                    square = 0.0
+                    for axis in range(3):
+                        square += (position[mine, axis] - position[other, axis]) ** 2
+                    if square <= distance2:
                         label[other] = n
                         queue[waiting] = other
                         waiting += 1
@@ -110,14 +115,6 @@ def _merge(
             n += 1
         new_offsets[event + 1] = n
     return merged[:n], new_offsets
-
-
-@kernel
-def _near(position: Array, a: int, b: int, distance2: float) -> bool:
-    square = 0.0
-    for axis in range(3):
-        square += (position[a, axis] - position[b, axis]) ** 2
-    return square <= distance2
 
 
 @kernel

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -80,39 +83,31 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
 def _potential(figure: Figure, axes: Axes, fields: FieldMaps) -> None:
     values = _in_germanium(fields, fields.potential_V)
     top = float(np.nanmax(fields.potential_V))
-    image = axes.pcolormesh(
-        fields.r_mm, fields.z_mm, values.T, cmap="viridis", vmin=0, vmax=top, rasterized=True
-    )
     levels = np.linspace(0, top, 11)[1:-1]
-    axes.contour(
-        fields.r_mm, fields.z_mm, values.T, levels, colors="white", linewidths=0.6, alpha=0.8
+    bar = f"Potential [V], lines every {top / 10:.0f} V"
+    _map(
+        figure, axes, fields, values, levels, "Potential", bar, cmap="viridis", vmin=0, vmax=top
     )
-    axes.set_title("Potential")
-    _bar(figure, axes, image, f"Potential [V], lines every {top / 10:.0f} V")
 
 
 def _weighting_potential(figure: Figure, axes: Axes, fields: FieldMaps) -> None:
-    values = _in_germanium(fields, fields.weighting_potential)
-    low = _WEIGHTING_LEVELS[0]
-    image = axes.pcolormesh(
-        fields.r_mm,
-        fields.z_mm,
-        np.maximum(values, low / 10).T,
-        cmap="cividis",
-        norm=LogNorm(low / 10, 1),
-        rasterized=True,
-    )
-    lines = axes.contour(
-        fields.r_mm,
-        fields.z_mm,
-        values.T,
-        _WEIGHTING_LEVELS,
-        colors="white",
-        linewidths=0.7,
-    )
+    low, name = _WEIGHTING_LEVELS[0], "Weighting potential"
+    values = np.maximum(_in_germanium(fields, fields.weighting_potential), low / 10)
+    how = {"cmap": "cividis", "norm": LogNorm(low / 10, 1)}
+    lines = _map(figure, axes, fields, values, _WEIGHTING_LEVELS, name, name, **how)
     axes.clabel(lines, manual=_along_a_ray(fields), fmt="%g", fontsize=7.5)
-    axes.set_title("Weighting potential")
-    _bar(figure, axes, image, "Weighting potential")
+
+
+def _map(
+    figure: Figure, axes: Axes, fields: FieldMaps, values: FloatArray, levels: Any, title: str,
+    bar: str, **how: Any,
+) -> ContourSet:  # fmt: skip
+    """Draw values at the nodes in colour, with lines at some levels."""
+    places = fields.r_mm, fields.z_mm, values.T
+    image = axes.pcolormesh(*places, rasterized=True, **how)
+    axes.set_title(title)
+    _bar(figure, axes, image, bar)
+    return axes.contour(*places, levels, colors="white", linewidths=0.65, alpha=0.9)
 
 
 def _along_a_ray(fields: FieldMaps) -> list[tuple[float, float]]:

@@ -186,7 +186,7 @@ def _legend(
         for suffix in _MAPPINGS
     ]
     found = Path(crystal) if crystal else next(filter(Path.is_file, places), None)
-    hints = {field: why for field in Detector.model_fields if (why := why_missing(field))}
+    hints = why_missing()
     hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
     if found is None:
         return values, hints
@@ -194,7 +194,7 @@ def _legend(
     hints[_Z0] = f"production.impcc is empty or 0, and {found} has no impurity_curve"
     if content.get("impurity_curve") is None and crystal is None:
         return values, hints
-    length = values["crystal_length"]
+    length = values.get("crystal_length")
     if not isinstance(length, int | float):
         return values, hints  # refused together with the rest of the geometry
     # the curve describes the whole crystal and replaces a line through a few points

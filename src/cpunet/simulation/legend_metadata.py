@@ -53,12 +53,6 @@ _GEOMETRY = {
     "bulletization.pp-contact_radius_in_mm": "",
     "bulletization.contact_radius_in_mm": "",
 }
-_REQUIRED = (
-    "height_in_mm",
-    "radius_in_mm",
-    "pp_contact.radius_in_mm",
-    "pp_contact.depth_in_mm",
-)
 # fields of the detector and their locations; the first value above 0 is used
 _MEASURED = {
     "bias_V": (
@@ -106,9 +100,13 @@ _ANOTHER = "correct it, or take another file of the crystal"
 _LARGEST_EXPONENT = 300
 
 
-def why_missing(field: str) -> str:
-    """Reason why a diode does not give a field of `Detector`; empty for optional fields."""
-    return f"neither {' nor '.join(_MEASURED[field])} is above 0" if field in _MEASURED else ""
+def why_missing() -> dict[str, str]:
+    """Reasons why a diode does not give a field of `Detector`, by field."""
+    reasons = {field: f"no geometry.{key}" for key, field in _GEOMETRY.items()}
+    return reasons | {
+        field: f"neither {' nor '.join(places)} is above 0"
+        for field, places in _MEASURED.items()
+    }
 
 
 def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -132,9 +130,6 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             f"give one of type {', '.join(_SIMULATED)}"
         )
     geometry = _flat(diode["geometry"], name)
-    for key in _REQUIRED:
-        if key not in geometry:
-            raise CpunetError(f"detector {name}: no geometry.{key}; add it to the file")
     extra = diode["geometry"].get("extra") or {}
     if _at(extra, "crack") and _at(extra, "crack.width_in_mm") != 0:
         raise CpunetError(

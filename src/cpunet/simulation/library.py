@@ -8,6 +8,7 @@ fail are later drifted individually.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from cpunet.simulation.library_drift import (
 from cpunet.simulation.library_lookup import LATE, OUTSIDE, UNTRIED, PulseLibrary
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import EXACT, WHOLE_ON_AVERAGE, Task, drift_task
-from cpunet.simulation.velocity import FloatArray
 
 # Energies of the pulses of a self-repelling cloud: Chebyshev points in the squared width.
 _ENERGIES_KEV = (0.0, 430.0, 1820.0, 2700.0)
@@ -33,8 +33,10 @@ _BLOCK = 256
 _CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
 
 
-def _blocks(n: int) -> list[slice]:
-    return [slice(b, min(b + _BLOCK, n)) for b in range(0, n, _BLOCK)]
+def _blocks(n: int, bar: Stage) -> Iterator[slice]:
+    for begin in range(0, n, _BLOCK):
+        yield slice(begin, min(begin + _BLOCK, n))
+        bar.update(min(_BLOCK, n - begin))
 
 
 def build_library(fields: FieldMaps, settings: SimulationSettings) -> PulseLibrary:
@@ -52,7 +54,9 @@ def build_library(fields: FieldMaps, settings: SimulationSettings) -> PulseLibra
     settings
         Simulation settings, including those named `library_...`.
     """
-    maps, task = drift_maps(fields, settings), _task(fields, settings)
+    maps, task = drift_maps(fields, settings), drift_task(fields, settings)
+    if task.rounding != EXACT:  # jumps from place to place could not be interpolated
+        task = task._replace(rounding=WHOLE_ON_AVERAGE)
     library = _empty(fields, settings)
     size = 2**settings.library_halvings
     nr, nz = library.cell.shape
@@ -62,20 +66,15 @@ def build_library(fields: FieldMaps, settings: SimulationSettings) -> PulseLibra
             library = _with_nodes(library, maps, task, _new_corners(library, cells, size), bar)
             complete, halved = _sorted(library, cells, size)
             library = _with_cells(library, complete, size)
-            worst = _deviations(library, maps, task, complete + size / 2, bar)
+            worst = np.zeros(len(complete))
+            for block in _blocks(len(complete), bar):
+                compare(library, maps, task, complete[block] + size / 2, worst[block])
             bad = complete[worst > settings.library_tolerance]
             _enter(library.cell, bad, size, np.zeros(len(bad), np.int64))
             size //= 2
             cells = np.concatenate([halved, bad])
             cells = (cells[:, None] + size * _CORNERS).reshape(-1, 2)
     return library
-
-
-def _task(fields: FieldMaps, settings: SimulationSettings) -> Task:
-    """No jumps from place to place, which could not be interpolated."""
-    task = drift_task(fields, settings)
-    rounding = EXACT if task.rounding == EXACT else WHOLE_ON_AVERAGE
-    return task._replace(rounding=rounding)
 
 
 def _empty(fields: FieldMaps, settings: SimulationSettings) -> PulseLibrary:
@@ -134,7 +133,7 @@ def _with_nodes(
     rows = len(library.energies_kev) * library.phases
     pulses, found = [library.pulses], []
     n_columns = len(library.samples) // azimuths
-    for block in _blocks(len(places)):
+    for block in _blocks(len(places), bar):
         here = places[block]
         scratch = np.empty((len(here) * azimuths, rows, longest), np.float32)
         facts = np.zeros((len(here) * azimuths, 5))
@@ -150,7 +149,6 @@ def _with_nodes(
         within = np.arange(longest) < facts[:, 1, None]
         pulses.append(scratch[np.broadcast_to(within[:, None], scratch.shape)])
         found.append(facts)
-        bar.update(block.stop - block.start)
     new = np.concatenate([np.zeros((0, 5)), *found])
     samples = np.concatenate([library.samples, new[:, 1].astype(np.int64)])
     return library._replace(
@@ -178,16 +176,6 @@ def _with_cells(library: PulseLibrary, cells: IntArray, size: int) -> PulseLibra
     bends = np.zeros((len(cells), *library.bend_ns.shape[1:]), np.float32)
     bend(library, cells, size, bends)
     return library._replace(bend_ns=np.concatenate([library.bend_ns, bends]))
-
-
-def _deviations(
-    library: PulseLibrary, maps: DriftMaps, task: Task, places: FloatArray, bar: Stage
-) -> FloatArray:
-    worst = np.zeros(len(places))
-    for block in _blocks(len(places)):
-        compare(library, maps, task, places[block], worst[block])
-        bar.update(block.stop - block.start)
-    return worst
 
 
 def _enter(table: IntArray, cells: IntArray, size: int, values: IntArray) -> None:

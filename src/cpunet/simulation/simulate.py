@@ -25,7 +25,7 @@ from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow, with_resolution
-from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector
+from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector, FloatArray
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
 from cpunet.simulation.hit_sources import (
@@ -52,14 +52,17 @@ Resolution = tuple[float, float]
 class Simulation:
     """A file of simulated pulses, with counts over all of its events.
 
-    Hits are counted as merged, energies are in keV. ``lines`` counts, by window, the pulses
-    whose collected energy is still in it; ``not_collected`` the hits whose charge was not all
-    collected within the record.
+    The energies are smeared by `resolution`. Hits are counted as merged, energies are in keV.
+    ``lines`` counts, by window, the pulses whose collected energy is still in it;
+    ``not_collected`` the hits whose charge was not all collected within the record.
     """
 
     path: Path
     detector: Detector
     settings: SimulationSettings
+    windows: list[EnergyWindow]
+    resolution: Resolution | None = None
+    seed: int = 0
     mode: str = ""
     n_events: int = 0
     n_written: int = 0
@@ -84,7 +87,7 @@ class Simulation:
         """Number of events that were not written because none of their hits gives a signal."""
         return self.n_events - self.n_written
 
-    def count(self, hits: Hits, events: EventPulses, windows: list[EnergyWindow]) -> None:
+    def count(self, hits: Hits, events: EventPulses) -> None:
         """Count a block of events."""
         r = np.hypot(hits.x_mm, hits.y_mm)
         inside = self.detector.inside(r, hits.z_mm)
@@ -100,9 +103,14 @@ class Simulation:
         self.lost_kev += float(events.lost_kev.sum())
         self.trapped_kev += float(events.trapped_kev.sum())
         self.events_with_loss += int((events.lost_kev > 0).sum())
-        for window in windows:
+        for window in self.windows:
             within = (collected >= window.low_kev) & (collected <= window.high_kev)
             self.lines[window.name] += int(within.sum())
+
+    def smeared(self, energy_kev: FloatArray, seed: int) -> FloatArray:
+        """Energies in keV as the resolution smears them."""
+        noise, fano = self.resolution or (0.0, 0.0)
+        return with_resolution(energy_kev, noise_kev2=noise, fano_kev=fano, seed=seed)
 
     def __repr__(self) -> str:
         return f"<Simulation {self.path}: {self.n_written} pulses of {self.detector.name}>"
@@ -206,24 +214,17 @@ def simulate(
         source = GammaSource(wanted, physics.source_height_mm, physics.source_radius_mm, seed)
     else:
         raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
-    simulation = Simulation(out, read_detector(detector, of_detector), physics)
+    found = read_detector(detector, of_detector)
+    simulation = Simulation(out, found, physics, windows, resolution, seed)
     writer = PulseWriter(
         out, attrs={"made_by": f"cpunet simulate {cpunet.__version__}"}, force=force
     )
-    if resolution is not None:
-        _smeared(np.zeros(0), resolution, seed)  # wrong ones are told before any work
-    _simulate(simulation, source, windows, writer, resolution, seed)
+    simulation.smeared(np.zeros(0), seed)  # a wrong resolution is told before any work
+    _simulate(simulation, source, writer)
     return simulation
 
 
-def _simulate(
-    simulation: Simulation,
-    source: HitSource,
-    windows: list[EnergyWindow],
-    writer: PulseWriter,
-    resolution: Resolution | None,
-    seed: int,
-) -> None:
+def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) -> None:
     """Write the pulses, and count them."""
     detector, settings = simulation.detector, simulation.settings
     opened = source.open(detector)
@@ -247,8 +248,8 @@ def _simulate(
     with writer, stage(f"Simulating {detector.name}", opened.n_events) as bar:
         for block in chain([first], blocks):
             events = simulate_events(fields, block, settings, library)
-            simulation.count(block, events, windows)
-            _append(writer, block, events, settings, resolution, seed)
+            simulation.count(block, events)
+            _append(simulation, writer, block, events)
             bar.update(len(block))
         if not writer.n_pulses:
             raise CpunetError(
@@ -261,8 +262,8 @@ def _simulate(
             "settings": settings.model_dump(mode="json"),
             "hits": source.provenance(),
             "mode": mode,
-            "resolution": resolution,
-            "seed": seed,
+            "resolution": simulation.resolution,
+            "seed": simulation.seed,
             "events": simulation.n_events,
             "events_without_signal": simulation.without_signal,
             "depletion_V": fields.depletion_V,
@@ -270,18 +271,8 @@ def _simulate(
         writer.annotate({"simulation": json.dumps(made)})
 
 
-def _smeared(energy_kev: Any, resolution: Resolution, seed: int) -> Any:
-    noise, fano = resolution
-    return with_resolution(energy_kev, noise_kev2=noise, fano_kev=fano, seed=seed)
-
-
 def _append(
-    writer: PulseWriter,
-    hits: Hits,
-    events: EventPulses,
-    settings: SimulationSettings,
-    resolution: Resolution | None,
-    seed: int,
+    simulation: Simulation, writer: PulseWriter, hits: Hits, events: EventPulses
 ) -> None:
     kept = events.collected_kev > 0
     pulses = events.pulses()
@@ -289,12 +280,13 @@ def _append(
         "lost_energy": (events.lost_kev[kept], "keV"),
         "n_hits": (np.diff(hits.offsets)[kept], ""),
     }
-    if any(settings.trapping_per_ns):
+    if any(simulation.settings.trapping_per_ns):
         columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
-    if resolution is not None:
+    if simulation.resolution is not None:
         columns["true_energy"] = (pulses.energy_kev, "keV")
         # each block has its own seed, from the number of pulses before it in the file
-        block_seed = int(np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)[0])
-        pulses = replace(pulses, energy_kev=_smeared(pulses.energy_kev, resolution, block_seed))
+        sequence = np.random.SeedSequence((simulation.seed, writer.n_pulses))
+        smeared = simulation.smeared(pulses.energy_kev, int(sequence.generate_state(1)[0]))
+        pulses = replace(pulses, energy_kev=smeared)
     writer.append(pulses, columns)
     writer.append_rows(HIT_TABLE, hit_columns(hits[kept]))
