@@ -24,7 +24,7 @@ _compiled: Any = kernel(error_model="numpy")
 
 
 @_compiled
-def _window(values, steps, averaged):  # type: ignore[no-untyped-def]
+def average(values, steps, averaged):  # type: ignore[no-untyped-def]
     """Mean of each value and the `steps` - 1 before it, in reverse order.
 
     The windows alternate between looking back and ahead: on reversed values, back is ahead.
@@ -79,7 +79,7 @@ def averaged_maxima(current, first, samples, upsampling, steps, averages, ends):
             for i in range(max(start, 0), min(start + upsampling, fine)):
                 values[i] = highest
         for _ in range(averages):
-            _window(values, steps, averaged)
+            average(values, steps, averaged)
             values, averaged = averaged, values
         highest[:] = values[ends]
         for i in range(ends, fine - ends):

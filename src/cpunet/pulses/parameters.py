@@ -106,9 +106,14 @@ def current_amplitude_kernel() -> npt.NDArray[np.float32]:
         Float32, shape ``(16, 2 * REACH + 1)``: for each step within a sample, the weights of
         the current from `REACH` samples before to `REACH` samples after it.
     """
-    current = np.zeros((1, 4 * REACH + 2), np.float32)
-    current[0, 2 * REACH] = 1
-    grid = _averaged(current)[0].reshape(-1, UPSAMPLING)
+    fine = np.zeros(((4 * REACH + 1) * UPSAMPLING, 1), np.float32)
+    centre = 2 * REACH * UPSAMPLING
+    fine[centre - UPSAMPLING // 2 : centre + UPSAMPLING // 2] = 1  # a current of one sample
+    smooth = np.empty_like(fine)
+    for _ in range(AVERAGES):
+        kernels.average(fine, AVERAGE_STEPS, smooth)
+        fine, smooth = smooth, fine
+    grid = fine[::-1].reshape(-1, UPSAMPLING)  # each average reverses the order
     around = grid[REACH : 3 * REACH + 1]
     # the response at sample j to a unit current at sample 0 is the weight of the current j
     # samples earlier
@@ -289,16 +294,3 @@ def _maximum(
         current, first, samples, UPSAMPLING, AVERAGE_STEPS, AVERAGES, ends
     )
     return found.astype(float)
-
-
-def _averaged(current: FloatArray) -> FloatArray:
-    """The current on the fine grid, smoothed by the moving averages."""
-    from dspeed.processors import moving_window_multi, upsampler
-
-    n, samples = current.shape
-    # dspeed centres each sample, so the end of the grid is not filled: drop it
-    fine = np.empty((n, (samples - 1) * UPSAMPLING), np.float32)
-    upsampler(current, UPSAMPLING, fine)
-    smooth: FloatArray = np.empty_like(fine)
-    moving_window_multi(fine, AVERAGE_STEPS, AVERAGES, 0, smooth)
-    return smooth
