@@ -28,7 +28,7 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from unpaired import CHAIN, DT_NS, measured_with
 
-SEARCHES = ["_with_more", "free_decay_if_better", "ringing_if_better"]
+SEARCHES = ["_with_more", "ringing_if_better", "free_decay_if_better"]  # of a hopeless fit
 DRIFT = ["drift_if_better", "drift_if_needed"]
 PHYSICS = "_with_wrong_physics"
 

@@ -96,7 +96,10 @@ class Fitter:
             self.count(chi_square)
 
         found = levenberg_marquardt(problem, steps or self.training.steps, told, coarse=coarse)
-        return Fitted(problem, found.cost, found.covariance)
+        parameters = problem.parameters
+        priors = np.diag(parameters.widths**-2.0)
+        information = np.asarray(np.linalg.inv(found.covariance), float) - priors
+        return Fitted(problem, found.cost, parameters.covariance(information))
 
     def count(self, chi_square: float) -> None:
         """Count a step, and report it."""

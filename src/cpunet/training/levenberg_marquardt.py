@@ -103,7 +103,7 @@ def levenberg_marquardt(
         cost = float(residuals @ residuals)
         jacobian, updates = problem.jacobian(vector, residuals), 0
         for _ in range(max(1, most)):
-            if not updates and _promised(jacobian, residuals) < CONVERGED:
+            if not updates and _promised(parameters, vector, jacobian, residuals) < CONVERGED:
                 break
             step = _step(problem, jacobian, vector, residuals, damping)
             if step is None and updates:
@@ -142,10 +142,12 @@ def levenberg_marquardt(
     return Minimum(cost, covariance)
 
 
-def _promised(jacobian: Values, residuals: Values) -> float:
+def _promised(
+    parameters: Unknowns, vector: Values, jacobian: Values, residuals: Values
+) -> float:
     """Fall of chi-square in a full step if the residuals were linear."""
     gradient = jacobian.T @ residuals
-    return float(gradient @ np.linalg.lstsq(jacobian.T @ jacobian, gradient)[0])
+    return -float(gradient @ _within(parameters, vector, jacobian.T @ jacobian, gradient))
 
 
 def _step(

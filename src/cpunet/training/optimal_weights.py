@@ -276,8 +276,8 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     array
         Covariance of the parameters.
     """
-    smooth = SmoothParameters(near.parameters)
-    place = smooth.get()
+    smooth = near.parameters
+    place = smooth.vector()
     weighted = [_Weighted(band, smooth, near.response, bins) for band in bands]
     slopes = np.concatenate([w.slopes for w in weighted])
 
@@ -288,10 +288,8 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
 
     columns = np.concatenate([slopes, np.diag(1 / smooth.widths)])
     end = _descend(residuals, smooth, columns)
-    smooth.set(np.maximum(end - _bias(weighted, smooth, place, end), smooth.lowest))
-    vector, widths = near.parameters.vector(), near.parameters.widths
-    slopes = smooth.by_parameters(slopes, vector)
-    return np.asarray(np.linalg.inv(slopes.T @ slopes + np.diag(widths**-2.0)))
+    smooth.set(np.maximum(end - _bias(weighted, smooth, place, end), smooth.low))
+    return smooth.covariance(slopes.T @ slopes)
 
 
 def _bias(
@@ -301,7 +299,7 @@ def _bias(
 
     Coordinates that end at their bound are held there: jumps to and from it are not a bias.
     """
-    held = np.where(end > smooth.lowest + AT_BOUND, np.nan, end - place)
+    held = np.where(end > smooth.low + AT_BOUND, np.nan, end - place)
     prior = (place - smooth.centre) / smooth.widths
     bias = jackknife_bias([w.parts for w in weighted], prior, smooth.widths, held)
     # if there are many pulses, the weights come from only some of those that are compared
@@ -317,12 +315,12 @@ def _descend(
     A pass over all pulses is expensive, so derivatives are not evaluated again: each step,
     whether or not it lowers the sum of squares, corrects them along its direction (Broyden).
     """
-    place, damping = smooth.get(), 0.0
+    place, damping = smooth.vector(), 0.0
     left = residuals(place)
     for _ in range(PASSES):
         damped = np.concatenate([columns, np.diag(np.sqrt(damping) / smooth.widths)])
         wanted = np.concatenate([-left, np.zeros(len(place))])
-        bounds = smooth.lowest - place - 1e-12, np.inf
+        bounds = smooth.low - place - 1e-12, np.inf
         move = scipy.optimize.lsq_linear(damped, wanted, bounds, method="bvls").x
         promised = left + columns @ move
         if left @ left - promised @ promised < CONVERGED:
@@ -398,7 +396,7 @@ def _simulated(
 
     size = -(-len(sim) // PARTS)
     here = sim.sums_of_blocks(response, of, size=size, draws=1)
-    place, slopes = smooth.get(), []
+    place, slopes = smooth.vector(), []
     for i, step in enumerate(smooth.steps):
         moved = place.copy()
         moved[i] += step

@@ -198,12 +198,15 @@ def fit_response(
 def _extended(found: Fitted, fitter: Fitter) -> Fitted:
     """Extend the response by what brings a poor or stretched fit closer."""
     stretched = found.problem.response.drift is not None
-    if stretched and found.per_moment < HOPELESS_FIT:  # else a ringing is first
+    hopeless = found.per_moment > HOPELESS_FIT
+    if hopeless:  # nothing else may stand in for a ringing
+        found = ringing_if_better(found, fitter)
+    elif stretched:
         found = drift_if_better(found, fitter)
     # a stretch hides some of what another decay does
     if found.poor or (stretched and found.per_moment > HIDDEN):
         found = free_decay_if_better(found, fitter)
-    if found.poor:
+    if found.poor and not hopeless:
         found = ringing_if_better(found, fitter)
     if stretched or (found.poor and onset_is_off(found.problem)):
         found = drift_if_better(found, fitter)

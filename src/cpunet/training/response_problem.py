@@ -88,6 +88,71 @@ class Parameters:
         return named
 
 
+POLES = "log_poles_ns"
+# For the square of half the difference of two logarithms: width of the prior, and step of the
+# finite differences (times of 44 and 36 ns instead of 40 ns twice).
+SQUARE_WIDTH, SQUARE_STEP = 0.25, 0.01
+
+
+class SmoothParameters(Parameters):
+    """The parameters, with mean and squared half difference in place of each pair of poles.
+
+    Pulses depend nearly linearly on these.  Two poles act alike: pulses depend on the mean of
+    their logarithms and on the *square* of their difference.  Where they are equal, derivatives
+    with respect to the difference vanish, and steps along it go astray.
+    """
+
+    _pairs: Sequence[tuple[int, int]] = ()
+
+    def __init__(self, response: Readout) -> None:
+        super().__init__(response)
+        poles = [i for i, label in enumerate(self.labels) if label == POLES]
+        self._pairs = list(zip(poles[::2], poles[1::2], strict=False))
+        self._plain_widths = self.widths.copy()
+        for mean, square in self._pairs:
+            self.widths[mean] /= np.sqrt(2)
+            self.widths[square], self.steps[square] = SQUARE_WIDTH, SQUARE_STEP
+            self.longest[square], self.low[square] = SQUARE_WIDTH, 0.0
+        self.centre = self._of(self.centre)
+
+    def vector(self) -> Values:
+        """Coordinates of the current response."""
+        return self._of(super().vector())
+
+    def set(self, vector: Values) -> None:
+        """Set the response from its coordinates."""
+        plain = vector.copy()
+        for mean, square in self._pairs:
+            half = np.sqrt(max(vector[square], 0.0))
+            plain[mean], plain[square] = vector[mean] + half, vector[mean] - half
+        super().set(plain)
+
+    def covariance(self, information: Values) -> Values:
+        """Covariance of the parameters themselves, which have priors of their own.
+
+        Parameters
+        ----------
+        information
+            What the data alone tell of the coordinates: products of the derivatives of all
+            residuals but those of the priors.
+        """
+        turn = np.eye(len(information))
+        for mean, square in self._pairs:
+            half = np.sqrt(max(self.vector()[square], 0.0))
+            turn[mean, [mean, square]] = 0.5
+            turn[square, [mean, square]] = half, -half
+        plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
+        return np.asarray(np.linalg.inv(plain), float)
+
+    def _of(self, plain: Values) -> Values:
+        """Coordinates of a vector of parameters."""
+        place = plain.copy()
+        for mean, square in self._pairs:
+            first, second = plain[mean], plain[square]
+            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
+        return place
+
+
 @dataclass(frozen=True, eq=False)
 class Band:
     """Simulated and measured pulses of a band of energy, which are compared with each other.
@@ -140,7 +205,8 @@ class ResponseProblem:
     def __init__(
         self, response: Readout, bands: Sequence[Band], draws: int | None = None
     ) -> None:
-        self.parameters, self.bands, self.draws = Parameters(response), tuple(bands), draws
+        self.parameters = SmoothParameters(response)
+        self.bands, self.draws = tuple(bands), draws
         self.clip: float | None = None
         self._comparisons = [BandComparison(band, draws=draws) for band in self.bands]
 
@@ -280,64 +346,3 @@ class BandComparison:
         # far from the data many tails are outside their range, and none may be excluded
         (total,), n = self.sim.sums(response, of, cut=clip is None, draws=self.draws)
         return np.asarray((total / max(n, 1e-9) - self.wanted) / self.sigma)
-
-
-POLES = "log_poles_ns"
-# For the square of half the difference of two logarithms: width of the prior, and step of the
-# finite differences (times of 44 and 36 ns instead of 40 ns twice).
-SQUARE_WIDTH, SQUARE_STEP = 0.25, 0.01
-
-
-class SmoothParameters:
-    """The parameters, with mean and squared half difference in place of each pair of poles.
-
-    Pulses depend nearly linearly on these.  Two poles act alike: pulses depend on the mean of
-    their logarithms and on the *square* of their difference.  Where they are equal, derivatives
-    with respect to the difference vanish, and steps along it go astray.
-
-    Parameters
-    ----------
-    parameters
-        Parameters of the response.
-    """
-
-    def __init__(self, parameters: Parameters) -> None:
-        self.parameters = parameters
-        poles = [i for i, label in enumerate(parameters.labels) if label == POLES]
-        self._pairs = list(zip(poles[::2], poles[1::2], strict=False))
-        self.widths, self.steps = parameters.widths.copy(), parameters.steps.copy()
-        self.lowest = np.full(len(self.widths), -np.inf)
-        for mean, square in self._pairs:
-            self.widths[mean] /= np.sqrt(2)
-            self.widths[square], self.steps[square] = SQUARE_WIDTH, SQUARE_STEP
-            self.lowest[square] = 0.0
-        self.centre = self.of(parameters.centre)
-
-    def get(self) -> Values:
-        """Coordinates of the current response."""
-        return self.of(self.parameters.vector())
-
-    def set(self, place: Values) -> None:
-        """Set the response from its coordinates."""
-        vector = place.copy()
-        for mean, square in self._pairs:
-            half = np.sqrt(max(place[square], 0.0))
-            vector[mean], vector[square] = place[mean] + half, place[mean] - half
-        self.parameters.set(vector)
-
-    def of(self, vector: Values) -> Values:
-        """Coordinates of a vector of parameters."""
-        place = vector.copy()
-        for mean, square in self._pairs:
-            first, second = vector[mean], vector[square]
-            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
-        return place
-
-    def by_parameters(self, slopes: Values, vector: Values) -> Values:
-        """Convert derivatives (in columns) from coordinates to parameters."""
-        turned = slopes.copy()
-        for mean, square in self._pairs:
-            half = 0.5 * (vector[mean] - vector[square])
-            turned[:, mean] = 0.5 * slopes[:, mean] + half * slopes[:, square]
-            turned[:, square] = 0.5 * slopes[:, mean] - half * slopes[:, square]
-        return turned
