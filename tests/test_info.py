@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import lh5
@@ -244,7 +245,9 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
     fit = {"noise": {"rms": 1.6, "baselines": 9}}
     write_run(run, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
     assert dict(info(run).lines)["noise"] == "of 9 baselines"
-    monkeypatch.setattr(chain_description, "noise_kev", lambda _: (1.95, 0.05))
+    numbers = [{"noise_rms_kev": kev} for kev in (1.95, 0.05)]
+    told = SimpleNamespace(values=numbers[0], errors=numbers[1])
+    monkeypatch.setattr(chain_description, "describe_chain", lambda _: told)
     assert dict(info(run).lines)["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"
 
 

@@ -21,7 +21,7 @@ from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.recipes.schema import MatchingConfig
 from synthetic import drifting, two_sites
 
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8

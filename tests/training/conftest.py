@@ -66,5 +66,5 @@ def held(monkeypatch: pytest.MonkeyPatch) -> list[Prepared]:
             first.append(prepare(*args))
         return first[0]
 
-    monkeypatch.setattr("cpunet.training.outside.prepare", once)
+    monkeypatch.setattr("cpunet.training.cyclegan.prepare", once)
     return first

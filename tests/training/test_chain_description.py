@@ -24,10 +24,10 @@ from cpunet.recipes import load_recipe
 from cpunet.training.chain_description import propagated
 from cpunet.training.closed_forms import (
     learned_chain,
-    response_figure,
     true_chain_of,
 )
 from cpunet.training.diagnosis import beyond, diagnosis, parts_off
+from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
 from synthetic import write_run

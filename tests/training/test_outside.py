@@ -14,8 +14,16 @@ from cpunet.electronics.finishing import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare
 from cpunet.recipes import load_recipe
-from cpunet.training.cyclegan import CycleGan, Step, weighted_l1, window_weights
-from cpunet.training.outside import Outside, as_measured, in_room, tolerance
+from cpunet.training.cyclegan import (
+    CycleGan,
+    Outside,
+    Step,
+    as_measured,
+    in_room,
+    tolerance,
+    weighted_l1,
+    window_weights,
+)
 from unpaired import crossing
 
 CONFIG = load_recipe("paper").preparation

@@ -18,9 +18,8 @@ from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.recipes import load_recipe
-from cpunet.training.cyclegan import CycleGan
+from cpunet.training.cyclegan import CycleGan, Outside
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.outside import Outside
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 from synthetic import (

@@ -13,7 +13,7 @@ from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.recipes import load_recipe
-from cpunet.training.sides_figure import sides_figure
+from cpunet.training.figures import sides_figure
 from cpunet.validation import run_figures
 from cpunet.validation.comparisons import compare
 from cpunet.validation.pulse_figures import (

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets

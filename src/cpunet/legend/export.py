@@ -32,7 +32,7 @@ from cpunet.legend.library_files import (
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
-from cpunet.training.chain_description import chain_of, describe_chain
+from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import RunLike, as_run
 
 log = logging.getLogger(__name__)
@@ -147,13 +147,13 @@ def export_legend(
     given = (run.folder, report, library)
     refuse_existing(out, *given, force=force)
     told = describe_chain(run)
-    for doubt in told["doubts"]:
+    for doubt in told.doubts:
         log.warning(doubt)
     known = known_detector(run)
     trained = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed}
     name = detector or known or EVERY_DETECTOR
     methods, ae_pars = ({}, {}) if report is None else _against_energy(report, trained)
-    undecayed = chain_of(run).undecayed
+    undecayed = told.chain.undecayed
     with stage("Two numbers for the chain"):
         nearest = fitted_kernel(undecayed)
         equivalent: dict[str, Any] = asdict(nearest)
@@ -169,9 +169,9 @@ def export_legend(
         },
         "electronics": {
             "equivalent": equivalent,
-            "chain": told["parameters"],
-            "chain_errors": told["parameter_errors"],
-            "numbers": told["values"],
+            "chain": told.parameters,
+            "chain_errors": told.parameter_errors,
+            "numbers": told.values,
         },
         "drift_time": {
             "current_maximum_delay_ns": current_delay_ns(undecayed),

@@ -13,7 +13,7 @@ from cpunet.electronics.drawn_tails import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import LearnedConfig, ResponseConfig
-from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.recipes.schema import MatchingConfig
 
 NOISE_BINS = 4097  # in a spectrum as measured by `BaselineNoise`
 

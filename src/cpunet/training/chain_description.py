@@ -123,79 +123,48 @@ _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one col
 
 
 @dataclass(frozen=True, eq=False)
-class _Response:
-    """The chain of a run, and its parameters with their errors."""
+class DescribedChain:
+    """The readout chain of a run, in numbers.
+
+    Parameters
+    ----------
+    run, chain
+        The run, and its chain in closed form with its noise.
+    values, errors
+        Numbers by name, with the unit as suffix (shares of the full charge have none); errors
+        of the fitted quantities and of the noise.
+    parameters, parameter_errors
+        All parameters of the fit.
+    doubts
+        Reasons why these do not describe a readout alone.
+    """
 
     run: Run
     chain: Chain
-    parameters: Numbers
+    values: Numbers
     errors: Numbers
+    parameters: Numbers
+    parameter_errors: Numbers
+    doubts: list[str]
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """As ``response.json`` has it."""
+        facts: dict[str, Any] = {"path": self.run.name, "recipe": self.run.recipe.name}
+        facts |= {"peak": self.run.peak, "seed": self.run.seed}
+        names = ("values", "errors", "parameters", "parameter_errors", "doubts")
+        return facts | {name: getattr(self, name) for name in names}
 
 
-def describe_chain(run: Run) -> dict[str, Any]:
-    """A readout chain in numbers.
-
-    Returns
-    -------
-    dict
-        ``values`` by name, with the unit as suffix (shares of the full charge have none),
-        ``errors`` of the fitted quantities and of the noise, all ``parameters`` with their
-        ``parameter_errors``, and ``doubts``, reasons why these do not describe a readout
-        alone.
-
-    Raises
-    ------
-    CpunetError
-        If the run has no response in closed form.
-    """
-    found = _response(run)
-    parameters = found.parameters
-    slow = {n: w for n, w in parameters.items() if n.startswith("slow_")}
-    values = {n: v for n, v in parameters.items() if n not in slow}
-    values |= slow_numbers([(float(n.split("_")[1]), w) for n, w in slow.items()])
-    values |= chain_numbers(found.chain, run.recipe.preparation, run.dt_ns)
-    if run.fit is not None and run.fit.chi_square_per_moment is not None:
-        values["chi_square_per_moment"] = run.fit.chi_square_per_moment
-    return {
-        "path": run.name,
-        "recipe": run.recipe.name,
-        "peak": run.peak,
-        "seed": run.seed,
-        "values": values,
-        "errors": {n: e for n, e in found.errors.items() if n in values} | _noise_error(found),
-        "parameters": parameters,
-        "parameter_errors": found.errors,
-        "doubts": _doubts(found),
-    }
-
-
-def chain_of(run: Run) -> Chain:
-    """The readout chain fitted by a training, with its noise.
+def describe_chain(run: Run) -> DescribedChain:
+    """The readout chain of a run, in numbers.
 
     Raises
     ------
     CpunetError
         If the run has no response in closed form.
     """
-    return _response(run).chain
-
-
-def noise_kev(run: Run) -> tuple[float, float | None]:
-    """RMS of the noise that a training measured, and its error if known, in keV.
-
-    Raises
-    ------
-    CpunetError
-        If the run has no response in closed form, or no noise.
-    """
-    told = describe_chain(run)
-    if "noise_rms_kev" not in told["values"]:
-        raise CpunetError(f"{run.name}: holds no noise; train on raw traces")
-    return told["values"]["noise_rms_kev"], told["errors"].get("noise_rms_kev")
-
-
-def _response(run: Run) -> _Response:
-    recipe = run.recipe
+    recipe, fit = run.recipe, run.fit or FitInfo()
     if not isinstance(recipe.generator, ResponseConfig):
         raise CpunetError(
             f"{run.name}: recipe {recipe.name} trains a {recipe.generator.name}, which has no "
@@ -203,41 +172,35 @@ def _response(run: Run) -> _Response:
             "`cpunet validate`"
         )
     network = run.fill("ren", ResponseGenerator(recipe.generator, run.dt_ns))
-    response, preparation, fit = network.response, run.recipe.preparation, run.fit or FitInfo()
+    response, preparation = network.response, recipe.preparation
     chain = learned_chain(response, Path(run.name).name)
     if int(network.n_baselines):
         chain = with_noise(chain, network, preparation)
     parameters = response.describe()
     if len(response.ringing):
         parameters["ringing"] = response.ringing.norm().item()
-    errors = fitted_errors(response, fit.errors)
 
     def derived(moved: ElectronicsResponse) -> Numbers:
         slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
         numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
         return slow_numbers(slow) | numbers
 
+    errors = fitted_errors(response, fit.errors)
     errors |= propagated(response, fit.covariance, derived)
-    return _Response(run, chain, parameters, errors)
+    values = {n: v for n, v in parameters.items() if not n.startswith("slow_")}
+    values |= derived(response) | noise_numbers(chain)
+    if fit.chi_square_per_moment is not None:
+        values["chi_square_per_moment"] = fit.chi_square_per_moment
+    doubts = beyond(parameters) + stretched(parameters, fit.gains)
+    if fit.causes:
+        told = "these numbers stand in for what is wrong with the simulation, too"
+        doubts.insert(0, f"poor fit: {fit.verdict}; {told}: {fit.causes[0]}")
+    of_values = {n: e for n, e in errors.items() if n in values} | _noise_error(run, chain)
+    return DescribedChain(run, chain, values, of_values, parameters, errors, doubts)
 
 
-def _doubts(found: _Response) -> list[str]:
-    """Reasons why the numbers of a run do not describe a readout alone."""
-    fit = found.run.fit
-    gains = {} if fit is None else fit.gains
-    doubts = beyond(found.parameters) + stretched(found.parameters, gains)
-    if fit is not None and fit.causes:
-        doubts.insert(
-            0,
-            f"poor fit: {fit.verdict}; these numbers stand in for what is wrong "
-            f"with the simulation, too: {fit.causes[0]}",
-        )
-    return doubts
-
-
-def _noise_error(found: _Response) -> Numbers:
+def _noise_error(run: Run, chain: Chain) -> Numbers:
     """Error of the noise in keV, from the baselines and the height of a full charge."""
-    run, chain = found.run, found.chain
     measured = {} if run.fit is None else run.fit.noise
     error, rms = measured.get("rms_error"), measured.get("rms")
     if not error or not rms or chain.noise_kev2_per_mhz is None:
@@ -280,19 +243,17 @@ def summary(run: Run) -> list[tuple[str, str]]:
         ("drift", str(drift.get("verdict") or "")),
     ]
     if "baselines" in fit.noise:
-        lines.append(("noise", f"{_noise(run)}of {fit.noise['baselines']:.0f} baselines"))
+        size = ""
+        with suppress(CpunetError):  # no chain
+            told = describe_chain(run)
+            kev, error = (of.get("noise_rms_kev") for of in (told.values, told.errors))
+            size = f"{with_std(kev, error)} keV (RMS), "
+        lines.append(("noise", f"{size}of {fit.noise['baselines']:.0f} baselines"))
     if known is not None and "rate_khz" in known.model_fields_set:
         lines += tails_in_words(known.model_dump())
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]
-
-
-def _noise(run: Run) -> str:
-    with suppress(CpunetError):  # no chain
-        kev, error = noise_kev(run)
-        return f"{with_std(kev, error)} keV (RMS), "
-    return ""
 
 
 def _side(side: SideInfo) -> str:

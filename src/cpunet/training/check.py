@@ -118,7 +118,7 @@ class CheckResult:
         CpunetError
             If the pulses of a side could not be read, or there are several channels.
         """
-        from cpunet.training.sides_figure import sides_figure
+        from cpunet.training.figures import sides_figure
 
         if not self.sides:
             raise CpunetError("there are no pulses of both sides to draw")

@@ -1,14 +1,11 @@
-"""Readout chains in closed form, fitted or true: sums of exponentials, numbers, one figure."""
+"""Readout chains in closed form, fitted or true: sums of exponentials, and numbers of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 
 from cpunet.electronics.chain import Decay, Electronics
@@ -16,19 +13,14 @@ from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apar
 from cpunet.electronics.readout import noise_power
 from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.plotting import COLOURS, SPARE_COLOURS, styled
 from cpunet.recipes.schema import PreparationConfig
 
 Numbers = dict[str, float]
 
-STEP_NS, IMPULSE_NS, GRID_NS = 2000.0, 600.0, 1.0
 _FINE_NS, _SHORTEST_NS = 0.5, 10_000.0  # step and minimum length of step responses
 _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 # Range in which a spectrum is flat, in units of half the sampling rate, and smoothing bins.
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
-_LAYOUT = (("step", "impulse"), ("residual", "impulse"), ("tail", "noise"))
-_POINTS = 400  # of the tail, equidistant on the logarithmic axis
-_BINS = 150  # of the noise spectra
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,114 +89,6 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
 def reaches_ns(chain: Chain, fraction: float) -> float:
     """Time in ns after a step at which its response reaches a fraction of its maximum."""
     return _reaches_ns(chain.whole.step(np.arange(0, _SHORTEST_NS, _FINE_NS)), fraction)
-
-
-@styled
-def response_figure(
-    chains: Sequence[Chain], truth: Chain | None = None, *, tail_ns: float
-) -> Figure:
-    """Step response and its residuals, impulse response, tail, and spectrum of the noise.
-
-    Times are counted from half height, by which pulses are aligned: an overall delay of the
-    chain cannot be inferred from them.  Residuals are differences from the truth, or from
-    the mean of several chains if there is no truth; a single chain has none.
-
-    Parameters
-    ----------
-    chains
-        Fitted chains.
-    truth
-        True chain, if known.
-    tail_ns
-        Time after the step up to which the tail is drawn, in ns.
-    """
-    compared = truth is not None or len(chains) > 1
-    rows = [row for row in _LAYOUT if compared or "residual" not in row]
-    heights = [1.3 if "residual" in row else 2.2 for row in rows]
-    figure = Figure(figsize=(10.5, 2.4 + sum(heights)))
-    panels = figure.subplot_mosaic([list(row) for row in rows], height_ratios=heights)
-    shades = [COLOURS["ren"], *SPARE_COLOURS]
-    drawn = [(chain, shades[i % len(shades)], 1.2) for i, chain in enumerate(chains)]
-    if truth is not None:
-        # a broad line underneath, so that a chain which agrees does not hide it
-        drawn.insert(0, (truth, COLOURS["truth"], 3.5))
-    for chain, colour, width in drawn:
-        _responses(panels, chain, colour, width, tail_ns)
-        _noise(panels["noise"], chain, colour, width)
-    if compared:
-        _residuals(panels["residual"], chains, truth, shades)
-    _annotate(panels, has_noise=bool(panels["noise"].lines))
-    return figure
-
-
-def _responses(
-    panels: dict[str, Axes], chain: Chain, colour: str, width: float, tail_ns: float
-) -> None:
-    half_ns = reaches_ns(chain, 0.5)
-    long_ns = np.arange(-100.0, STEP_NS, GRID_NS)
-    short_ns = np.arange(-150.0, IMPULSE_NS, GRID_NS)
-    tail = np.geomspace(100.0, tail_ns, _POINTS)
-    look: dict[str, Any] = {"color": colour, "linewidth": width}
-    panels["step"].plot(long_ns, chain.whole.step(long_ns + half_ns), label=chain.name, **look)
-    panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
-    panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
-
-
-def _residuals(
-    axes: Axes, chains: Sequence[Chain], truth: Chain | None, shades: Sequence[str]
-) -> None:
-    time_ns = np.arange(-100.0, STEP_NS, GRID_NS)
-    steps = [chain.whole.step(time_ns + reaches_ns(chain, 0.5)) for chain in chains]
-    if truth is not None:
-        reference, name = truth.whole.step(time_ns + reaches_ns(truth, 0.5)), "truth"
-    else:
-        reference, name = np.mean(steps, axis=0), "mean"
-    for i, step in enumerate(steps):
-        axes.plot(time_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.set(ylabel=f"Run − {name}\n[10⁻³ of full charge]")
-
-
-def _noise(axes: Axes, chain: Chain, colour: str, width: float) -> None:
-    if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
-        return
-    # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
-    stop = len(chain.frequency_mhz) - 1
-    edges = np.unique(np.geomspace(1, stop, _BINS).astype(int))
-    frequency, density = (
-        np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
-        for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
-    )
-    axes.loglog(frequency, density, color=colour, linewidth=width)
-
-
-def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
-    steps = [panels[name] for name in ("step", "residual") if name in panels]
-    for axes in steps:
-        axes.set(xlim=(-100, STEP_NS))
-        axes.tick_params(labelbottom=axes is steps[-1])
-    steps[-1].set(xlabel="Time from half height [ns]")
-    panels["step"].set(title="Step response", ylabel="Height [full charge]")
-    panels["step"].legend(loc="lower right")
-    panels["impulse"].set(
-        title="Impulse response",
-        xlabel="Time from half height of the step [ns]",
-        ylabel="Current [1/µs]",
-    )
-    panels["tail"].set(
-        title="Top and tail of the step",
-        xlabel="Time from half height [µs]",
-        ylabel="Height [full charge]",
-        xscale="log",
-    )
-    panels["tail"].xaxis.set_major_formatter("{x:g}")
-    if has_noise:
-        panels["noise"].set(
-            title="Noise", xlabel="Frequency [MHz]", ylabel="Density [keV²/MHz]"
-        )
-        panels["noise"].xaxis.set_major_formatter("{x:g}")
-    else:
-        panels["noise"].set_axis_off()
 
 
 def noise_numbers(chain: Chain) -> Numbers:

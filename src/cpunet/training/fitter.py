@@ -16,7 +16,7 @@ import numpy as np
 
 from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.networks.response_layer import Readout
-from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.levenberg_marquardt import Listener, levenberg_marquardt
 from cpunet.training.moments import Rows, Values

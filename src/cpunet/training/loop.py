@@ -24,8 +24,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, update_bn
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
-from cpunet.training.cyclegan import CycleGan, Step
-from cpunet.training.outside import Outside
+from cpunet.training.cyclegan import CycleGan, Outside, Step
 
 log = logging.getLogger(__name__)
 

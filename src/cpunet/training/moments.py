@@ -21,8 +21,7 @@ import scipy.linalg
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
-from cpunet.recipes.schema import PreparationConfig
-from cpunet.recipes.training_settings import MatchingConfig
+from cpunet.recipes.schema import MatchingConfig, PreparationConfig
 from cpunet.training._record_kernels import RecordWindow, project, read_records
 
 Values = npt.NDArray[np.float64]

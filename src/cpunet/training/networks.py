@@ -16,9 +16,8 @@ from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
 from cpunet.training.checkpoints import UnfinishedRun
-from cpunet.training.cyclegan import CycleGan
+from cpunet.training.cyclegan import CycleGan, Outside
 from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
-from cpunet.training.outside import Outside
 from cpunet.training.run import FitInfo, Run, read_losses
 
 if TYPE_CHECKING:

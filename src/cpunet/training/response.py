@@ -16,15 +16,13 @@ import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
-from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import checked, read_json
 from cpunet.tables import text_table
-from cpunet.training.chain_description import chain_of, describe_chain
+from cpunet.training.chain_description import DescribedChain, describe_chain
 from cpunet.training.closed_forms import (
     Chain,
     Numbers,
     chain_numbers,
-    response_figure,
     true_chain_of,
     true_parameters,
 )
@@ -78,21 +76,21 @@ class Response:
     Parameters
     ----------
     content
-        ``runs``: for each run the result of
-        `cpunet.training.chain_description.describe_chain`.  ``mean`` and ``spread`` (standard
+        ``runs``: for each run the content of a
+        `cpunet.training.chain_description.DescribedChain`.  ``mean`` and ``spread`` (standard
         deviation) of several runs.  ``truth``: the same ``values`` of the true chain, the
         ``difference`` of the run or of the mean of the runs from it, and ``sigma``, the
         difference divided by the error or the spread, whichever is larger.  A quantity
         without an error has no sigma: the runs share their data, so their spread shows how
         well they agree, not how accurate they are.
     runs
-        The runs.
+        The chains of the runs.
     truth
         True chain, if known.
     """
 
     content: dict[str, Any]
-    runs: list[Run]
+    runs: list[DescribedChain]
     truth: Chain | None = None
 
     @property
@@ -108,9 +106,11 @@ class Response:
 
     def plot(self) -> Figure:
         """Step and impulse response, tail and noise."""
-        first = self.runs[0]
+        from cpunet.training.figures import response_figure
+
+        first = self.runs[0].run
         tail_ns = first.recipe.preparation.samples_after * first.dt_ns
-        return response_figure(list(map(chain_of, self.runs)), self.truth, tail_ns=tail_ns)
+        return response_figure([one.chain for one in self.runs], self.truth, tail_ns=tail_ns)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Make a folder of ``response.json`` and ``response.png``.
@@ -120,7 +120,7 @@ class Response:
         CpunetError
             If the folder exists and `force` is off, or is of something else.
         """
-        folders = [run.folder for run in self.runs]
+        folders = [one.run.folder for one in self.runs]
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(self.content, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
@@ -141,7 +141,7 @@ class Response:
 
     def __repr__(self) -> str:
         truth = "" if self.truth is None else f", beside {self.content['truth']['name']}"
-        names = ", ".join(Path(run.name).name for run in self.runs)
+        names = ", ".join(Path(one.run.name).name for one in self.runs)
         return f"<{type(self).__name__} of {names}{truth}>"
 
 
@@ -186,21 +186,20 @@ def response(
         refuse_existing(Path(out), place, *(run.folder for run in known), force=force)
     electronics = _electronics(truth)
     first, preparation = known[0], known[0].recipe.preparation
-    told = [describe_chain(run) for run in known]
-    _require_alike([(run.name, run.dt_ns, run.recipe.preparation) for run in known])
+    chains = [describe_chain(run) for run in known]
+    _require_alike(known, electronics)
     content: dict[str, Any] = {"cpunet": cpunet.__version__, "dt_ns": first.dt_ns}
-    content |= {"runs": told} | _summary(told)
+    content |= {"runs": [one.content for one in chains]} | _summary(chains)
     true_chain = None
     if electronics is not None:
-        _require_sampling(first, electronics)
         true_chain = true_chain_of(electronics)
         values = true_parameters(electronics)
         values |= chain_numbers(true_chain, preparation, first.dt_ns)
         content["truth"] = {"name": electronics.name} | _compared(content, values)
-    result = Response(content, known, true_chain)
-    for run in told:
-        for doubt in run["doubts"]:
-            log.warning(f"{Path(run['path']).name}: {doubt}")
+    result = Response(content, chains, true_chain)
+    for one in chains:
+        for doubt in one.doubts:
+            log.warning(f"{Path(one.run.name).name}: {doubt}")
     if out is not None:
         result.save(out, force)
     return result
@@ -217,12 +216,12 @@ def _electronics(truth: str | Path | Electronics | None) -> Electronics | None:
     return checked(Electronics, content.get("electronics"), f"{path}: electronics")
 
 
-def _summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Numbers]:
-    """Mean and spread of several runs."""
-    if len(runs) < 2:
+def _summary(chains: Sequence[DescribedChain]) -> dict[str, Numbers]:
+    """Mean and spread of several chains."""
+    if len(chains) < 2:
         return {}
-    names = [name for name in runs[0]["values"] if all(name in r["values"] for r in runs)]
-    columns = {name: [run["values"][name] for run in runs] for name in names}
+    names = [n for n in chains[0].values if all(n in one.values for one in chains)]
+    columns = {name: [one.values[name] for one in chains] for name in names}
     return {
         "mean": {name: float(np.mean(column)) for name, column in columns.items()},
         "spread": {name: float(np.std(column, ddof=1)) for name, column in columns.items()},
@@ -243,24 +242,21 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     return {"values": values, "difference": difference, "sigma": sigma}
 
 
-def _require_alike(runs: Sequence[tuple[str, float, PreparationConfig]]) -> None:
-    """Raise a `CpunetError` unless all runs have the first's period (ns) and preparation."""
-    (first, first_ns, preparation), *others = runs
-    for run, dt_ns, other in others:
-        if not np.isclose(dt_ns, first_ns):
+def _require_alike(runs: Sequence[Run], truth: Electronics | None) -> None:
+    """Raise a `CpunetError` unless all runs have the first's sampling and preparation."""
+    first, *others = runs
+    for run in others:
+        if not np.isclose(run.dt_ns, first.dt_ns):
             raise CpunetError(
-                f"{run}: trained on pulses sampled every {dt_ns:g} ns, {first} every "
-                f"{first_ns:g} ns; describe them one by one"
+                f"{run.name}: trained on pulses sampled every {run.dt_ns:g} ns, {first.name} "
+                f"every {first.dt_ns:g} ns; describe them one by one"
             )
-        if other != preparation:
+        if run.recipe.preparation != first.recipe.preparation:
             raise CpunetError(
-                f"{run}: trained with another preparation than {first}; describe them one by "
-                "one"
+                f"{run.name}: trained with another preparation than {first.name}; describe "
+                "them one by one"
             )
-
-
-def _require_sampling(first: Run, truth: Electronics) -> None:
-    if not np.isclose(truth.dt_ns, first.dt_ns):
+    if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
         raise CpunetError(
             f"{first.name}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
             f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"

@@ -298,7 +298,7 @@ class Run(InfoPart):
         """
         from cpunet.training.chain_description import describe_chain
 
-        return dict(describe_chain(self)["values"])
+        return describe_chain(self).values
 
     def plot(self) -> Figure:
         """Step and impulse response, tail and noise of a readout chain; losses of networks.
@@ -308,14 +308,14 @@ class Run(InfoPart):
         CpunetError
             If a run of networks contains no losses.
         """
-        from cpunet.training.chain_description import chain_of
-        from cpunet.training.closed_forms import response_figure
+        from cpunet.training.chain_description import describe_chain
+        from cpunet.training.figures import response_figure
         from cpunet.validation.run_figures import loss_curves
 
         if self.recipe.generator.name != "response":
             return loss_curves(self.records)
         tail_ns = self.recipe.preparation.samples_after * self.dt_ns
-        return response_figure([chain_of(self)], tail_ns=tail_ns)
+        return response_figure([describe_chain(self).chain], tail_ns=tail_ns)
 
     def translate(
         self, pulses: Any, out: str | Path | None = None, **how: Any

@@ -157,13 +157,13 @@ def _fitted(run: Run, translator: Translator) -> list[str]:
     if generator.name != "response":
         return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
     chain = describe_chain(run)
-    errors = chain["parameter_errors"]
+    errors = chain.parameter_errors
     numbers = [
         f"`{name}` {value:.4g}" + (f" ± {errors[name]:.2g}" if name in errors else "")
-        for name, value in chain["parameters"].items()
+        for name, value in chain.parameters.items()
     ]
     lines = [f"* readout chain as fitted: {', '.join(numbers)}"]
-    if rms := chain["values"].get("noise_rms_kev"):
+    if rms := chain.values.get("noise_rms_kev"):
         lines.append(f"* noise of the data: {rms:.3g} keV RMS")
     return lines
 

@@ -1,0 +1,196 @@
+"""Figures of a training: both sides of it, and readout chains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpunet.plotting import COLOURS, DATA_FILL, SPARE_COLOURS, label, styled
+from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.training.closed_forms import Chain, reaches_ns
+
+Floats = npt.NDArray[np.floating]
+
+PULSES, EDGE_NS, SIDE_BINS = 12, (-500.0, 500.0), 40  # pulses drawn of each side
+STEP_NS, IMPULSE_NS, GRID_NS = 2000.0, 600.0, 1.0
+LAYOUT = (("step", "impulse"), ("residual", "impulse"), ("tail", "noise"))
+POINTS = 400  # of the tail, equidistant on the logarithmic axis
+NOISE_BINS = 150  # of the noise spectra
+
+
+@styled
+def sides_figure(
+    waveforms: Mapping[str, Floats],
+    parameters: Mapping[str, Mapping[str, Floats]],
+    dt_ns: float,
+    counts: Mapping[str, int],
+) -> Figure:
+    """Pulses aligned at half maximum with their edges (top), histograms (bottom).
+
+    Parameters
+    ----------
+    waveforms
+        Pulses of unit height, shape (pulses, samples), of ``"raw"`` (the simulation) and
+        ``"data"``.
+    parameters
+        Floats of two quantities by axis label and side.
+    dt_ns
+        Sampling period in ns.
+    counts
+        Number of pulses that each side has in all.
+    """
+    figure = Figure(figsize=(9.0, 6.0))
+    (whole, edge), below = figure.subplots(2, 2)
+    for side, pulses in waveforms.items():
+        shown = min(len(pulses), PULSES)
+        some = pulses[np.linspace(0, len(pulses) - 1, shown).astype(int)]
+        length = pulses.shape[1]
+        aligned = align_half_maximum(np.asarray(some, np.float32), length, length)
+        time_ns = (np.arange(2 * length) - length) * dt_ns
+        scales = {whole: 1e-3, edge: 1.0}  # µs, ns
+        colour = COLOURS[side] if side != "data" else "0.35"
+        for axes, scale in scales.items():
+            lines = axes.plot(
+                scale * time_ns, aligned.T, color=colour, linewidth=0.7, alpha=0.8
+            )
+            lines[0].set_label(f"{label(side)}, {shown} of {counts[side]}")
+    whole.set_title("Pulses, aligned at half of their maximum")
+    edge.set_title("Their edges")
+    edge.set_xlim(*EDGE_NS)
+    whole.set(xlabel="Time [µs]", ylabel="Charge / its maximum")
+    edge.set(xlabel="Time [ns]", ylabel="Charge / its maximum")
+    for axes, (name, values) in zip(below, parameters.items(), strict=True):
+        _histograms(axes, name, values)
+    figure.legend(*whole.get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+def _histograms(axes: Axes, name: str, values: Mapping[str, Floats]) -> None:
+    everything = np.concatenate([v[np.isfinite(v)] for v in values.values()])
+    low, high = np.quantile(everything, (0.002, 0.998))
+    edges = np.linspace(low, high, SIDE_BINS + 1)
+    for side, own in values.items():
+        counts = np.histogram(own, edges)[0] / max(len(own), 1)
+        data = side == "data"
+        axes.stairs(
+            counts,
+            edges,
+            fill=data,
+            color=DATA_FILL if data else COLOURS[side],
+            label=label(side),
+        )
+    axes.set(xlabel=name, ylabel="Fraction of pulses")
+    axes.legend()
+
+
+@styled
+def response_figure(
+    chains: Sequence[Chain], truth: Chain | None = None, *, tail_ns: float
+) -> Figure:
+    """Step response and its residuals, impulse response, tail, and spectrum of the noise.
+
+    Times are counted from half height, by which pulses are aligned: an overall delay of the
+    chain cannot be inferred from them.  Residuals are differences from the truth, or from
+    the mean of several chains if there is no truth; a single chain has none.
+
+    Parameters
+    ----------
+    chains
+        Fitted chains.
+    truth
+        True chain, if known.
+    tail_ns
+        Time after the step up to which the tail is drawn, in ns.
+    """
+    compared = truth is not None or len(chains) > 1
+    rows = [row for row in LAYOUT if compared or "residual" not in row]
+    heights = [1.3 if "residual" in row else 2.2 for row in rows]
+    figure = Figure(figsize=(10.5, 2.4 + sum(heights)))
+    panels = figure.subplot_mosaic([list(row) for row in rows], height_ratios=heights)
+    shades = [COLOURS["ren"], *SPARE_COLOURS]
+    drawn = [(chain, shades[i % len(shades)], 1.2) for i, chain in enumerate(chains)]
+    if truth is not None:
+        # a broad line underneath, so that a chain which agrees does not hide it
+        drawn.insert(0, (truth, COLOURS["truth"], 3.5))
+    for chain, colour, width in drawn:
+        _responses(panels, chain, colour, width, tail_ns)
+        _noise_spectrum(panels["noise"], chain, colour, width)
+    if compared:
+        _residuals(panels["residual"], chains, truth, shades)
+    _annotate(panels, has_noise=bool(panels["noise"].lines))
+    return figure
+
+
+def _responses(
+    panels: dict[str, Axes], chain: Chain, colour: str, width: float, tail_ns: float
+) -> None:
+    half_ns = reaches_ns(chain, 0.5)
+    long_ns = np.arange(-100.0, STEP_NS, GRID_NS)
+    short_ns = np.arange(-150.0, IMPULSE_NS, GRID_NS)
+    tail = np.geomspace(100.0, tail_ns, POINTS)
+    look: dict[str, Any] = {"color": colour, "linewidth": width}
+    panels["step"].plot(long_ns, chain.whole.step(long_ns + half_ns), label=chain.name, **look)
+    panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
+    panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
+
+
+def _residuals(
+    axes: Axes, chains: Sequence[Chain], truth: Chain | None, shades: Sequence[str]
+) -> None:
+    time_ns = np.arange(-100.0, STEP_NS, GRID_NS)
+    steps = [chain.whole.step(time_ns + reaches_ns(chain, 0.5)) for chain in chains]
+    if truth is not None:
+        reference, name = truth.whole.step(time_ns + reaches_ns(truth, 0.5)), "truth"
+    else:
+        reference, name = np.mean(steps, axis=0), "mean"
+    for i, step in enumerate(steps):
+        axes.plot(time_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
+    axes.axhline(0, color="black", linewidth=0.8)
+    axes.set(ylabel=f"Run − {name}\n[10⁻³ of full charge]")
+
+
+def _noise_spectrum(axes: Axes, chain: Chain, colour: str, width: float) -> None:
+    if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
+        return
+    # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
+    stop = len(chain.frequency_mhz) - 1
+    edges = np.unique(np.geomspace(1, stop, NOISE_BINS).astype(int))
+    frequency, density = (
+        np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
+        for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
+    )
+    axes.loglog(frequency, density, color=colour, linewidth=width)
+
+
+def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
+    steps = [panels[name] for name in ("step", "residual") if name in panels]
+    for axes in steps:
+        axes.set(xlim=(-100, STEP_NS))
+        axes.tick_params(labelbottom=axes is steps[-1])
+    steps[-1].set(xlabel="Time from half height [ns]")
+    panels["step"].set(title="Step response", ylabel="Height [full charge]")
+    panels["step"].legend(loc="lower right")
+    panels["impulse"].set(
+        title="Impulse response",
+        xlabel="Time from half height of the step [ns]",
+        ylabel="Current [1/µs]",
+    )
+    panels["tail"].set(
+        title="Top and tail of the step",
+        xlabel="Time from half height [µs]",
+        ylabel="Height [full charge]",
+        xscale="log",
+    )
+    panels["tail"].xaxis.set_major_formatter("{x:g}")
+    if has_noise:
+        panels["noise"].set(
+            title="Noise", xlabel="Frequency [MHz]", ylabel="Density [keV²/MHz]"
+        )
+        panels["noise"].xaxis.set_major_formatter("{x:g}")
+    else:
+        panels["noise"].set_axis_off()
