@@ -16,8 +16,8 @@ import torch
 
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
-from cpunet.training import checkpoints
-from cpunet.training.checkpoints import CHECKPOINT, UnfinishedRun
+from cpunet.training import networks
+from cpunet.training.networks import CHECKPOINT, UnfinishedRun
 from cpunet.training.run import LOSSES
 from cpunet.training.train import train
 from synthetic import digests
@@ -88,7 +88,7 @@ PROCESS = "a training that is killed"  # the name of this module in its process
 
 def die_at(moment: str, iteration: int) -> None:
     """Have this process killed by force at a moment of its training."""
-    log, save, put = UnfinishedRun.log, UnfinishedRun.save, checkpoints.copy_own
+    log, save, put = UnfinishedRun.log, UnfinishedRun.save, networks.copy_own
     replace, logged = Path.replace, [0]
 
     def is_now(name: str) -> bool:
@@ -121,7 +121,7 @@ def die_at(moment: str, iteration: int) -> None:
         put(*given, **options)
 
     UnfinishedRun.log, UnfinishedRun.save = watched_log, watched_save
-    checkpoints.copy_own, Path.replace = watched_put, watched_replace
+    networks.copy_own, Path.replace = watched_put, watched_replace
 
 
 def forked(given: dict[str, Any]) -> Any:

@@ -11,14 +11,13 @@ import torch
 
 from cpunet import outputs
 from cpunet.errors import CpunetError
-from cpunet.training import checkpoints
-from cpunet.training.checkpoints import (
+from cpunet.training.loop import CheckpointHooks, train
+from cpunet.training.networks import (
     CHECKPOINT,
     MARKER,
     UnfinishedRun,
     unfinished_folder,
 )
-from cpunet.training.loop import CheckpointHooks, train
 from cpunet.training.run import LOSSES, WEIGHTS
 from synthetic import interrupted_in, nearly_full_disk
 
@@ -133,7 +132,7 @@ def test_a_damaged_checkpoint_is_told(tmp_path, content):
 
 def test_a_checkpoint_executes_nothing(tmp_path):
     kept(tmp_path)
-    torch.save({"format": checkpoints.FORMAT, "state": Path("x").open}, tmp_path / CHECKPOINT)
+    torch.save({"state": Path("x").open}, tmp_path / CHECKPOINT)
     with pytest.raises(CpunetError, match="damaged"):
         unfinished(tmp_path).begin(resume=True)
 

@@ -30,11 +30,10 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.checkpoints import unfinished_folder, unfinished_name
 from cpunet.training.devices import peak_memory_mb
 from cpunet.training.fit import train_chain
 from cpunet.training.moments import MIN_PULSES
-from cpunet.training.networks import train_networks
+from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
 from cpunet.training.pulse_sets import Continuum, continuum
 from cpunet.training.run import INFO, RUN, Run, RunLike, as_run, read_losses, versions
 

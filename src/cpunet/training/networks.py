@@ -1,10 +1,28 @@
-"""Training of a CycleGAN: resumable."""
+"""Training of networks on its way: ``RUN.unfinished``, next to the run that it becomes.
+
+``unfinished.json``
+    Recipe, seed and pulses, for information.
+``losses.jsonl``
+    The log of the losses, cut to the checkpoint's iteration when a training is resumed.
+``checkpoint.pt``
+    All that the next iterations depend on, replaced as a whole; reading it executes nothing.
+
+The folder is visible, so that nobody wonders where a day of GPU time went.
+"""
 
 from __future__ import annotations
 
+import io
+import json
 import logging
-from collections.abc import Callable
+import os
+import pickle
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,19 +30,39 @@ import torch
 from cpunet.electronics.drawn_tails import TraceNoise
 from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
+from cpunet.outputs import (
+    FolderKind,
+    Given,
+    copy_own,
+    folder_written_aside,
+    mark,
+    not_written,
+    refuse_existing,
+    refuse_inputs,
+    remove_own,
+    require_kind,
+    require_replaceable,
+)
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
-from cpunet.training.checkpoints import UnfinishedRun
 from cpunet.training.cyclegan import CycleGan, Outside
-from cpunet.training.loop import CheckpointHooks, Record, judges_noted, train
-from cpunet.training.run import FitInfo, Run, read_losses
+from cpunet.training.loop import CheckpointHooks, Record, State, judges_noted, train
+from cpunet.training.run import LOSSES, RUN, FitInfo, Run, read_losses
 
 if TYPE_CHECKING:
     from cpunet.training.job import TrainingJob
 
 log = logging.getLogger(__name__)
 
+FORMAT = 4
+MARKER, CHECKPOINT, ASIDE = "unfinished.json", "checkpoint.pt", ".checkpoint.partial"
+UNFINISHED = FolderKind(
+    name="unfinished run",
+    command="cpunet train",
+    known_by=MARKER,
+    own=rf"{RUN.own}|unfinished\.json|checkpoint\.pt|\.[^/]*\.partial.*",
+)
 # settings of logs and checkpoints, which do not affect the weights
 _CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
 
@@ -34,7 +72,21 @@ def train_networks(job: TrainingJob) -> Run:
     recipe = job.recipe
     threads = torch.get_num_threads()  # as device and version, it changes the last bits
     environment = {"device": job.device, "threads": threads, "torch": torch.__version__}
-    run = UnfinishedRun(job.folder, _fingerprint(job), environment)
+    settings = recipe.model_dump(
+        mode="json", exclude={"search": True, "training": _CHANGES_NOTHING}
+    )
+    run = UnfinishedRun(
+        job.folder,
+        {
+            "recipe": settings,
+            "peak": job.peak,
+            "seed": job.seed,
+            "init": None if job.init is None else job.init.weights_sha256,
+            "simulation": job.sim.fingerprint(),
+            "data": job.data.fingerprint(),
+        },
+        environment,
+    )
     state = run.begin(resume=job.resume)
     outside, fit = outside_noise(job.sim, job.data, recipe)
     left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
@@ -124,13 +176,213 @@ def _fill(run: Run, model: CycleGan) -> None:
             run.fill(name, network, device).train(was_training)
 
 
-def _fingerprint(job: TrainingJob) -> dict[str, Any]:
-    """Everything that determines the weights."""
-    recipe = job.recipe.model_dump(mode="json")
-    del recipe["search"]  # the search space does not affect the weights
-    training = recipe["training"]
-    recipe["training"] = {k: v for k, v in training.items() if k not in _CHANGES_NOTHING}
-    settings = {"recipe": recipe, "peak": job.peak, "seed": job.seed}
-    if job.init is not None:
-        settings["init"] = job.init.weights_sha256
-    return settings | {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
+def unfinished_name(out: Path) -> Path:
+    """Folder of the unfinished training that will become the run `out`."""
+    return out.parent / f"{out.name}.unfinished"
+
+
+@contextmanager
+def unfinished_folder(
+    out: Path,
+    *inputs: Given,
+    resume: bool = False,
+    force: bool = False,
+) -> Iterator[Path]:
+    """Provide ``OUT.unfinished`` as a working folder; its content at the end becomes `out`.
+
+    On an exception the folder is kept if it contains a checkpoint.
+
+    Parameters
+    ----------
+    out
+        Run folder to be made.
+    inputs
+        Files and folders that are read.
+    resume
+        Whether an unfinished training may exist; it is kept for `UnfinishedRun` to continue.
+    force
+        Replace an existing run folder, and allow an unfinished training to be replaced.
+
+    Raises
+    ------
+    CpunetError
+        If `out` exists and may not be replaced, an unfinished training exists and is neither
+        to be resumed nor replaced, or the folder cannot be written to.
+    """
+    refuse_existing(out, *inputs, force=force)
+    require_replaceable(out, RUN)
+    folder = unfinished_name(out)
+    refuse_inputs(folder, *inputs)
+    require_kind(folder, UNFINISHED)
+    checkpoint = folder / CHECKPOINT
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        mark(folder, UNFINISHED, listed=False)
+        if checkpoint.exists() and not (resume or force):
+            raise CpunetError(
+                f"{folder}: an unfinished training; continue with `resume`, or begin again "
+                "with `force`"
+            )
+        yield folder
+        # a copy: until it is in place, the training can be resumed from the original folder
+        try:
+            with folder_written_aside(out, RUN, force=force) as whole:
+                copy_own(folder, whole, RUN)
+        except CpunetError as error:
+            kept = "the training is kept, finish it with `resume`"
+            raise CpunetError(f"{error}; {kept}") from error
+        checkpoint.unlink(missing_ok=True)
+    except OSError as error:
+        raise CpunetError(
+            f"{not_written(error, folder, folder)}; what is stored is kept, continue with "
+            "`resume`"
+        ) from error
+    finally:
+        if not checkpoint.exists():
+            remove_own(folder, UNFINISHED)
+
+
+class UnfinishedRun:
+    """Log and checkpoint of a training in its folder.
+
+    Parameters
+    ----------
+    folder
+        From `unfinished_folder`.
+    fingerprint
+        Everything that determines the weights, by kind (``"recipe"``, ``"seed"``, …).
+    environment
+        Facts that may change their last bits: device, threads, version.
+    """
+
+    def __init__(
+        self, folder: Path, fingerprint: dict[str, Any], environment: dict[str, Any]
+    ) -> None:
+        self.folder = folder
+        self.started = datetime.now(UTC).isoformat(timespec="seconds")
+        self.resumed_at: list[int] = []
+        # as a file has it: no tuples, and no subclass of a number or a text
+        self._fingerprint, self._environment = json.loads(
+            json.dumps([{"format": FORMAT} | fingerprint, environment])
+        )
+        self._waiting: list[str] = []  # lines of the log, which has so many bytes before them
+        self._logged = 0
+        self._seconds_before = 0.0
+        self._clock = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time taken so far, without lost iterations and pauses."""
+        return self._seconds_before + time.perf_counter() - self._clock
+
+    def begin(self, *, resume: bool) -> State | None:
+        """Clear the folder, or find the state to continue from (None if there is none).
+
+        Raises
+        ------
+        CpunetError
+            If the training was begun with other settings or pulses, or the checkpoint is
+            damaged.
+        """
+        path, state = self.folder / CHECKPOINT, None
+        if resume and path.exists():
+            try:
+                then = torch.load(path, map_location="cpu", weights_only=True)
+            except (RuntimeError, ValueError, EOFError, pickle.PickleError):
+                raise CpunetError(f"{path}: damaged; begin again with `force`") from None
+            for kind, now in self._fingerprint.items():
+                for difference in differences(then["fingerprint"].get(kind), now):
+                    raise CpunetError(
+                        f"resumed with another {kind}: {difference}; give what the training "
+                        "was begun with, or begin again with `force`"
+                    )
+            for difference in differences(then["environment"], self._environment):
+                log.warning(f"resumed elsewhere: {difference}; the last bits may differ")
+            state = then["state"]
+            self.started, self._seconds_before = then["started"], then["seconds"]
+            self.resumed_at = [*then["resumed_at"], state["iteration"]]
+            self._logged = then["logged"]
+            log.info(f"going on after {state['iteration']} iterations")
+        else:
+            if resume:
+                log.info("no checkpoint to go on from; beginning at the beginning")
+            path.unlink(missing_ok=True)
+        with (self.folder / LOSSES).open("ab") as stream:
+            stream.truncate(self._logged)
+        told = {"started": self.started} | self._fingerprint | self._environment
+        (self.folder / MARKER).write_text(json.dumps(told, indent=2) + "\n")
+        return state
+
+    def log(self, records: Iterable[Record]) -> None:
+        """Add training records to the log; if the disk is full, they wait for a later call."""
+        self._waiting += (json.dumps(record) + "\n" for record in records)
+        with suppress(OSError):  # `save` reports it
+            self.finish()
+
+    def save(self, state: State) -> None:
+        """Store a checkpoint; if that fails, report it and keep the previous one."""
+        aside = self.folder / ASIDE
+        try:
+            self.finish()
+            stream = io.BytesIO()
+            content = {
+                "state": state,
+                "fingerprint": self._fingerprint,
+                "environment": self._environment,
+                "started": self.started,
+                "seconds": self.seconds,
+                "resumed_at": self.resumed_at,
+                "logged": self._logged,
+            }
+            torch.save(content, stream)
+            with aside.open("wb") as file:
+                file.write(stream.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())
+            aside.replace(self.folder / CHECKPOINT)
+        except OSError as error:
+            aside.unlink(missing_ok=True)  # free the space on a full disk
+            log.warning(
+                f"{self.folder}: no checkpoint after {state['iteration']} iterations "
+                f"({error.strerror or error}); the one before is kept"
+            )
+
+    def finish(self) -> None:
+        """Write the rest of the log.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written; the next call writes it in the same place.
+        """
+        content = "".join(self._waiting).encode()
+        with (self.folder / LOSSES).open("r+b") as stream:
+            stream.seek(self._logged)
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        self._logged += len(content)
+        self._waiting.clear()
+
+
+def differences(then: Any, now: Any) -> Iterator[str]:
+    """Each difference between two JSON-like values, as ``"training.batch_size 32 → 16"``."""
+    # as read back from a file: without tuples
+    old, new = (dict(_leaves("", json.loads(json.dumps(value)))) for value in (then, now))
+    for key in old | new:
+        before, after = old.get(key, "none"), new.get(key, "none")
+        if before != after:
+            yield f"{key} {_short(before)} → {_short(after)}".strip()
+
+
+def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if not isinstance(value, Mapping):
+        yield key, value
+        return
+    for name, part in value.items():
+        yield from _leaves(f"{key}.{name}" if key else name, part)
+
+
+def _short(value: Any) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= 24 else f"{text[:12]}…"
