@@ -32,7 +32,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
-from cpunet.training.fit import known_response
+from cpunet.training.job import known_response
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine

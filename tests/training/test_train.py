@@ -18,8 +18,7 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.devices import resolve_device
-from cpunet.training.run import Run
+from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
 from synthetic import (
     KEV,

@@ -54,8 +54,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.simulate import simulate
-from cpunet.training.fit import train_chain
-from cpunet.training.job import TrainingJob
+from cpunet.training.job import TrainingJob, train_chain
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run import RUN
 

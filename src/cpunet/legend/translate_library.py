@@ -54,8 +54,7 @@ from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.writing import FileInTheMaking
-from cpunet.training.devices import resolve_device
-from cpunet.training.run import RunLike, as_run
+from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.translator import BATCH, REN
 
 

@@ -1,24 +1,31 @@
-"""A training: its recipe, its pulses, and where it writes."""
+"""A training: its recipe and its pulses, the fit of a readout chain, and where it writes."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import resource
+import sys
+import time
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
+from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
 from cpunet.matrices import one_thread_for_matrices
 from cpunet.memory import keep_freed_memory
+from cpunet.networks.generators import ResponseGenerator
+from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.outputs import folder_written_aside
+from cpunet.progress import stage
 from cpunet.pulses.channels import Pair, own_folder
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
@@ -28,14 +35,30 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
 from cpunet.recipes.schema import Recipe
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.devices import peak_memory_mb
-from cpunet.training.fit import train_chain
+from cpunet.training.diagnosis import beyond, diagnosis, stretched
+from cpunet.training.inverse import fit_inverse
+from cpunet.training.learned_fit import fit_learned
+from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
-from cpunet.training.pulse_sets import Continuum, continuum
-from cpunet.training.run import INFO, RUN, Run, RunLike, as_run, read_losses, versions
+from cpunet.training.pulse_sets import SINGLE, Continuum, continuum
+from cpunet.training.response_fit import Fit, fit_response
+from cpunet.training.response_starts import DRIFT, with_drift_terms
+from cpunet.training.run import (
+    INFO,
+    RUN,
+    FitInfo,
+    Run,
+    RunLike,
+    append_losses,
+    as_run,
+    read_losses,
+    versions,
+)
 
 log = logging.getLogger(__name__)
 
@@ -74,12 +97,9 @@ class TrainingJob:
     def trained(self, out: Path | None) -> Run:
         """Train, and write the folder of the job, which becomes `out`."""
         keep_freed_memory()
-        fits: dict[str, Callable[[TrainingJob], Run]] = {
-            "matching": train_chain,
-            "cyclegan": train_networks,
-        }
+        train = train_chain if self.recipe.training.method == "matching" else train_networks
         with one_thread_for_matrices():
-            run = fits[self.recipe.training.method](self)
+            run = train(self)
         run.write(self.folder)
         run = run.model_copy(update={"folder": out})
         vars(run)["records"] = read_losses(self.folder)  # the folder moves, or goes
@@ -101,6 +121,10 @@ class TrainingJob:
         more
             Further facts of the run.
         """
+        unit = 2**20 if sys.platform == "darwin" else 2**10
+        memory = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
+        if self.device.startswith("cuda"):
+            memory["gpu"] = torch.cuda.max_memory_allocated(self.device) / 2**20
         return Run.of(
             model,
             recipe,
@@ -111,7 +135,7 @@ class TrainingJob:
             threads=torch.get_num_threads(),
             started=started,
             seconds=round(seconds, 1),
-            peak_memory_mb=peak_memory_mb(self.device),
+            peak_memory_mb={where: round(mb, 1) for where, mb in memory.items()},
             dt_ns=self.data.dt_ns,
             versions=versions(),
             sim=self.sim.provenance(),
@@ -155,7 +179,23 @@ class Training:
     def run(self, pair: Pair, out: Path | None, start: Run | None, *, go_on: bool) -> Run:
         """Read, train and write a run."""
         files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
-        with workplace(out, files, self.recipe, go_on, self.force) as folder:
+        networks = self.recipe.training.method == "cyclegan"
+        if go_on and (out is None or not networks):
+            why = (
+                "takes a minute and keeps no checkpoints" if out else "was kept in memory only"
+            )
+            raise CpunetError(
+                f"recipe {self.recipe.name}: {why}",
+                "give what the training was begun with, or leave out `resume`",
+            )
+        place: AbstractContextManager[Path | str]
+        if out is None:
+            place = TemporaryDirectory()
+        elif networks:
+            place = unfinished_folder(out, *files, resume=go_on, force=self.force)
+        else:
+            place = folder_written_aside(out, RUN, *files, force=self.force)
+        with place as folder:
             return self._job(pair, Path(folder), start, go_on).trained(out)
 
     def _job(self, pair: Pair, folder: Path, init: Run | None, resume: bool) -> TrainingJob:
@@ -180,23 +220,165 @@ class Training:
         )
 
 
-def workplace(
-    out: Path | None,
-    read: Sequence[Path | str | None],
-    recipe: Recipe,
-    resume: bool,
-    force: bool,
-) -> AbstractContextManager[Path | str]:
-    """Context of the folder to write to, which becomes `out` when the training is complete."""
-    networks = recipe.training.method == "cyclegan"
-    if resume and (out is None or not networks):
-        why = "takes a minute and keeps no checkpoints" if out else "was kept in memory only"
+def known_response(run: Run, like: Recipe) -> Readout:
+    """The response of a run, as a starting point for a recipe.
+
+    Raises
+    ------
+    CpunetError
+        If the run has no response of the recipe's kind.
+    """
+    generator = run.recipe.generator
+    if generator.name != like.generator.name or isinstance(generator, PunetConfig):
         raise CpunetError(
-            f"recipe {recipe.name}: {why}",
-            "give what the training was begun with, or leave out `resume`",
+            f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
+            f"give a run of {like.name}"
         )
-    if out is None:
-        return TemporaryDirectory()
-    if networks:
-        return unfinished_folder(out, *read, resume=resume, force=force)
-    return folder_written_aside(out, RUN, *read, force=force)
+    known: Readout = run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
+    return known
+
+
+class Matched(NamedTuple):
+    """A fitted chain.
+
+    Parameters
+    ----------
+    model
+        Module with ``ren`` and ``iren``.
+    info
+        What a run keeps of the fit.
+    recipe
+        Recipe of the response as fitted: a ringing or a stretch may have been added.
+    fit
+        Result of the fit.
+    remark
+        Remark on the noise, if any.
+    """
+
+    model: nn.Module
+    info: FitInfo
+    recipe: Recipe
+    fit: Fit
+    remark: str | None
+
+    def log(self) -> None:
+        """Tell which pulses were compared, how well the fit describes them, and why not."""
+        fit, info = self.fit, self.info
+        if self.remark is not None:
+            log.warning(self.remark)
+        compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+        log.info(f"compared (simulated/measured pulses): {compared}")
+        beside = info.in_no_band
+        if any(beside.values()):
+            log.info(
+                f"in no band, since one side has too few of their energies: {beside['sim']} "
+                f"simulated and {beside['data']} measured pulses"
+            )
+        if fit.poor:
+            log.warning(f"poor fit: {fit.verdict}")
+        else:
+            log.info(f"fit: {fit.verdict}")
+        if fit.drift is not None:
+            log.info(str(fit.drift))
+        for part, gain in fit.gains.items():
+            if part != DRIFT[1] or "drift_stretch" not in info.parameters:
+                log.info(f"{part}: {gain}")
+        for number, cause in enumerate(info.causes, 1):
+            log.info(f"  {number}. {cause}")
+        for found in beyond(info.parameters) + stretched(info.parameters, fit.gains):
+            log.warning(found)
+
+
+def match(
+    sim: InputSet,
+    data: InputSet,
+    recipe: Recipe,
+    seed: int,
+    listen: Listener,
+    known: Readout | None = None,
+    continuum: Continuum | None = None,
+) -> Matched:
+    """Measure the noise, fit the response, and invert it.
+
+    Parameters
+    ----------
+    sim, data
+        Pulses of both sides.
+    recipe
+        Recipe with a response to fit.
+    seed
+        Seed of all random numbers.
+    listen
+        Function called with step and chi-square.
+    known
+        Response to start from, if any.
+    continuum
+        Reads the pulses of both sides away from all lines, if a fit needs them.
+
+    Raises
+    ------
+    CpunetError
+        If there are too few pulses or baselines, or the fit diverges.
+    """
+    tails, drawn, tails_info = find_tails(data, recipe.preparation)
+    noise, remark = measured_noise(data, recipe.preparation, tails)
+    if isinstance(known, ElectronicsResponse):
+        allowed = recipe.matching.training.drift_terms
+        if known.config.drift_terms > allowed:
+            known = with_drift_terms(known, allowed)
+        recipe = recipe.model_copy(update={"generator": known.config})
+    response: Any  # an `ElectronicsResponse` or a `LearnedResponse`
+    given: dict[str, Any] = {"seed": seed, "known": known, "tails": drawn, "listener": listen}
+    simulated, measured = sim.prepared.pulses, data.prepared.pulses
+    if isinstance(recipe.generator, LearnedConfig):
+        response, fit = fit_learned(simulated, measured, noise, recipe, **given)
+    else:
+        given["continuum"] = continuum
+        response, fit = fit_response(simulated, measured, noise, recipe, **given)
+    parameters = response.describe()
+    counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
+    told = asdict(fit) | {
+        "parameters": parameters,
+        "drift": fit.drift and {"verdict": str(fit.drift), **asdict(fit.drift)},
+        "verdict": "; ".join([fit.verdict, *stretched(parameters, fit.gains)]),
+        "causes": diagnosis(fit.pulls) if fit.poor else [],
+        "in_no_band": {
+            "sim": len(sim.prepared) - sum(n for n, _ in counts),
+            "data": len(data.prepared) - sum(m for _, m in counts) - fit.data_left_out,
+        },
+        "noise": {
+            "baselines": noise.n_baselines,
+            "rms": noise.rms,
+            "rms_error": noise.rms_error,
+        },
+        "tails": tails_info,
+    }
+    recipe = recipe.model_copy(update={"generator": response.config})
+    chain = ResponseGenerator(response.config, sim.dt_ns)
+    chain.response = response
+    chain.set_noise(noise)
+    chain.tails = drawn
+    iren = fit_inverse(chain, simulated.waveforms, simulated.energy_kev, recipe, seed=seed)
+    model = nn.ModuleDict({"ren": chain, "iren": iren})
+    return Matched(model, FitInfo.model_validate(told), recipe, fit, remark)
+
+
+def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
+    """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    if job.init is not None:
+        known = known_response(job.init, job.recipe)
+    with stage("Matching") as bar:  # how many steps a fit needs is not known
+
+        def listen(step: int, chi_square: float) -> None:
+            losses = {"chi_square": chi_square}
+            record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
+            append_losses(job.folder, [record])
+            bar.update(1)
+            bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
+
+        found = match(job.sim, job.data, job.recipe, job.seed, listen, known, job.continuum)
+    found.log()
+    seconds = time.perf_counter() - clock
+    began = started.isoformat(timespec="seconds")
+    return job.run(found.model, found.recipe, began, seconds, fit=found.info)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -366,6 +367,21 @@ else:  # which commands read: there, a run is its folder
 def as_run(run: RunLike) -> Run:
     """The run itself, or that of a folder."""
     return run if isinstance(run, Run) else Run.load(run)
+
+
+def resolve_device(device: str) -> str:
+    """Resolve ``"auto"`` to a device; raise a `CpunetError` if a device is missing."""
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    known = re.fullmatch(r"cpu|cuda(?::(\d+))?", device)
+    if known is None:
+        raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
+    if device != "cpu" and not torch.cuda.is_available():
+        raise CpunetError("no GPU was found; use `device` cpu or install a CUDA build of torch")
+    if known[1] and int(known[1]) >= torch.cuda.device_count():
+        count = torch.cuda.device_count()
+        raise CpunetError(f"device {device!r}: the last of {count} GPUs is cuda:{count - 1}")
+    return device
 
 
 def versions() -> dict[str, str]:

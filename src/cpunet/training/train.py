@@ -91,9 +91,8 @@ def train(
     from cpunet.recipes import load_recipe
     from cpunet.recipes.schema import Recipe
     from cpunet.settings import require_seed
-    from cpunet.training.devices import resolve_device
     from cpunet.training.job import Training
-    from cpunet.training.run import Run, as_run
+    from cpunet.training.run import Run, as_run, resolve_device
 
     target = None if out is None else Path(out)
     if target is not None and not isinstance(recipe, Recipe):

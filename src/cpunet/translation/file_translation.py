@@ -24,8 +24,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.writing import PulseWriter
-from cpunet.training.devices import resolve_device
-from cpunet.training.run import RunLike, as_run
+from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import (
     AdcTraces,
     Formed,

@@ -24,8 +24,7 @@ from cpunet.pulses.parameters import Values
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
-from cpunet.training.devices import resolve_device
-from cpunet.training.run import Run
+from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.a_over_e import DEP, Range, survival_by_range, survival_table
 from cpunet.validation.ae_drift_time import ae_against_drift_time

@@ -33,11 +33,10 @@ from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, checked
-from cpunet.training.devices import resolve_device
-from cpunet.training.fit import match
+from cpunet.training.job import match
 from cpunet.training.loop import train
 from cpunet.training.networks import differences, outside_noise
-from cpunet.training.run import Run
+from cpunet.training.run import Run, resolve_device
 from cpunet.translation.forms import drawn_kev, wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
