@@ -11,7 +11,7 @@ import torch
 
 from cpunet import outputs
 from cpunet.errors import CpunetError
-from cpunet.training.loop import CheckpointHooks, train
+from cpunet.training.loop import train
 from cpunet.training.networks import (
     CHECKPOINT,
     MARKER,
@@ -59,9 +59,8 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
     """Train up to an iteration; its state goes to a file, its records are returned."""
     records, run = [], unfinished(folder)
     run.begin(resume=False)
-    hooks = CheckpointHooks(run.save)
     with interrupted_in(iteration), pytest.raises(KeyboardInterrupt):
-        train(*sets, recipe, seed=3, listener=records.extend, hooks=hooks)
+        train(*sets, recipe, seed=3, listener=records.extend, save=run.save)
     return records
 
 
@@ -80,8 +79,7 @@ def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, varian
     state = unfinished(tmp_path).begin(resume=True)
     assert state["iteration"] == stop == len(records)
     torch.manual_seed(99)  # what happened in between does not matter
-    hooks = CheckpointHooks(lambda _state: None, start=state)
-    model = train(*sets, recipe, seed=3, listener=records.extend, hooks=hooks)
+    model = train(*sets, recipe, seed=3, listener=records.extend, start=state)
     assert weights(model) == expected
     assert records == expected_records
 
@@ -170,8 +168,7 @@ def work(sets, recipe, out: Path, *, resume=False, die=None, disk=None, seed=3):
             with nearly_full_disk(disk if state["iteration"] == 4 and disk else 2**40):
                 run.save(state)
 
-        hooks = CheckpointHooks(save, start)
-        model = train(*sets, recipe, seed=seed, listener=listen, hooks=hooks)
+        model = train(*sets, recipe, seed=seed, listener=listen, save=save, start=start)
         run.finish()
         (folder / WEIGHTS).write_bytes(b"".join(weights(model).values()))
 

@@ -18,7 +18,6 @@ from cpunet.errors import CpunetError
 from cpunet.training import loop
 from cpunet.training.cyclegan import Step
 from cpunet.training.loop import (
-    CheckpointHooks,
     EpochSampler,
     judges_noted,
     refresh_batch_statistics,
@@ -113,10 +112,12 @@ def test_without_an_average_the_last_weights_are_kept(tiny, sets, monkeypatch):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_training_on_a_gpu_goes_on(tiny, sets):
     states, recipe = [], tiny("training.checkpoint_interval=2")
-    hooks = CheckpointHooks(lambda state: states.append(copy.deepcopy(state)))
-    whole = train(*sets, recipe, seed=0, device="cuda", hooks=hooks).state_dict()
-    hooks = CheckpointHooks(lambda _state: None, start=states[0])
-    again = train(*sets, recipe, seed=0, device="cuda", hooks=hooks).state_dict()
+
+    def save(state):
+        states.append(copy.deepcopy(state))
+
+    whole = train(*sets, recipe, seed=0, device="cuda", save=save).state_dict()
+    again = train(*sets, recipe, seed=0, device="cuda", start=states[0]).state_dict()
     # cuDNN's kernels may add in another order
     for name, value in whole.items():
         torch.testing.assert_close(again[name], value, rtol=1e-3, atol=1e-4)
@@ -135,7 +136,7 @@ def kept(sets, recipe):
             recipe,
             seed=0,
             listener=records.extend,
-            hooks=CheckpointHooks(save),
+            save=save,
         )
     finally:
         assert [record["iteration"] for record in records] == [*range(len(records))]
@@ -151,9 +152,12 @@ def test_the_state_is_kept_at_its_interval_and_at_the_end(tiny, sets):
 def test_an_interruption_is_kept(tiny, sets, caplog):
     caplog.set_level("INFO", "cpunet")
     before, states = signal.getsignal(signal.SIGINT), []
-    hooks = CheckpointHooks(lambda state: states.append(state["iteration"]))
+
+    def save(state):
+        states.append(state["iteration"])
+
     with interrupted_in(3), pytest.raises(KeyboardInterrupt):
-        train(*sets, tiny(), seed=0, hooks=hooks)
+        train(*sets, tiny(), seed=0, save=save)
     assert states == [3]
     assert caplog.messages[-1].startswith("stopped after 3 of 4 iterations; resume")
     assert signal.getsignal(signal.SIGINT) is before
@@ -181,11 +185,14 @@ def test_what_diverged_is_not_kept(tiny, sets, monkeypatch):
     monkeypatch.setattr(loop, "Step", Diverging)
     states = []
     recipe = tiny("training.iterations=20", "training.checkpoint_interval=2")
-    hooks = CheckpointHooks(lambda state: states.append(state["iteration"]))
+
+    def save(state):
+        states.append(state["iteration"])
+
     with pytest.raises(
         CpunetError, match=r"diverged: .* is not finite after iteration 3 \(seed 8"
     ):
-        train(*sets, recipe, seed=8, hooks=hooks)
+        train(*sets, recipe, seed=8, save=save)
     assert states == [2]
 
 

@@ -22,7 +22,7 @@ from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
-from cpunet.training.response_starts import drift_if_needed, with_drift_terms
+from cpunet.training.response_starts import drift_if_needed, with_settings
 from cpunet.training.translated import Noise, SimulatedSide
 from unpaired import (
     CHAIN,
@@ -228,7 +228,7 @@ def asked(problem: Problem) -> ResponseProblem:
 
 def test_records_are_stretched_as_the_layer_stretches(asked: ResponseProblem) -> None:
     """And what is kept of one stretch is not used for the next."""
-    more = asked.of(with_drift_terms(asked.response, 1))
+    more = asked.of(with_settings(asked.response, drift_terms=1))
     vector = more.parameters.vector()
     as_simulated, plain = more.pulls(vector), asked.pulls(asked.parameters.vector())
     np.testing.assert_allclose(as_simulated, plain, atol=1e-3)
@@ -245,7 +245,7 @@ def test_records_are_stretched_as_the_layer_stretches(asked: ResponseProblem) ->
 
 def test_a_needless_stretch_is_taken_out(asked: ResponseProblem) -> None:
     """It may have stood in for a ringing that was found later."""
-    stretched = asked.of(with_drift_terms(asked.response, 1))
+    stretched = asked.of(with_settings(asked.response, drift_terms=1))
     vector = stretched.parameters.vector()
     vector[stretched.parameters.labels.index(STRETCH)] = 0.002
     stretched.parameters.set(vector)

@@ -117,17 +117,8 @@ def test_weights_that_are_no_numbers(run, recipe, change, message):
     one_line(error, WEIGHTS, message)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        '{"iteration": 0',
-        "[]",
-        '{"iteration": "1", "losses": {}}',
-        '{"iteration": 1, "losses": {"a": "b"}}',
-    ],
-)
-def test_a_damaged_log(run, text):
-    (run / "losses.jsonl").write_text(text)
+def test_a_damaged_log(run):
+    (run / "losses.jsonl").write_text('{"iteration": 0')
     with pytest.raises(CpunetError) as error:
         read_losses(run)
     one_line(error, "losses.jsonl: damaged")

@@ -47,7 +47,7 @@ from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
 from cpunet.training.pulse_sets import SINGLE, Continuum, continuum
 from cpunet.training.response_fit import Fit, fit_response
-from cpunet.training.response_starts import DRIFT, with_drift_terms
+from cpunet.training.response_starts import DRIFT, with_settings
 from cpunet.training.run import (
     INFO,
     RUN,
@@ -325,7 +325,7 @@ def match(
     if isinstance(known, ElectronicsResponse):
         allowed = recipe.matching.training.drift_terms
         if known.config.drift_terms > allowed:
-            known = with_drift_terms(known, allowed)
+            known = with_settings(known, drift_terms=allowed)
         recipe = recipe.model_copy(update={"generator": known.config})
     response: Any  # an `ElectronicsResponse` or a `LearnedResponse`
     given: dict[str, Any] = {"seed": seed, "known": known, "tails": drawn, "listener": listen}

@@ -12,7 +12,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Self
 
@@ -38,27 +37,6 @@ MIN_UPDATES = 20  # minimum number of updates
 WON, LOST = 0.95, 0.52  # accuracy of a discriminator from which a generator learns nothing
 
 
-@dataclass(frozen=True)
-class CheckpointHooks:
-    """Hooks to save and resume a training.
-
-    Parameters
-    ----------
-    save
-        Called with the state every ``checkpoint_interval`` iterations, after the last one and
-        before an interruption, always after the listener has received all earlier records.
-        The tensors change again once it returns.
-    start
-        State to continue from.
-    """
-
-    save: Callable[[State], None]
-    start: State | None = None
-
-
-NOTHING_KEPT = CheckpointHooks(lambda _state: None)
-
-
 def train(
     sim: FloatArray,
     data: FloatArray,
@@ -69,7 +47,8 @@ def train(
     init: Callable[[CycleGan], None] | None = None,
     outside: Outside | None = None,
     listener: Listener | None = None,
-    hooks: CheckpointHooks = NOTHING_KEPT,
+    save: Callable[[State], None] | None = None,
+    start: State | None = None,
 ) -> CycleGan:
     """Train REN and IREN on two unpaired sets of prepared pulses.
 
@@ -95,8 +74,12 @@ def train(
         Called every ``log_interval`` iterations, and before each state is saved, with the
         records since the last call: ``{"iteration": i, "rate": r, "losses": {name: value}}``,
         and ``"accuracy"`` of the discriminators where they were updated.
-    hooks
-        Hooks to save and resume the training.
+    save
+        Called with the state every ``checkpoint_interval`` iterations, after the last one and
+        before an interruption, always after the listener has received all earlier records.
+        The tensors change again once it returns.
+    start
+        State to continue from.
 
     Raises
     ------
@@ -112,21 +95,15 @@ def train(
             EpochSampler(torch.from_numpy(pulses)[:, None].to(device), config.batch_size, own)
             for pulses, own in zip((sim, data), seeds, strict=True)
         ]
-        if hooks.start is None and init is not None:
+        if start is None and init is not None:
             init(model)
         warmup = 0 if init is None else config.warmup
         step = Step(model, config, outside=outside, warmup=warmup)
-        training = _Training(step, samplers, device)
-        if hooks.start is not None:
-            training.load_state_dict(hooks.start)
-        try:
-            with _Interruption() as interruption:
-                _iterate(training, listener, hooks, interruption)
-        except _DivergenceError as error:
-            raise CpunetError(
-                f"training diverged: {error} (seed {seed}); lower the learning rates or change "
-                "the seed, and begin again"
-            ) from error
+        training = _Training(step, samplers, device, seed)
+        if start is not None:
+            training.load_state_dict(start)
+        with _Interruption() as interruption:
+            _iterate(training, listener, save, interruption)
         for averaged, network, sampler in zip(
             training.averages, training.generators, samplers, strict=True
         ):
@@ -215,15 +192,13 @@ def judges_noted(records: Sequence[Record]) -> list[str]:
     return lines
 
 
-class _DivergenceError(Exception):
-    """A loss or weight is not finite; the message says which and when."""
-
-
 class _Training:
     """Everything that changes from iteration to iteration."""
 
-    def __init__(self, step: Step, samplers: list[EpochSampler], device: str) -> None:
-        self.step, self.samplers, self.config = step, samplers, step.config
+    def __init__(
+        self, step: Step, samplers: list[EpochSampler], device: str, seed: int
+    ) -> None:
+        self.step, self.samplers, self.config, self.seed = step, samplers, step.config, seed
         self.model, self.generators = step.model, (step.model.ren, step.model.iren)
         self.device = torch.device(device)
         average = get_ema_multi_avg_fn(self.config.average_decay)  # type: ignore[no-untyped-call]
@@ -296,7 +271,7 @@ class _Interruption:
 def _iterate(
     training: _Training,
     listener: Listener | None,
-    hooks: CheckpointHooks,
+    save: Callable[[State], None] | None,
     interruption: _Interruption,
 ) -> None:
     config = training.config
@@ -309,16 +284,17 @@ def _iterate(
         keep = last or stop or done % config.checkpoint_interval == 0
         # several iterations are fetched at once: each transfer makes a GPU wait
         if keep or len(pending) == config.log_interval:
-            records = [_finite(record) for record in pending]
+            records = [_finite(record, training.seed) for record in pending]
             pending.clear()
             if listener is not None:
                 listener(records)
-        if keep:
+        if keep and save is not None:
             # losses are one iteration behind the weights
             for name, value in training.model.state_dict().items():
                 if not bool(torch.isfinite(value).all()):
-                    raise _DivergenceError(f"{name} is not finite after iteration {done - 1}")
-            hooks.save(training.state_dict())
+                    told = f"{name} is not finite after iteration {done - 1}"
+                    raise _diverged(told, training.seed)
+            save(training.state_dict())
         if stop:
             log.info(
                 f"stopped after {done} of {config.iterations} iterations; resume goes on "
@@ -327,15 +303,20 @@ def _iterate(
             signal.raise_signal(stop)
 
 
-def _finite(record: dict[str, Any]) -> Record:
-    """The record in numbers; a `_DivergenceError` if a loss is not finite."""
+def _finite(record: dict[str, Any], seed: int) -> Record:
+    """The record in numbers, if all losses are finite."""
     for part in ("losses", "accuracy"):
         if part in record:
             record[part] = {name: float(value) for name, value in record[part].items()}
     for name, value in record["losses"].items():
         if not math.isfinite(value):
-            raise _DivergenceError(f"{name} is {value} in iteration {record['iteration']}")
+            raise _diverged(f"{name} is {value} in iteration {record['iteration']}", seed)
     return record
+
+
+def _diverged(told: str, seed: int) -> CpunetError:
+    remedy = "lower the learning rates or change the seed, and begin again"
+    return CpunetError(f"training diverged: {told} (seed {seed}); {remedy}")
 
 
 @contextmanager

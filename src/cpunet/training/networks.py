@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +46,7 @@ from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
 from cpunet.training.cyclegan import CycleGan, Outside
-from cpunet.training.loop import CheckpointHooks, Record, State, judges_noted, train
+from cpunet.training.loop import Record, State, judges_noted, train
 from cpunet.training.run import LOSSES, RUN, FitInfo, Run, read_losses
 
 if TYPE_CHECKING:
@@ -105,7 +104,8 @@ def train_networks(job: TrainingJob) -> Run:
             init=None if job.init is None else weights_of(job.init, recipe),
             outside=outside,
             listener=listen,
-            hooks=CheckpointHooks(run.save, state),
+            save=run.save,
+            start=state,
         )
     run.finish()
     for line in judges_noted(read_losses(job.folder)):
@@ -143,7 +143,7 @@ def outside_noise(
 
 
 def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:
-    """Function that fills networks with the weights of another run.
+    """Function that fills networks for which another run has weights, at least REN and IREN.
 
     Raises
     ------
@@ -163,17 +163,16 @@ def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:
             f"{theirs.samples_after} samples, this recipe has {own.samples_before} + "
             f"{own.samples_after}; start from a run of the same windows"
         )
-    return partial(_fill, init)
 
+    def fill(model: CycleGan) -> None:
+        there = {"ren", "iren"} | {name.partition(".")[0] for name in init.weights}
+        device = str(next(model.parameters()).device)
+        for name, network in model.named_children():
+            if name in there:
+                was_training = network.training
+                init.fill(name, network, device).train(was_training)
 
-def _fill(run: Run, model: CycleGan) -> None:
-    """Fill the networks for which the run has weights, at least REN and IREN."""
-    there = {"ren", "iren"} | {name.partition(".")[0] for name in run.weights}
-    device = str(next(model.parameters()).device)
-    for name, network in model.named_children():
-        if name in there:
-            was_training = network.training
-            run.fill(name, network, device).train(was_training)
+    return fill
 
 
 def unfinished_name(out: Path) -> Path:

@@ -11,9 +11,9 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-import torch
 
 from cpunet.electronics.drawn_tails import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -109,7 +109,7 @@ def drift_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     terms = response.config.drift_terms + 1
     if terms > fitter.training.drift_terms:
         return found
-    tried = with_drift_terms(response, terms)
+    tried = with_settings(response, drift_terms=terms)
     again = fitter.fit(found.problem.of(tried), coarse=terms == 1)
     assert tried.drift is not None
     sane = float(tried.drift.stretch.detach().abs().max()) < MAX_STRETCH
@@ -136,7 +136,7 @@ def drift_if_needed(found: Fitted, fitter: Fitter) -> Fitted:
     errors = np.sqrt(np.diagonal(found.covariance)[stretch])
     if not stretch or (np.abs(parameters.vector()[stretch]) > SURE * errors).any():
         return found
-    simulated = problem.of(with_drift_terms(problem.response, 0))
+    simulated = problem.of(with_settings(problem.response, drift_terms=0))
     again = fitter.fit(simulated, coarse=False)
     return again if again.cost < found.cost + ADDS else found
 
@@ -272,7 +272,7 @@ def most_promising_ringing(
     known = problem.derivatives(vector, deviations, range(len(vector)))
     best: tuple[ElectronicsResponse | None, float] = (None, float(deviations @ deviations))
     for frequency in frequencies_mhz:
-        response = _ringing_copy(problem.response, frequency)
+        response = with_settings(problem.response, ringing_mhz=frequency)
         tried = problem.of(response)
         weights = [i for i, label in enumerate(tried.parameters.labels) if label == "ringing"]
         slopes = tried.derivatives(tried.parameters.vector(), deviations, weights)
@@ -285,25 +285,15 @@ def most_promising_ringing(
     return best
 
 
-def _ringing_copy(response: ElectronicsResponse, frequency_mhz: float) -> ElectronicsResponse:
-    """A copy of a response with a ringing of a given frequency and zero weights."""
-    config = response.config.model_copy(update={"ringing_mhz": frequency_mhz})
-    rings = ElectronicsResponse(config, float(response.dt_ns))
-    state = {n: v for n, v in response.state_dict().items() if "ringing" not in n}
-    rings.load_state_dict(state, strict=False)
-    rings.decay_known = response.decay_known
-    return rings
-
-
-def with_drift_terms(response: ElectronicsResponse, terms: int) -> ElectronicsResponse:
-    """A copy of a response with this many parameters of the drift, new ones at 0."""
-    more = response.config.model_copy(update={"drift_terms": terms})
-    copied = ElectronicsResponse(more, float(response.dt_ns))
-    state = response.state_dict()
-    stretch = state.pop(STRETCH, torch.empty(0))
-    copied.load_state_dict(state, strict=False)
-    if copied.drift is not None:
-        copied.drift.stretch.data[: len(stretch)] = stretch[:terms]
+def with_settings(response: ElectronicsResponse, **settings: Any) -> ElectronicsResponse:
+    """A copy of a response with a ringing or terms of the drift, which have no effect yet."""
+    config = response.config.model_copy(update=settings)
+    copied = ElectronicsResponse(config, float(response.dt_ns))
+    known = response.state_dict()
+    for name, values in copied.state_dict().items():  # these share their memory
+        if name in known:
+            old = known[name].flatten()[: values.numel()]
+            values.view(-1)[: len(old)] = old
     copied.decay_known = response.decay_known
     return copied
 
