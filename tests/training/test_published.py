@@ -147,12 +147,12 @@ def test_one_generator_is_enough(files, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda s: s.pop("fc_var.bias"), "1 missing (latent_log_variance.bias)"),
-        (lambda s: s.update(more=torch.zeros(1)), "1 extra (more)"),
-        (lambda s: s.update({"fc_mean.bias": torch.zeros(3)}), "1 of other shape"),
-        (lambda s: s.pop("pe3.pe"), "1 missing (pe3.pe)"),
-        (lambda s: s["pe3.pe"].mul_(2), "positional map pe3.pe"),
-        (lambda s: s.update({"pe2.pe": torch.zeros(1, 8, 10)}), "positional map pe2.pe"),
+        (lambda s: s.pop("fc_var.bias"), "1 tensors differ, first latent_log_variance.bias"),
+        (lambda s: s.update(more=torch.zeros(1)), "1 tensors differ, first more"),
+        (
+            lambda s: s.update({"fc_mean.bias": torch.zeros(3)}),
+            "first latent_mean.bias",
+        ),
         (lambda s: s.pop("inc.double_conv.0.weight"), "no Positional U-Net"),
         (lambda s: s.update({"inc.double_conv.0.weight": torch.zeros(())}), "no Positional"),
     ],

@@ -11,23 +11,22 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.errors import CpunetError
-from cpunet.networks.positional_unet import PositionalUNet, positional_map
+from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.loading import SideInfo
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.network_settings import PunetConfig
-from cpunet.training.run import Run, versions
+from cpunet.training.run import Run, differing, versions
 
-# Published layer names → names here; the ninth positional map is never used.
+# Published layer names → names here.
 LAYERS = (
     {"inc.double_conv": "inlet", "outc.conv.0": "outlet"}
     | {"fc_mean": "latent_mean", "fc_var": "latent_log_variance"}
     | {f"down{i}.maxpool_conv.1.double_conv": f"down.{i - 1}" for i in range(1, 5)}
     | {f"up{i}.conv.double_conv": f"up.{i - 1}" for i in range(1, 5)}
 )
-MAPS = [f"pe{i}.pe" for i in range(1, 10)]
-MAP_TOLERANCE = 1e-3  # the published maps are computed in single precision
+MAPS = [f"pe{i}.pe" for i in range(1, 10)]  # computed here
 
 # Facts on the training for a report; its pulses were not published.
 UNKNOWN = SideInfo(file="not published with the weights", used="an unknown number of")
@@ -151,8 +150,7 @@ def _generator(path: Path, length: int) -> PositionalUNet:
     Raises
     ------
     CpunetError
-        If the file is not a published generator, or its tensors or positional maps belong to
-        another architecture; the message names missing, extra or differently shaped tensors.
+        If the file is not a published generator, or of another architecture.
     """
     state = _load_state(path)
     first = state.get("inc.double_conv.0.weight")
@@ -165,10 +163,12 @@ def _generator(path: Path, length: int) -> PositionalUNet:
     config = PunetConfig(name="punet", width=width, dropout=0.1)
     with torch.device("meta"):
         expected = PositionalUNet(config, length).state_dict()
-    maps = {name: state.pop(name) for name in MAPS if name in state}
-    named = _renamed(state, LAYERS)
-    _require_same(path, named, expected, sorted(set(MAPS) - set(maps)))
-    _check_maps(path, maps, width, length)
+    named = _renamed({n: v for n, v in state.items() if n not in MAPS}, LAYERS)
+    if wrong := differing(named, expected):
+        raise CpunetError(
+            f"{path}: weights of another architecture: {len(wrong)} tensors differ, first "
+            f"{wrong[0]}"
+        )
     network = PositionalUNet(config, length)
     network.load_state_dict(named)
     return network.eval()
@@ -188,42 +188,3 @@ def _renamed(state: State, layers: dict[str, str]) -> State:
         else:
             named[name] = value
     return named
-
-
-def _require_same(path: Path, named: State, expected: State, absent: list[str]) -> None:
-    missing = [*sorted(expected.keys() - named.keys()), *absent]
-    extra = sorted(named.keys() - expected.keys())
-    other = [
-        name
-        for name in sorted(expected.keys() & named.keys())
-        if named[name].shape != expected[name].shape
-    ]
-    told = [
-        f"{len(names)} {what} ({', '.join(names[:3])}{', …' if len(names) > 3 else ''})"
-        for names, what in ((missing, "missing"), (extra, "extra"), (other, "of other shape"))
-        if names
-    ]
-    if told:
-        raise CpunetError(f"{path}: weights of another architecture: {'; '.join(told)}")
-
-
-def _check_maps(path: Path, maps: State, width: int, length: int) -> None:
-    """Compare the positional maps, which are not weights but define the architecture."""
-    m = width
-    channels = (m, 2 * m, 4 * m, 8 * m, 8 * m, 4 * m, 2 * m, m)
-    last = (1, 2, 4, 8, 16, 8, 4, 2)
-    offsets = (0, 0, 0, 0, 0, 4 * m, 2 * m, 2 * m)
-    for name, d, factor, offset in zip(MAPS, channels, last, offsets, strict=False):
-        samples = length // factor + offset
-        found = maps[name]
-        wanted = positional_map(d, samples, 0)
-        if (
-            found.ndim != 3
-            or found.shape[:2] != wanted.shape[:2]
-            or found.shape[2] < samples
-            or not torch.allclose(found[..., :samples].float(), wanted, atol=MAP_TOLERANCE)
-        ):
-            raise CpunetError(
-                f"{path}: weights of another architecture: positional map {name} is not that "
-                f"of {d} channels"
-            )

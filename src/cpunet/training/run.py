@@ -221,12 +221,7 @@ class Run(InfoPart):
             for key, values in self.weights.items()
             if key.startswith(prefix)
         }
-        expected = network.state_dict()
-        wrong = sorted(
-            (own.keys() ^ expected.keys())
-            | {k for k in own.keys() & expected.keys() if own[k].shape != expected[k].shape}
-        )
-        if wrong:
+        if wrong := differing(own, network.state_dict()):
             raise CpunetError(
                 f"{where}: weights of another network: {len(wrong)} tensors differ, first "
                 f"{wrong[0]}"
@@ -367,6 +362,12 @@ else:  # which commands read: there, a run is its folder
 def as_run(run: RunLike) -> Run:
     """The run itself, or that of a folder."""
     return run if isinstance(run, Run) else Run.load(run)
+
+
+def differing(own: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> list[str]:
+    """Names of tensors that only one side has, or in another shape."""
+    shapes = [{name: value.shape for name, value in side.items()} for side in (own, expected)]
+    return sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()})
 
 
 def resolve_device(device: str) -> str:
