@@ -38,7 +38,7 @@ def sides_figure(
         Pulses of unit height, shape (pulses, samples), of ``"raw"`` (the simulation) and
         ``"data"``.
     parameters
-        Floats of two quantities by axis label and side.
+        Values of two quantities by axis label and side.
     dt_ns
         Sampling period in ns.
     counts
@@ -117,44 +117,30 @@ def response_figure(
     if truth is not None:
         # a broad line underneath, so that a chain which agrees does not hide it
         drawn.insert(0, (truth, COLOURS["truth"], 3.5))
-    for chain, colour, width in drawn:
-        _responses(panels, chain, colour, width, tail_ns)
-        _noise_spectrum(panels["noise"], chain, colour, width)
-    if compared:
-        _residuals(panels["residual"], chains, truth, shades)
-    _annotate(panels, has_noise=bool(panels["noise"].lines))
-    return figure
-
-
-def _responses(
-    panels: dict[str, Axes], chain: Chain, colour: str, width: float, tail_ns: float
-) -> None:
-    half_ns = reaches_ns(chain, 0.5)
     long_ns = np.arange(-100.0, STEP_NS, GRID_NS)
     short_ns = np.arange(-150.0, IMPULSE_NS, GRID_NS)
     tail = np.geomspace(100.0, tail_ns, POINTS)
-    look: dict[str, Any] = {"color": colour, "linewidth": width}
-    panels["step"].plot(long_ns, chain.whole.step(long_ns + half_ns), label=chain.name, **look)
-    panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
-    panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
+    steps = []
+    for chain, colour, width in drawn:
+        half_ns = reaches_ns(chain, 0.5)
+        steps.append(chain.whole.step(long_ns + half_ns))
+        look: dict[str, Any] = {"color": colour, "linewidth": width}
+        panels["step"].plot(long_ns, steps[-1], label=chain.name, **look)
+        panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
+        panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
+        _noise_spectrum(panels["noise"], chain, look)
+    if compared:
+        axes, name = panels["residual"], "mean" if truth is None else "truth"
+        reference = np.mean(steps, axis=0) if truth is None else steps.pop(0)
+        for i, step in enumerate(steps):
+            axes.plot(long_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
+        axes.axhline(0, color="black", linewidth=0.8)
+        axes.set(ylabel=f"Run − {name}\n[10⁻³ of full charge]")
+    _annotate(panels)
+    return figure
 
 
-def _residuals(
-    axes: Axes, chains: Sequence[Chain], truth: Chain | None, shades: Sequence[str]
-) -> None:
-    time_ns = np.arange(-100.0, STEP_NS, GRID_NS)
-    steps = [chain.whole.step(time_ns + reaches_ns(chain, 0.5)) for chain in chains]
-    if truth is not None:
-        reference, name = truth.whole.step(time_ns + reaches_ns(truth, 0.5)), "truth"
-    else:
-        reference, name = np.mean(steps, axis=0), "mean"
-    for i, step in enumerate(steps):
-        axes.plot(time_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.set(ylabel=f"Run − {name}\n[10⁻³ of full charge]")
-
-
-def _noise_spectrum(axes: Axes, chain: Chain, colour: str, width: float) -> None:
+def _noise_spectrum(axes: Axes, chain: Chain, look: dict[str, Any]) -> None:
     if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
         return
     # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
@@ -164,33 +150,25 @@ def _noise_spectrum(axes: Axes, chain: Chain, colour: str, width: float) -> None
         np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
         for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
     )
-    axes.loglog(frequency, density, color=colour, linewidth=width)
+    axes.loglog(frequency, density, **look)
 
 
-def _annotate(panels: dict[str, Axes], *, has_noise: bool) -> None:
+def _annotate(panels: dict[str, Axes]) -> None:
     steps = [panels[name] for name in ("step", "residual") if name in panels]
     for axes in steps:
         axes.set(xlim=(-100, STEP_NS))
         axes.tick_params(labelbottom=axes is steps[-1])
     steps[-1].set(xlabel="Time from half height [ns]")
-    panels["step"].set(title="Step response", ylabel="Height [full charge]")
+    height, density = "Height [full charge]", "Density [keV²/MHz]"
+    panels["step"].set(title="Step response", ylabel=height)
     panels["step"].legend(loc="lower right")
-    panels["impulse"].set(
-        title="Impulse response",
-        xlabel="Time from half height of the step [ns]",
-        ylabel="Current [1/µs]",
-    )
-    panels["tail"].set(
-        title="Top and tail of the step",
-        xlabel="Time from half height [µs]",
-        ylabel="Height [full charge]",
-        xscale="log",
-    )
-    panels["tail"].xaxis.set_major_formatter("{x:g}")
-    if has_noise:
-        panels["noise"].set(
-            title="Noise", xlabel="Frequency [MHz]", ylabel="Density [keV²/MHz]"
-        )
-        panels["noise"].xaxis.set_major_formatter("{x:g}")
-    else:
+    time = "Time from half height of the step [ns]"
+    panels["impulse"].set(title="Impulse response", xlabel=time, ylabel="Current [1/µs]")
+    time = "Time from half height [µs]"
+    panels["tail"].set(title="Top and tail of the step", xlabel=time, ylabel=height)
+    panels["tail"].set(xscale="log")
+    panels["noise"].set(title="Noise", xlabel="Frequency [MHz]", ylabel=density)
+    for name in ("tail", "noise"):
+        panels[name].xaxis.set_major_formatter("{x:g}")
+    if not panels["noise"].lines:
         panels["noise"].set_axis_off()
