@@ -50,15 +50,14 @@ MAX_PULSES = 2000  # maximum number of pulses per side for shapes
 RISES = (0.1, 0.5)  # of the height: a readout adds the same time between them to all pulses
 OFF_LINE = 1.5  # keV, maximum deviation of a line
 DPI = 150
-MARKS = {"fine": "ok", "warning": "look", "error": "stop"}
 
 
 class Level(StrEnum):
-    """How bad a finding is."""
+    """How bad a finding is, as it is printed."""
 
-    FINE = "fine"
-    WARNING = "warning"
-    ERROR = "error"
+    FINE = "ok"
+    WARNING = "look"
+    ERROR = "stop"
 
 
 @dataclass(frozen=True)
@@ -157,11 +156,11 @@ class CheckResult:
             if finding.channel != channel:
                 channel = finding.channel
                 lines.append(f"{channel}:")
-            lines.append(f"{MARKS[finding.level]:<7}{finding}")
+            lines.append(f"{finding.level:<7}{finding}")
         return "\n".join(lines)
 
     def __repr__(self) -> str:
-        counts = Counter(MARKS[finding.level] for finding in self.findings)
+        counts = Counter(finding.level for finding in self.findings)
         told = ", ".join(f"{n} {mark}" for mark, n in counts.items())
         return f"<{type(self).__name__}: {told}>"
 
@@ -409,16 +408,12 @@ def _amplitudes(one: InputSet) -> Values:
 def _rise_ns(one: InputSet) -> Values:
     """Time between the last samples below two fractions of the height before the maximum."""
     waveforms = _of_height_one(one)
-    begin, end = (_last_below(waveforms, fraction) for fraction in RISES)
+    samples = np.arange(waveforms.shape[1])
+    rising = samples < waveforms.argmax(axis=1)[:, np.newaxis]
+    begin, end = (
+        np.where((waveforms < fraction) & rising, samples, 0).max(axis=1) for fraction in RISES
+    )
     return np.asarray((end - begin) * one.dt_ns, float)
-
-
-def _last_below(waveforms: FloatArray, level: float) -> Values:
-    """Last sample below a level before each pulse's maximum; the first if there is none."""
-    last = waveforms.argmax(axis=1)
-    below = (waveforms < level) & (np.arange(waveforms.shape[1]) < last[:, np.newaxis])
-    at = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
-    return np.where(below.any(axis=1), at, 0).astype(float)
 
 
 def _range(values: Values) -> float:
