@@ -15,7 +15,7 @@ from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.settings import Shift, SimulationSettings
+from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
 
 KINDS = (Electronics, Recipe, Detector, SimulationSettings, Shift)
 TEXTS = {
@@ -183,3 +183,11 @@ def test_wrong_settings_are_named(override, part):
 )
 def test_wrong_settings_of_a_matching_are_named(override, part):
     assert part in message("fast", override)
+
+
+def test_values_of_a_file_and_of_words(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text("dt_ns: 4\nbias_V: 3000\n")
+    assert split_overrides([str(path), "dt_ns=2"]) == ({"bias_V": 3000}, {"dt_ns": 2})
+    with pytest.raises(CpunetError, match="expected KEY=VALUE"):
+        split_overrides([str(tmp_path / "none.yaml")])

@@ -108,7 +108,7 @@ GROUPS = {
     "library": App(name="library", help="Make and translate pulse-shape libraries."),
 }
 # Parameters whose options have other names; those of these classes are options of their own.
-SHORT = {"electronics": "preset", "settings": "set", "settings_file": "settings"}
+SHORT = {"electronics": "preset", "settings": "set"}
 for _options in (Adc, FileOptions, HitOptions, ReadOptions):
     Parameter(name="*", accepts_keys=True)(_options)
 

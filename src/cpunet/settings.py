@@ -121,6 +121,20 @@ def key_values(set_: Set) -> dict[str, Any]:
     return values
 
 
+def words_and_files(given: Set, folder: Path | None = None) -> dict[str, Any]:
+    """Values by key, see `key_values`; words without ``=`` are YAML files, or some in `folder`.
+
+    Later ones take precedence.
+    """
+    if isinstance(given, Mapping):
+        return key_values(given)
+    values: dict[str, Any] = {}
+    for word in map(str, given):
+        is_file = "=" not in word and (folder is not None or Path(word).is_file())
+        values |= read_values(word, folder) if is_file else key_values([word])
+    return values
+
+
 def names(folder: Path) -> list[str]:
     """Names of the YAML files in a folder."""
     return sorted(file.stem for file in folder.glob("*.yaml"))

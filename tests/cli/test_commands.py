@@ -174,7 +174,7 @@ export onnx | RUN --report REPORT | REPORT/ren.onnx
 export legend | RUN | RUN
 export legend | RUN --report REPORT | REPORT
 library make | --detector D/my.yaml | D/my.yaml
-library make | --detector icpc --settings D/my.yaml | D/my.yaml
+library make | --detector icpc --set D/my.yaml | D/my.yaml
 library translate | RUN D/hits.lh5 | D/hits.lh5
 library translate | RUN D/hits.lh5 | RUN/l.lh5
 import | --ren D/fep_REN.pt | D

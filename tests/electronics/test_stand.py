@@ -184,9 +184,10 @@ def test_pulses_of_a_library_are_those_drifted_one_by_one(
 
 @pytest.mark.parametrize("preset", ["ornl", "legend200"])
 def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None:
-    settings = SimulationSettings(self_repulsion=0.3, hole_velocity_low_factor=0.95)
+    values = {"self_repulsion": 0.3, "hole_velocity_low_factor": 0.95}
+    settings = SimulationSettings(**values)
     electronics = read_electronics(preset)
-    small = SMALL | {"electronics": electronics, "settings_file": settings}
+    small = SMALL | {"electronics": electronics, "settings": values}
     make_stand(tmp_path / "a", **small)
     stored = StoredSimulation.read(tmp_path / "a" / "sim.lh5")
     assert stored.detector == DETECTOR

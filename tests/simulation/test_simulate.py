@@ -30,7 +30,7 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
 
-SETTINGS = SimulationSettings(length_ns=1600)
+SETTINGS = {"length_ns": 1600}
 # in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
 PLACES = [[10, 0, 20], [12, 0, 25], [5, 0, 45.5], [5, 3, 45.6], [0, 0, 300]]
 HITS = Hits.of(PLACES, [1000, 600, 600, 2614.5, 500], [0, 1, 3, 4, 5], [7, 3, 20, 21])
@@ -67,7 +67,7 @@ def gammas(**changed: object) -> GammaSource:
 def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     out = tmp_path / "sim.lh5"
     events = {"FEP": 30, "SEP": 3, "DEP": 3}
-    summary = simulate(out, detector=ppc, events=events, settings_file=SETTINGS, seed=4)
+    summary = simulate(out, detector=ppc, events=events, settings=SETTINGS, seed=4)
     assert summary.pulses == PulseFile(out)
     assert (summary.n_events, summary.mode) == (36, "exact")
     assert summary.n_written + summary.without_signal == 36
@@ -104,9 +104,7 @@ def test_rounds_add_up_and_number_events_anew(ppc, monkeypatch):
 
 def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
     out = tmp_path / "sim.lh5"
-    summary = simulate(
-        out, detector=ppc, hits=source, settings_file=SETTINGS, settings={"cluster_mm": 0}
-    )
+    summary = simulate(out, detector=ppc, hits=source, settings=SETTINGS | {"cluster_mm": 0})
     # of the events with numbers 0 to 3 the last two leave no charge that moves
     assert (summary.n_events, summary.n_written, summary.without_signal) == (4, 2, 2)
     assert (summary.hits_outside, summary.hits_in_contacts) == (1, 2)
@@ -121,34 +119,34 @@ def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
 
 def test_kept_hits_read_back_as_they_were(ppc, source, tmp_path: Path):
     out, again = tmp_path / "sim.lh5", tmp_path / "again.lh5"
-    simulate(out, detector=ppc, hits=source, settings_file=SETTINGS)
+    simulate(out, detector=ppc, hits=source, settings=SETTINGS)
     kept = read_hits(out)
     assert np.array_equal(kept.position_mm, HITS[:2].position_mm)
     assert np.array_equal(kept.edep_kev, HITS[:2].edep_kev)
     assert np.array_equal(kept.offsets, HITS[:2].offsets)
     table = lh5.read("geds/hits", str(out))
     assert table["x"].attrs["units"] == "mm"
-    simulate(again, detector=ppc, hits=HitFile(out), settings_file=SETTINGS)
+    simulate(again, detector=ppc, hits=HitFile(out), settings=SETTINGS)
     first, second = (next(open_pulses(path).blocks()) for path in (out, again))
     assert np.array_equal(first.waveforms, second.waveforms)
 
 
 def test_the_file_tells_how_it_was_made(ppc, source, tmp_path: Path):
     out = tmp_path / "sim.lh5"
-    simulate(out, detector=ppc, hits=source, settings_file=SETTINGS, seed=11)
+    simulate(out, detector=ppc, hits=source, settings=SETTINGS, seed=11)
     with h5py.File(out) as file:
         attributes = dict(file["geds/sim"].attrs)
     made = json.loads(attributes["simulation"])
     assert Detector.model_validate(made["detector"]) == ppc
-    assert SimulationSettings.model_validate(made["settings"]) == SETTINGS
+    assert SimulationSettings.model_validate(made["settings"]) == SimulationSettings(**SETTINGS)
     assert (made["seed"], made["hits"]["file"]) == (11, str(source.path))
     assert attributes["made_by"].startswith("cpunet simulate ")
 
 
 def test_resolution_changes_energies_and_nothing_else(ppc, source, tmp_path: Path):
     sharp, broad = tmp_path / "sharp.lh5", tmp_path / "broad.lh5"
-    simulate(sharp, detector=ppc, hits=source, settings_file=SETTINGS)
-    simulate(broad, detector=ppc, hits=source, settings_file=SETTINGS, resolution=(1.0, 0.01))
+    simulate(sharp, detector=ppc, hits=source, settings=SETTINGS)
+    simulate(broad, detector=ppc, hits=source, settings=SETTINGS, resolution=(1.0, 0.01))
     first, second = (next(open_pulses(path).blocks()) for path in (sharp, broad))
     assert np.array_equal(first.waveforms, second.waveforms)
     assert np.all(first.energy_kev != second.energy_kev)
@@ -221,16 +219,16 @@ def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
     ppc, tmp_path: Path
 ):
     out, merged = tmp_path / "exact.lh5", tmp_path / "merged.lh5"
-    how = {"detector": ppc, "events": "FEP=10,DEP=5", "seed": 4, "settings_file": SETTINGS}
+    how = {"detector": ppc, "events": "FEP=10,DEP=5", "seed": 4}
     for file, cluster_mm in ((out, 0), (merged, 0.05)):
-        simulate(file, **how, settings={"cluster_mm": cluster_mm})
+        simulate(file, **how, settings=SETTINGS | {"cluster_mm": cluster_mm})
     first, second = (next(open_pulses(path).blocks()) for path in (out, merged))
     assert np.abs(first.waveforms - second.waveforms).max() < 1e-3
     assert first.energy_kev == pytest.approx(second.energy_kev)
 
 
 def test_hits_outside_are_told(ppc, source, tmp_path: Path, caplog):
-    simulate(tmp_path / "sim.lh5", detector=ppc, hits=source, settings_file=SETTINGS)
+    simulate(tmp_path / "sim.lh5", detector=ppc, hits=source, settings=SETTINGS)
     # one of five, at z = 300 mm
     assert caplog.messages == [
         f"{source.path}: 1 of 5 (20.0%) hits lie outside ppc (radius 34, z 0 to 46 "
@@ -259,7 +257,7 @@ def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: 
     caplog.set_level("INFO", "cpunet")
     out = tmp_path / "sim.lh5"
     values = {"measured_depletion_V": 2100.0, "impurity_scale": "depletion"}
-    simulate(out, detector=ppc, hits=source, settings_file=SETTINGS, settings=values)
+    simulate(out, detector=ppc, hits=source, settings=SETTINGS | values)
     made = json.loads(h5py.File(out)["geds/sim"].attrs["simulation"])
     scale = made["detector"]["impurity_scale"]
     assert made["depletion_V"] == pytest.approx(2100, abs=1)
@@ -270,7 +268,7 @@ def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: 
 def test_no_event_with_a_signal(ppc, tmp_path: Path):
     dead = HitFile(npz(tmp_path / "hits.npz", HITS[2:3]))
     with pytest.raises(CpunetError, match="none of 1 events gives a signal"):
-        simulate(tmp_path / "sim.lh5", detector=ppc, hits=dead, settings_file=SETTINGS)
+        simulate(tmp_path / "sim.lh5", detector=ppc, hits=dead, settings=SETTINGS)
     assert not (tmp_path / "sim.lh5").exists()
 
 
@@ -318,11 +316,11 @@ def test_wrong_settings_name_the_file(tmp_path: Path, text: str, said: str):
 
 
 def test_a_library_without_templates_is_not_written(ppc, tmp_path):
-    short = SimulationSettings(dt_ns=1, length_ns=50)
+    short = {"length_ns": 50}
     for grid_mm, said in (
         (100, "0 of 2 places .* 2 give no signal"),
         (20, r"\d+ are not collected in time"),
     ):
         with pytest.raises(CpunetError, match=said):
-            make_library(ppc, tmp_path / "psl.lh5", settings_file=short, grid_mm=grid_mm)
+            make_library(ppc, tmp_path / "psl.lh5", settings=short, grid_mm=grid_mm)
     assert list(tmp_path.iterdir()) == []

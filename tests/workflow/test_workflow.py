@@ -225,7 +225,7 @@ def test_a_dry_run_with_calibrations(place):
     words = "--fix=tilt '--prior=depletion_voltage=2100±50' --events=500"
     assert words in told.replace("--prior='depletion", "'--prior=depletion")
     run = "'all results/V01/p03/run/"
-    assert f"--detector={run}detector.yaml' --settings={run}settings.yaml' --hits" in told
+    assert f"--detector={run}detector.yaml' --set={run}settings.yaml' --hits" in told
     assert f"library make --detector={run}detector.yaml' --grid-mm 2" in told
     assert "--data-table=ch1/raw" in told
 

@@ -21,7 +21,7 @@ def physics(wildcards, settings=True):
     if CALIBRATED:
         run = TRAINED.format(**dict(wildcards))
         words = {"detector": f"{run}/detector.yaml"}
-        return options(**words, settings=f"{run}/settings.yaml" if settings else None)
+        return options(**words, set=f"{run}/settings.yaml" if settings else None)
     entry = DETECTORS[wildcards.detector]["simulate"]
     return options(detector=entry["detector"], set=entry.get("set"))
 

@@ -342,7 +342,7 @@ def _simulate_calibrated(
         folder / SIM,
         detector=detector,
         hits=HitFile(sides.sim.path, placed=True),
-        settings_file=settings,
+        settings=dict(settings),
         seed=seed,
     )
 

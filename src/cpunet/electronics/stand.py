@@ -142,7 +142,6 @@ def make_stand(
     events: str | Mapping[str, int] = "FEP=4000,SEP=1500,DEP=1500",
     shift: Sequence[str] | Mapping[str, Any] = (),
     settings: Set = (),
-    settings_file: str | Path | SimulationSettings | None = None,
     seed: int = 0,
     force: bool = False,
 ) -> Stand:
@@ -173,9 +172,7 @@ def make_stand(
         or a YAML file of keys (repeatable). The truth is the response to the simulated pulses.
     settings
         Override a value of the detector, of the settings or of the readout: bias_V=3500,
-        earlier_pulses.rate_kHz=3 (repeatable).
-    settings_file
-        YAML file of settings of the simulation, without the period.
+        earlier_pulses.rate_kHz=3, or all those in a YAML file, without the period (repeatable).
     seed
         Seed of all random numbers; the sides are independent.
     force
@@ -195,13 +192,13 @@ def make_stand(
 
     cpunet stand --preset ornl --shift default --shift bias_V=20 --out stand2
     """
-    shifts = [] if isinstance(shift, Mapping) else [*shift]
-    given = (electronics, detector, settings_file, *shifts)
+    words = [w for given in (shift, settings) if not isinstance(given, Mapping) for w in given]
+    given = (electronics, detector, *words)
     refuse_inputs(Path(out), *(f for f in given if isinstance(f, str | Path)))
     of_detector, of_settings = split_overrides(settings)
     readout = Electronics.model_fields.keys() - {"name"}
     of_chain = {k: of_detector.pop(k) for k in [*of_detector] if k.split(".")[0] in readout}
-    physics = read_settings(SimulationSettings, settings_file, of_settings)
+    physics = read_settings(SimulationSettings, set_=of_settings)
     seed, moved = require_seed(seed), Shift.of(shift) if shift else None
     chain = read_electronics(electronics, of_chain)
     sim, data, readout_seed = stand_sides(

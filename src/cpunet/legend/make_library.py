@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,7 +63,6 @@ def make_library(
     grid_mm: float = 1.0,
     angles: str | Sequence[int] = ANGLES_DEG,
     settings: Set = (),
-    settings_file: str | Path | SimulationSettings | None = None,
     force: bool = False,
 ) -> MadeLibrary:
     """Simulate the charge pulse of every place in a detector.
@@ -86,10 +85,8 @@ def make_library(
     angles
         Azimuths from <100> in degrees, as 0,45.
     settings
-        Override a value of the detector or the simulation: bias_V=3500, dt_ns=2 (repeatable).
-    settings_file
-        YAML file of settings of the simulation, with the sampling period and the length of a
-        template; without one they are 1 ns and 5000 ns.
+        Override a value of the detector or the simulation, bias_V=3500, or all those in a YAML
+        file (repeatable); templates have dt_ns=1 and length_ns=5000 without.
     force
         Replace an existing file.
 
@@ -111,7 +108,8 @@ def make_library(
     cpunet library make --detector icpc --out psl.lh5 --grid-mm 0.5 --set dt_ns=2
     """
     out = Path(out)
-    inputs = [given for given in (detector, settings_file) if isinstance(given, str | Path)]
+    words = () if isinstance(settings, Mapping) else settings
+    inputs = [given for given in (detector, *words) if isinstance(given, str | Path)]
     refuse_existing(out, *inputs, force=force)
     of_detector, of_settings = split_overrides(settings)
     if not isinstance(detector, Detector):
@@ -119,8 +117,8 @@ def make_library(
     angles_deg = _degrees(angles)
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
-    sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS} if settings_file is None else {}
-    wanted = read_settings(SimulationSettings, settings_file, sampling | of_settings)
+    sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS}
+    wanted = read_settings(SimulationSettings, set_=sampling | of_settings)
     with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))

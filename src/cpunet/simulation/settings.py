@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.settings import Config, Set, checked, key_values, read_values
+from cpunet.settings import Config, Set, checked, words_and_files
 from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.velocity import VelocityFactors
@@ -160,14 +159,14 @@ class SimulationSettings(Config):
 
 
 def split_overrides(overrides: Set) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split ``KEY=VALUE`` words into values of the detector and of `SimulationSettings`.
+    """Split words and YAML files into values of the detector and of `SimulationSettings`.
 
     Examples
     --------
     >>> split_overrides(["bias_V=3500", "hole_trapping_per_us=0.01"])
     ({'bias_V': 3500}, {'hole_trapping_per_us': 0.01})
     """
-    values = key_values(overrides)
+    values = words_and_files(overrides)
     of_settings = values.keys() & SimulationSettings.model_fields.keys()
     return (
         {key: value for key, value in values.items() if key not in of_settings},
@@ -228,7 +227,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
     self_repulsion: Number | None = None
 
     @classmethod
-    def of(cls, parts: Mapping[str, Any] | Iterable[str | Path]) -> Shift:
+    def of(cls, parts: Set) -> Shift:
         """Combine ``"default"``, YAML files and ``"KEY=VALUE"``. Later ones take precedence.
 
         Raises
@@ -241,12 +240,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
         >>> Shift.of(["temperature_K=2", "self_repulsion=0.5"]).self_repulsion
         0.5
         """
-        if isinstance(parts, Mapping):
-            return checked(cls, key_values(parts), "shift")
-        values: dict[str, Any] = {}
-        for part in map(str, parts):
-            values |= key_values([part]) if "=" in part else read_values(part, _SHIFTS)
-        return checked(cls, values, "shift")
+        return checked(cls, words_and_files(parts, _SHIFTS), "shift")
 
     def detector(self, detector: Detector) -> Detector:
         """Shifted version of a simulated detector.

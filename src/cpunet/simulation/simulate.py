@@ -142,7 +142,6 @@ def simulate(
     hits: str | Path | HitFile | None = None,
     frame: HitOptions = HitOptions(),
     settings: Set = (),
-    settings_file: str | Path | SimulationSettings | None = None,
     resolution: Resolution | None = None,
     seed: int = 0,
     force: bool = False,
@@ -170,9 +169,8 @@ def simulate(
     frame
         How a file of hits is read.
     settings
-        Override a value of the detector or of the settings: bias_V=3500 (repeatable).
-    settings_file
-        YAML file of settings of the simulation.
+        Override a value of the detector or of the settings, bias_V=3500, or all those in a
+        YAML file (repeatable).
     resolution
         A and B: smear the energies written, FWHM² = A + B E in keV, as 0.5 0.0018.
     seed
@@ -195,10 +193,11 @@ def simulate(
     require_seed(seed)
     out = Path(out)
     of_detector, of_settings = split_overrides(settings)
-    files = [f for f in (detector, settings_file) if isinstance(f, str | Path)]
+    words = () if isinstance(settings, Mapping) else settings
+    files = [f for f in (detector, *words) if isinstance(f, str | Path)]
     files += [hits.path if isinstance(hits, HitFile) else hits] if hits is not None else []
     refuse_inputs(out, *files)
-    physics = read_settings(SimulationSettings, settings_file, of_settings)
+    physics = read_settings(SimulationSettings, set_=of_settings)
     peaks = load_recipe("fast").peaks
     windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
     source: HitSource
