@@ -84,7 +84,7 @@ rule merge_data:
 
 def simulation_reading(detector):
     entry = DETECTORS[detector]
-    return options(table=entry.get("sim_table"), energy=entry.get("sim_energy"))
+    return options(table=entry.get("sim_table"))
 
 
 def data_reading(detector, period):
@@ -117,7 +117,7 @@ def reading(wildcards):
     words = {}
     if len(SIMULATIONS[wildcards.detector]) == 1:
         entry = DETECTORS[wildcards.detector]
-        words |= {"sim_table": entry.get("sim_table"), "sim_energy": entry.get("sim_energy")}
+        words["sim_table"] = entry.get("sim_table")
     if len(DATA[wildcards.detector, wildcards.period]) == 1:
         of_data = data_reading(wildcards.detector, wildcards.period)
         for name in ("table", "energy"):

@@ -59,8 +59,6 @@ class ReadOptions:
         Sampling period in ns.
     sim_table
         Table of the simulated pulses, if the file has several.
-    sim_energy
-        Energy column of the simulation, or ``FILE:path/to/column``.
     insist
         Pulses are simulated or measured as given, whatever they look like.
     """
@@ -70,13 +68,12 @@ class ReadOptions:
     kev_per_adc: float | None = None
     dt_ns: float | None = None
     sim_table: str | None = None
-    sim_energy: str | None = None
     insist: bool = False
 
     @property
     def sim(self) -> FileOptions:
         """Those of the simulated pulses, which are in keV."""
-        return FileOptions(self.sim_table, self.sim_energy, None, self.dt_ns, self.insist)
+        return FileOptions(self.sim_table, None, None, self.dt_ns, self.insist)
 
     @property
     def data(self) -> FileOptions:
