@@ -26,4 +26,4 @@ rule so_far:
         reports=REPORTS,
         page=f"{RESULTS}/so_far.html",
     shell:
-        "cpunet compare {params.reports:q} --missing-ok --out {params.page:q} --force"
+        "cpunet compare {params.reports:q} --out {params.page:q} --force"

@@ -87,13 +87,13 @@ def compare(
     *reports: str | Path | Report,
     method: str = "ren",
     out: str | Path | None = None,
-    missing_ok: bool = False,
     force: bool = False,
 ) -> Comparison:
     """Put the scores of several validations beside each other, of one detector or of many.
 
     The page also has links to the reports, and room for many detectors and periods. A second
-    table tells how the scores of runs scatter that differ in their seed only.
+    table tells how the scores of runs scatter that differ in their seed only. Reports that are
+    missing are listed.
 
     Parameters
     ----------
@@ -103,8 +103,6 @@ def compare(
         Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.
     out
         Page to write, such as compare.html.
-    missing_ok
-        List reports that are not there; no error.
     force
         Replace existing output.
 
@@ -116,7 +114,7 @@ def compare(
     Raises
     ------
     CpunetError
-        If a report is missing or cannot be read, none has a score of `method`, or `out`
+        If a report cannot be read, all are missing, none has a score of `method`, or `out`
         exists or is not writable.
 
     Examples
@@ -126,10 +124,10 @@ def compare(
     cpunet compare results/*/*/report --out results/index.html
     """
     if out is None:
-        return compared(reports, method=method, missing_ok=missing_ok)
+        return compared(reports, method=method)
     files = [r.folder if isinstance(r, Report) else Path(r) for r in reports]
     _refuse(Path(out), files, force=force)
-    comparison = compared(reports, method=method, missing_ok=missing_ok)
+    comparison = compared(reports, method=method)
     comparison.save(out, force=force)
     return replace(comparison, path=Path(out))
 
@@ -139,13 +137,12 @@ def compared(
     *,
     method: str = "ren",
     failed: Collection[Path] = (),
-    missing_ok: bool = False,
 ) -> Comparison:
     """Compare the scores of several validations, see `compare`.
 
     Parameters
     ----------
-    reports, method, missing_ok
+    reports, method
         As of `compare`.
     failed
         Reports to list as missing: what is in their folders is of an earlier validation.
@@ -158,13 +155,16 @@ def compared(
             folders.append(report.folder)
         else:
             path = Path(report)
-            file = None if path in failed else _metrics_file(path, missing_ok=missing_ok)
+            file = None if path in failed else _metrics_file(path)
             metrics.append(None if file is None else read_metrics(file))
             folders.append(None if file is None else file.parent)
     names = _names([_place(report) for report in reports])
     runs = {n: found for n, found in zip(names, metrics, strict=True) if found is not None}
     if not runs:
-        raise CpunetError(f"none of the {len(reports)} reports is there yet")
+        raise CpunetError(
+            f"none of the {len(reports)} reports is there",
+            "give folders of cpunet validate or cpunet demo",
+        )
     missing = tuple(name for name in names if name not in runs)
     table = side_by_side(runs, method)
     return Comparison(table, runs, dict(zip(names, folders, strict=True)), missing)
@@ -194,23 +194,10 @@ def _text(table: SideBySide, title: str) -> str:
     return text_table(["peak", "score", *table.names], rows, words=2, title=title)
 
 
-def _metrics_file(report: Path, *, missing_ok: bool) -> Path | None:
-    """Path of the metrics of a report, given as folder or file; None if it may be missing."""
-    if report.is_file():
-        return report
-    for file in (report / METRICS, report / REPORT / METRICS):
-        if file.is_file():
-            return file
-    if missing_ok:
-        return None
-    if not report.exists():
-        raise CpunetError(
-            f"{report}: no such folder or file", "give a folder of cpunet validate"
-        )
-    raise CpunetError(
-        f"{report}: no {METRICS} in it",
-        "give a folder of cpunet validate or cpunet demo, or `missing_ok`",
-    )
+def _metrics_file(report: Path) -> Path | None:
+    """Path of the metrics of a report, given as folder or file; None if it has none."""
+    places = (report, report / METRICS, report / REPORT / METRICS)
+    return next((place for place in places if place.is_file()), None)
 
 
 def _names(reports: Sequence[Path]) -> list[str]:

@@ -153,7 +153,7 @@ def _of_channels(
         folders = [out / name for name in channels]
         # without force, a channel with a report fails and keeps it
         failed = [out / name for name in outcome.failed if force]
-        compared(folders, failed=failed, missing_ok=True).save(out / INDEX, force=True)
+        compared(folders, failed=failed).save(out / INDEX, force=True)
         log.info(f"all channels: {out / INDEX}")
     return Outcome({n: Report.load(place) for n, place in outcome.done.items()}, outcome.failed)
 
