@@ -170,7 +170,6 @@ response | RUN | RUN
 response | RUN --truth D | D
 response | RUN | .
 export onnx | RUN | RUN/weights.safetensors
-export onnx | RUN --report REPORT | REPORT/ren.onnx
 export legend | RUN | RUN
 export legend | RUN --report REPORT | REPORT
 library make | --detector D/my.yaml | D/my.yaml

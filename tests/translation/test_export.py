@@ -24,8 +24,7 @@ from cpunet.translation.dspeed_processor import ren
 from cpunet.translation.export import export_onnx
 from cpunet.translation.onnx import write_onnx
 from cpunet.translation.translator import IREN, REN
-from cpunet.validation.comparisons import compare
-from synthetic import waveform_table, write_chain, write_report
+from synthetic import waveform_table, write_chain
 
 
 def fitted(chain: ResponseGenerator) -> None:
@@ -50,24 +49,6 @@ def written(folder: Path, *settings: str) -> Path:
     fit = {"errors": {"log_poles_ns.2": 0.02, "log_decay_us.1": 0.002}}
     how = {"change": fitted, "inverse": unity, "noise_kev": 3}
     return write_chain(folder, *settings, **how, fit=fit)
-
-
-def written_report(folder: Path) -> tuple[Path, dict[str, float]]:
-    """A report as a validation writes it, and its overlaps in percent."""
-    rng = np.random.default_rng(1)
-    data, ren = ({"drift_time": rng.normal(1000, 50, 400)} for _ in range(2))
-    scores = load_recipe("fast").scores.model_copy(update={"bootstraps": 20})
-    compared = compare(data, {"ren": ren}, scores, seed=1)
-    folder.mkdir()
-    write_report(
-        folder,
-        {"peaks": {"SEP": {"parameters": compared, "two_sample": {"ren": {"missing": "few"}}}}},
-        {},
-        [],
-    )
-    overlaps = compared["drift_time"]["iou"]
-    assert 50 < overlaps["ren"] <= 100
-    return folder, overlaps
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +118,7 @@ def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
 
 
 def test_the_card_and_the_noise(chain, tmp_path):
-    report, scores = written_report(tmp_path / "report")
-    done = export_onnx(chain, tmp_path / "ren.onnx", report=report)
+    done = export_onnx(chain, tmp_path / "ren.onnx")
     assert (done.card.name, done.noise.name) == ("ren.card.md", "ren.noise.npz")
     card = done.card.read_text()
     for words in (
@@ -148,7 +128,6 @@ def test_the_card_and_the_noise(chain, tmp_path):
         "(batch, 1400)",
         "every 16 ns",
         "ren.noise.npz",
-        f"| SEP | drift time | ceiling {scores['ceiling']:.1f}, ren {scores['ren']:.1f} |",
         # what was fitted, not where the fit began
         "`pole_1_ns` 71 ± 1.4, `pole_2_ns` 33,",
         "`decay_us` 54.6 ± 0.11",
@@ -169,8 +148,6 @@ def test_the_card_and_the_noise(chain, tmp_path):
 
 
 def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
-    with pytest.raises(CpunetError, match=r"metrics\.json: cannot be read"):
-        export_onnx(chain, tmp_path / "ren.onnx", report=chain)
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
         export_onnx(chain, tmp_path / "ren.onnx")

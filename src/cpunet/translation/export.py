@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
-from cpunet.settings import read_json
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import Run, RunLike, as_run
 from cpunet.translation.onnx import CHECKED, FORMAT, OPSET, TOLERANCE, Graph, write_onnx
@@ -39,7 +37,6 @@ def export_onnx(
     out: str | Path,
     *,
     inverse: bool = False,
-    report: str | Path | None = None,
     force: bool = False,
 ) -> Export:
     """Export the deterministic part of a run as ONNX, and check it against the run.
@@ -56,8 +53,6 @@ def export_onnx(
         File to write, its card beside it.
     inverse
         Export IREN instead of REN.
-    report
-        Report on this run, whose scores go into the card.
     force
         Replace existing files; those of noise are removed if there is none.
 
@@ -69,24 +64,20 @@ def export_onnx(
     Raises
     ------
     CpunetError
-        If the run is not finished, the report has no scores, a package is missing or the
-        exported graph differs from the run.
+        If the run is not finished, a package is missing or the exported graph differs from the
+        run.
 
     Examples
     --------
     cpunet export onnx run --out ren.onnx
     """
-    out, report = Path(out), None if report is None else Path(report)
+    out = Path(out)
     card, noise_file = out.with_suffix(".card.md"), out.with_suffix(".noise.npz")
     run = as_run(run)
     for path in (out, card, noise_file):
-        refuse_existing(path, run.folder, report, force=force)
+        refuse_existing(path, run.folder, force=force)
     kind: type[Translator] = IREN if inverse else REN
     translator = kind.of(run)
-    scores = None
-    if report is not None:
-        remedy = "give the folder that `cpunet validate` made"
-        scores = read_json(report / "metrics.json", remedy)["peaks"]
     noise = translator.backend.noise
     graph = translator.backend.graph(run.recipe.preparation.length)
     with (
@@ -96,7 +87,7 @@ def export_onnx(
     ):
         difference = write_onnx(graph, aside)
         done = Export(out, card, None if noise is None else noise_file, difference)
-        text.write_text(_card(run, translator, graph, done, scores), encoding="utf-8")
+        text.write_text(_card(run, translator, graph, done), encoding="utf-8")
         if noise is not None:
             spectra: Any = {"continua": noise.kinds, "lines": noise.lines}
             spectra |= {"shares": noise.shares, "samples": noise.samples, "dt_ns": noise.dt_ns}
@@ -107,13 +98,7 @@ def export_onnx(
     return done
 
 
-def _card(
-    run: Run,
-    translator: Translator,
-    graph: Graph,
-    done: Export,
-    scores: Mapping[str, Any] | None,
-) -> str:
+def _card(run: Run, translator: Translator, graph: Graph, done: Export) -> str:
     parts = [
         f"# {done.graph.name}\n",
         f"{type(translator).__name__} of a cpunet run: "
@@ -131,8 +116,6 @@ def _card(
         f"Pulses sampled every {translator.dt_ns:g} ns, of the detector and readout of the "
         f"data. It was trained on {run.peak}; what it does at other energies is for a "
         "validation to say. Pile-up, saturated pulses and other samplings are not covered.\n",
-        "## Scores\n",
-        *_score_table(scores),
     ]
     return "\n".join(parts)
 
@@ -229,22 +212,3 @@ def _noise(graph: Graph, done: Export) -> list[str]:
         "(in the same units), then prepare again, so that alignment and scale suffer from "
         "noise as those of data do.\n",
     ]
-
-
-def _score_table(peaks: Mapping[str, Any] | None) -> list[str]:
-    if peaks is None:
-        return ["No report was given.\n"]
-    rows = [
-        "Overlap with data (IoU) in percent; the ceiling is that of data with data.\n",
-        "| peak | parameter | overlaps |",
-        "|---|---|---|",
-    ]
-    for peak, scores in peaks.items():
-        for name, compared in scores["parameters"].items():
-            overlaps = ", ".join(
-                f"{method} {iou:.1f}"
-                for method, iou in compared["iou"].items()
-                if iou is not None
-            )
-            rows.append(f"| {peak} | {name.replace('_', ' ')} | {overlaps} |")
-    return [*rows, ""]
