@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 import cpunet
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Physics, named, priors, titled
+from cpunet.calibration.nuisances import Physics, named, titled
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import measured_noise
 from cpunet.plotting import styled
@@ -92,16 +92,17 @@ def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, A
         nominal = read_detector(detector)
         settings = SimulationSettings(**made)
         before = Physics(nominal, settings, nuisances)
-        drawn = [p.centre + p.width * rng.normal() for p in priors(before, GIVEN)]
+        centres, widths = before.priors(GIVEN)
+        drawn = centres + widths * rng.normal(size=len(widths))
         stand = cpunet.make_stand(
             Path(folder) / "stand",
             detector=detector,
             events={"FEP": events},
-            shift=_shift(before, np.array(drawn)),
+            shift=_shift(before, drawn),
             settings=[f"{name}={value}" for name, value in made.items()],
             seed=100 * group + seed,
         )
-        search, truth = _search(stand, before, np.array(drawn), seed)
+        search, truth = _search(stand, before, drawn, seed)
         calibrated = search.run()
     at = calibrated.problem.parameters.coordinates
     covariance = calibrated.covariance[-len(names) :, -len(names) :]
@@ -115,9 +116,9 @@ def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, A
         "settled": calibrated.settled,
         "seconds": time.perf_counter() - begun,
         "parameters": {
-            n.name: {"found": float(x), "true": float(t), "error": float(e), "prior": p.width}
-            for n, x, t, e, p in zip(
-                nuisances, at, truth, calibrated.errors, priors(before, GIVEN), strict=True
+            n.name: {"found": float(x), "true": float(t), "error": float(e), "prior": float(w)}
+            for n, x, t, e, w in zip(
+                nuisances, at, truth, calibrated.errors, widths, strict=True
             )
         },
         "covariance": covariance.tolist(),
@@ -161,7 +162,7 @@ def _search(
         energy_kev=sim.pulses.energy_kev,
         recipe=recipe,
         given={k: v for k, v in GIVEN.items() if k in {n.name for n in physics.nuisances}},
-        free=list(range(len(physics.nuisances))),
+        chosen=True,
     )
     return search, np.array(truth)
 

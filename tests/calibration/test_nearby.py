@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration._shape_kernels import half_maxima, move
-from cpunet.calibration.nearby import Derivative, Nearby, Simulator
+from cpunet.calibration.nearby import Derivative, Nearby, Simulator, half_maxima, move
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
@@ -30,11 +29,8 @@ def simulator(tmp_path_factory):
 
 def laid_over(pulses, others):
     """Pulses moved so that they pass half of their height where the others do."""
-    at, there, moved = np.zeros(len(pulses)), np.zeros(len(pulses)), np.empty_like(pulses)
-    half_maxima(pulses, at)
-    half_maxima(others, there)
-    move(pulses, at - there, moved)
-    return moved
+    at, there = (half_maxima(some, np.zeros(len(pulses))) for some in (pulses, others))
+    return move(pulses, at - there)
 
 
 def test_small_changes_are_those_of_a_simulation(simulator):
@@ -93,10 +89,8 @@ def test_only_derivatives_from_afar_are_simulated_again():
 def test_pulses_are_moved_where_they_are_told(width, samples):
     time = np.arange(200.0)
     pulse = (1 / (1 + np.exp(-(time - 100.3) / width)))[np.newaxis].astype(np.float32)
-    at, moved = np.zeros(1), np.empty_like(pulse)
-    half_maxima(pulse, at)
-    assert at[0] == pytest.approx(100.3, abs=0.1)
-    move(pulse, np.array([samples]), moved)
+    assert half_maxima(pulse, np.zeros(1))[0] == pytest.approx(100.3, abs=0.1)
+    moved = move(pulse, np.array([samples]))
     wanted = 1 / (1 + np.exp(-(time + samples - 100.3) / width))
     inside = slice(10, 180)
     assert np.abs(moved[0] - wanted)[inside].max() < 0.05 / width**2 + 1e-4

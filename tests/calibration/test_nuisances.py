@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration.nuisances import NUISANCES, Physics, known_before, named, priors
+from cpunet.calibration.nuisances import NUISANCES, Physics, named
 from cpunet.errors import CpunetError
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -56,27 +58,25 @@ def test_each_coordinate_reaches_what_it_names():
 def test_a_given_prior_is_told_as_it_was_given(nuisance, factor, error):
     value = factor * (PHYSICS.nominal(nuisance) or 1.0)
     value = min(max(value, nuisance.lowest), nuisance.highest)
-    one = PHYSICS.of([nuisance])
-    told = known_before(one, {nuisance.name: (value, error)})[nuisance.name]
-    assert told == pytest.approx((value, error))
+    i = NUISANCES.index(nuisance)
+    centres, widths = PHYSICS.priors({nuisance.name: (value, error)})
+    assert PHYSICS.in_own_unit(i, centres[i], widths[i]) == pytest.approx((value, error))
 
 
 def test_priors_are_the_defaults_or_those_given():
-    some = PHYSICS.of([named("temperature"), named("impurity_factor")])
-    default, given_ = priors(some, {}), priors(some, {"impurity_factor": (1.1, 0.011)})
-    assert [p.centre for p in default] == [0, 0]
-    assert given_[0] == default[0]
-    assert given_[1].centre == pytest.approx(np.log(1.1))
-    assert given_[1].width == pytest.approx(0.01)
+    some = replace(PHYSICS, nuisances=(named("temperature"), named("impurity_factor")))
+    assert some.priors({})[0].tolist() == [0, 0]
+    centres, widths = some.priors({"impurity_factor": (1.1, 0.011)})
+    assert centres == pytest.approx([0, np.log(1.1)])
+    assert widths == pytest.approx([3.0, 0.01])
 
 
 def test_what_is_not_known_or_possible_is_refused():
     with pytest.raises(CpunetError, match="no such parameter of the physics; there are temp"):
         named("colour")
-    hot = PHYSICS.of([named("li_thickness")])
     with pytest.raises(CpunetError, match="with li_thickness_mm = 5 there can be none"):
         Physics(
             PHYSICS.detector.model_copy(update={"bore_length": 90.0, "li_thickness": 3.0}),
             PHYSICS.settings,
-            hot.nuisances,
+            (named("li_thickness"),),
         ).at(np.array([2.0]))

@@ -10,7 +10,7 @@ import pytest
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.result import Calibrated, described, doubts, notes
+from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
@@ -36,7 +36,7 @@ def calibrated(values=(), given=None) -> Calibrated:
         moments=2,
         names=("first", "second"),
         by_chance=(2.0, 0.5),
-        pulls=lambda _: np.zeros(2),
+        pulls=lambda: np.zeros(2),
         residuals=lambda at: at - vector,
         jacobian=lambda at, _: np.eye(len(at)),
     )
@@ -57,7 +57,7 @@ def calibrated(values=(), given=None) -> Calibrated:
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_a_parameter_at_its_bound_is_told(factor):
     """Rounding in a coordinate does not hide it."""
-    told = notes(calibrated((85.0, factor)))
+    told = described(calibrated((85.0, factor)))["notes"]
     assert any(
         "the fit uses impurity_factor" in note and "at its bound" in note for note in told
     )
@@ -76,8 +76,9 @@ def test_a_parameter_at_its_bound_is_told(factor):
 )
 def test_what_cannot_be_is_no_finding(values, name, why):
     """In remarks, numbers, and the files that hold the physics."""
-    told = described(calibrated(values))
-    doubtful = {n for n, one in told["parameters"].items() if one["doubt"]}
+    one = calibrated(values)
+    told = described(one)
+    doubtful = {n for n, each in told["parameters"].items() if each["doubt"]}
     assert doubtful == {name}
     assert why in told["parameters"][name]["doubt"]
     assert any(
@@ -87,15 +88,16 @@ def test_what_cannot_be_is_no_finding(values, name, why):
         for note in told["notes"]
     )
     assert not any("no other physics are needed" in note for note in told["notes"])
-    comment = doubts(told["parameters"])
+    comment = doubts(free_parameters(one))
     assert comment.startswith(f"# {name}: no finding, makes up for something else")
     assert comment.count("\n") == 1
 
 
 def test_what_can_be_is_a_finding():
-    told = described(calibrated((93.9, 1.1, 0.4, 1.0, 0.11)))
-    assert not any(one["doubt"] for one in told["parameters"].values())
-    assert not doubts(told["parameters"])
+    one = calibrated((93.9, 1.1, 0.4, 1.0, 0.11))
+    told = described(one)
+    assert not any(each["doubt"] for each in told["parameters"].values())
+    assert not doubts(free_parameters(one))
     assert not told["together"]
 
 

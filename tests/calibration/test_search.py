@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration import other_chains, search
+from cpunet.calibration import alternatives, search
+from cpunet.calibration.alternatives import NEEDED, decaying_chain, other_chain
 from cpunet.calibration.identifiability import Selection
 from cpunet.calibration.inputs import Freedom, known_depletion, require_depletion
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.other_chains import NEEDED, decaying_chain, other_chain
 from cpunet.calibration.search import Search, _relaxed
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -73,7 +74,7 @@ def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
         search, "levenberg_marquardt", lambda *_: SimpleNamespace(covariance=np.eye(3))
     )
     found = Search.__new__(Search)
-    found.free = None
+    found.chosen = False
     found.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
     found._moved = lambda nearby, move, _: SimpleNamespace(centre=nearby.centre + move)
     found._problem = problem
@@ -84,7 +85,7 @@ def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
     expected = np.linalg.lstsq(columns[:, 1:2], np.array([10.0, 0, 0]))[0]
     assert only[0].parameters.coordinates == pytest.approx([0, *expected, 0])
     assert [free for free, _ in fitted[1:]] == [[1]]
-    found.free = [0]  # as given by the user
+    found.chosen = True  # by the user
     assert not found._alternatives(here, selection)
 
 
@@ -124,7 +125,9 @@ def test_a_detector_that_does_not_deplete_within_the_priors_is_refused(bias, giv
         CpunetError, match=r"within the priors it depletes at .* its bias is .*;"
     ):
         require_depletion(physics, given)
-    require_depletion(physics.of(physics.nuisances[:1]), {})  # as simulated it does
+    require_depletion(
+        replace(physics, nuisances=physics.nuisances[:1]), {}
+    )  # as simulated it does
 
 
 def test_what_is_free_and_what_is_not():
@@ -152,7 +155,7 @@ def compared(chi_square, chain=CHAIN, after=None):
         parameters=SimpleNamespace(
             chain=SimpleNamespace(response=chain), vector=lambda: np.empty(0)
         ),
-        chi_square=lambda vector: chi_square,
+        chi_square=lambda: chi_square,
         by_chance=(100.0, 10.0),
         of_chain=lambda chain: compared(after, chain),
     )
@@ -167,9 +170,9 @@ def decay_free(monkeypatch):
         called.append(fitter.decay)
         return SimpleNamespace(problem=SimpleNamespace(response=OTHER))
 
-    monkeypatch.setattr(other_chains, "_at_these_physics", lambda *_: None)
-    monkeypatch.setattr(other_chains, "with_free_decay", fit)
-    monkeypatch.setattr(other_chains, "levenberg_marquardt", lambda *_, **__: None)
+    monkeypatch.setattr(alternatives, "_at_these_physics", lambda *_: None)
+    monkeypatch.setattr(alternatives, "with_free_decay", fit)
+    monkeypatch.setattr(alternatives, "levenberg_marquardt", lambda *_, **__: None)
     return called
 
 

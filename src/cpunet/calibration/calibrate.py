@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from cpunet.calibration.calibrated_run import (
     Plan,
 )
 from cpunet.calibration.figures import calibration_figures
-from cpunet.calibration.identifiability import Information
 from cpunet.calibration.inputs import (
     DEPLETION,
     CalibrationInputs,
@@ -37,8 +36,8 @@ from cpunet.calibration.inputs import (
     require_depletion,
 )
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Physics, known_before, titled
-from cpunet.calibration.result import Calibrated, described, doubts
+from cpunet.calibration.nuisances import Physics, titled
+from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
@@ -148,22 +147,20 @@ def calibrate(
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
-    freedom = Freedom.of(free, fix, prior)
-    seed = require_seed(seed)
-    job = partial(_Job, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed)
+    given = settings, Freedom.of(free, fix, prior), peak, events, require_seed(seed)
+    act = partial(_calibrated, given, plan, force)
     if sides[1].table != ALL:
-        return _calibrated(job, plan, force, "", sides, target)
+        return act("", sides, target)
     if target is None or CHANNEL not in str(sides[0].path):
         raise CpunetError(
             f"`data_table` {ALL}: each channel is a detector with physics of its own",
             f"give `out`, and the simulation of each as `sim` sims/{CHANNEL}.lh5",
         )
-    act = partial(_calibrated, job, plan, force)
     return each_channel(paired(*sides), target, act)
 
 
 def _calibrated(
-    make: Callable[[PulseFile, PulseFile], _Job],
+    given: tuple[Recipe, Freedom, str, int, int],
     plan: bool,
     force: bool,
     _name: str,
@@ -173,7 +170,7 @@ def _calibrated(
     """Calibrate one channel, or plan to."""
     if out is not None:
         refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
-    job = make(*pair)
+    job = _Job(pair[0], pair[1], *given)
     if plan:
         planned = job.plan()
         if out is not None:
@@ -197,81 +194,92 @@ class _Job:
     events: int
     seed: int
 
+    @cached_property
+    def sides(self) -> CalibrationInputs:
+        """Both sides, read and prepared."""
+        return read_sides(self.sim, self.data, self.recipe, self.peak, self.events, self.seed)
+
     @one_thread_for_matrices()
     def run(self, folder: Path, out: Path) -> None:
         """Calibrate detector and readout together, and write all to a folder, later `out`."""
         keep_freed_memory()
         clock, started = time.perf_counter(), datetime.now(UTC)
-        sides = self._sides()
+        _ = self.sides
         with stage("Calibrating") as bar:
-            search = self._search(sides, bar.update)
+            search = self._search(bar.update)
             bar.total = search.simulations
             calibrated = search.run()
         per = calibrated.chi_square / calibrated.problem.moments
         if per > HOPELESS:
             raise CpunetError(
-                f"{self.data.path}: no physics near those of {sides.stored.detector.name} "
+                f"{self.data.path}: no physics near those of {self.sides.stored.detector.name} "
                 f"make the simulation look like it (chi-square {per:.0f} per function); is it "
                 "of another detector, or of other energies (`peak`)?"
             )
-        content = self._content(calibrated, sides)
-        if len(calibrated.alternatives) > 1:
-            self._compare(calibrated, sides, content)
+        content = self._content(calibrated)
         for note in content["notes"]:
             log.info(titled(note))
-        _simulate_calibrated(calibrated, sides, folder, self.seed, content["parameters"])
-        again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, sides.selection)
+        self._simulate_calibrated(calibrated, folder)
+        again = load_pulses(
+            PulseFile(folder / SIM), "simulated", self.recipe, self.sides.selection
+        )
         # not stretched: what is off in the drift is for the physics to explain
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
         recipe = self.recipe.model_copy(update={"training": training})
-        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, sides.data, folder)
+        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.sides.data, folder)
         run = train_chain(job, calibrated.response)
-        content["seconds"] = round(time.perf_counter() - clock, 1)
+        seconds = round(time.perf_counter() - clock, 1)
         assert run.fit is not None  # of a chain
-        content["fit"] = run.fit.model_dump(include={"chi_square", "moments", "verdict"})
-        run = run.model_copy(
-            update={
-                "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
-                "started": started.isoformat(timespec="seconds"),
-                "seconds": content["seconds"],
-                "calibration": CALIBRATION,
-            }
-        )
+        content |= {
+            "seconds": seconds,
+            "fit": run.fit.model_dump(include={"chi_square", "moments", "verdict"}),
+        }
+        changes = {
+            "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
+            "started": started.isoformat(timespec="seconds"),
+            "seconds": seconds,
+            "calibration": CALIBRATION,
+        }
         (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
         for name, figure in calibration_figures(content).items():
             figure.savefig(folder / f"{name}.png", dpi=DPI)
-        run.write(folder)
+        run.model_copy(update=changes).write(folder)
 
     @one_thread_for_matrices()
     def plan(self) -> Plan:
         """Forecast how well the pulses constrain the physics, before any fit."""
-        sides = self._sides()
+        _ = self.sides
         with stage("Planning") as bar:
-            search = self._search(sides, bar.update)
-            bar.total = 2 + 2 * len(search.simulator.physics.nuisances)
+            search = self._search(bar.update)
+            physics = search.simulator.physics
+            bar.total = 2 + 2 * len(physics.nuisances)
             information = search.plan()
-        directions = {
-            str(n): [found.describe() for found in information.for_pulses(n / 2).directions()]
-            for n in PLANNED
-        }
+        by_pulses = {str(n): information.for_pulses(n / 2) for n in PLANNED}
+        errors = {}
+        for i, (centre, width) in enumerate(zip(*physics.priors(search.given), strict=True)):
+            own = partial(physics.in_own_unit, i, float(centre))
+            errors[physics.nuisances[i].name] = {
+                "simulated": physics.nominal(physics.nuisances[i]),
+                "prior": own(width)[1],
+                "alone": {n: own(one.errors([i])[0])[1] for n, one in by_pulses.items()},
+                "all_free": {n: own(one.errors()[i])[1] for n, one in by_pulses.items()},
+            }
         return Plan(
             {
                 "cpunet": cpunet.__version__,
-                "detector": sides.stored.detector.name,
+                "detector": self.sides.stored.detector.name,
                 "pulses": list(PLANNED),
-                "errors": _errors_by_pulses(
-                    information, search.simulator.physics, search.given
-                ),
-                "directions": directions,
+                "errors": errors,
+                "directions": {
+                    n: [found.describe() for found in one.directions()]
+                    for n, one in by_pulses.items()
+                },
             }
         )
 
-    def _sides(self) -> CalibrationInputs:
-        return read_sides(self.sim, self.data, self.recipe, self.peak, self.events, self.seed)
-
-    def _search(self, sides: CalibrationInputs, simulated: Callable[[], None]) -> Search:
+    def _search(self, simulated: Callable[[], None]) -> Search:
         """The search, ready to start."""
-        measured, pulses = sides.data.prepared.pulses, sides.sim.prepared.pulses
+        sides, given = self.sides, self.freedom.priors
         preparation = self.recipe.preparation
         tails, _ = tails_of(sides.data)
         drawn = None
@@ -280,12 +288,11 @@ class _Job:
         noise, note = measured_noise(sides.data, preparation, tails)
         if note is not None:
             log.warning(note)
-        stored, given = sides.stored, self.freedom.priors
-        physics = Physics(stored.detector, stored.settings, self.freedom.looked_at)
+        physics = Physics(sides.stored.detector, sides.stored.settings, self.freedom.looked_at)
         require_depletion(physics, given)
-        hits = stored.hits[sides.sim.prepared.index]
+        pulses, measured = sides.sim.prepared.pulses, sides.data.prepared.pulses
+        hits = sides.stored.hits[sides.sim.prepared.index]
         rng = np.random.default_rng(self.seed)
-        free = self.freedom.free
         return Search(
             simulator=Simulator(hits, physics, simulated),
             sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
@@ -293,25 +300,13 @@ class _Job:
             recipe=self.recipe,
             given={k: v for k, v in given.items() if k != DEPLETION},
             known=known_depletion(physics, given.get(DEPLETION)),
-            free=None if free is None else list(range(len(free))),
+            chosen=self.freedom.free is not None,
         )
 
-    def _compare(
-        self, calibrated: Calibrated, sides: CalibrationInputs, content: dict[str, Any]
-    ) -> None:
-        """Add the physics that explain the data about as well, and what would decide."""
-        fits, hits = calibrated.alternatives, sides.stored.hits
-        rows, decide = side_by_side(fits, hits, self.recipe, sides.selection)
-        content["alternatives"], content["would_decide"] = rows, decide
-        remedy = f"`peak` {','.join([self.peak, *decide[:2]])} would decide"
-        if not decide:
-            remedy = f"none of the energies of {self.sim.path.name} would decide"
-        told = f"{len(rows) - 1} other physics explain {self.peak} as well"
-        content["notes"].append(f"{told} (alternatives): {remedy}")
-
-    def _content(self, calibrated: Calibrated, sides: CalibrationInputs) -> dict[str, Any]:
-        compared = calibrated.problem.bands
-        return {
+    def _content(self, calibrated: Calibrated) -> dict[str, Any]:
+        """Content of ``calibration.json``, but for the last fit."""
+        compared, sides = calibrated.problem.bands, self.sides
+        content = {
             "cpunet": cpunet.__version__,
             "detector": sides.stored.detector.name,
             "data": str(self.data.path),
@@ -323,45 +318,29 @@ class _Job:
             },
             **described(calibrated),
         }
+        fits = calibrated.alternatives
+        if len(fits) > 1:  # other physics explain the data about as well
+            rows, decide = side_by_side(fits, sides.stored.hits, self.recipe, sides.selection)
+            content |= {"alternatives": rows, "would_decide": decide}
+            remedy = f"`peak` {','.join([self.peak, *decide[:2]])} would decide"
+            if not decide:
+                remedy = f"none of the energies of {self.sim.path.name} would decide"
+            told = f"{len(rows) - 1} other physics explain {self.peak} as well"
+            content["notes"].append(f"{told} (alternatives): {remedy}")
+        return content
 
-
-def _simulate_calibrated(
-    calibrated: Calibrated,
-    sides: CalibrationInputs,
-    folder: Path,
-    seed: int,
-    found: Mapping[str, Any],
-) -> None:
-    """Write the calibrated physics, and all events simulated with it."""
-    parameters = calibrated.problem.parameters
-    detector, settings = calibrated.problem.nearby.simulator.physics.at(parameters.coordinates)
-    for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
-        text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-        (folder / name).write_text(doubts(found) + text, encoding="utf-8")
-    simulate(
-        folder / SIM,
-        detector=detector,
-        hits=HitFile(sides.sim.path, placed=True),
-        settings=dict(settings),
-        seed=seed,
-    )
-
-
-def _errors_by_pulses(
-    information: Information, physics: Physics, given: Mapping[str, tuple[float, float]]
-) -> dict[str, Any]:
-    """Simulated value, prior error and expected errors of each parameter, by name."""
-    found: dict[str, Any] = {}
-    before = known_before(physics, given)
-    of_pulses = {n: information.for_pulses(n / 2) for n in PLANNED}
-    for i, nuisance in enumerate(information.nuisances):
-        nominal = physics.nominal(nuisance)
-        value, error = before[nuisance.name]
-        slope = nuisance.slope(nominal, value)
-        found[nuisance.name] = {
-            "simulated": nominal,
-            "prior": error,
-            "alone": {str(n): float(slope * f.errors([i])[0]) for n, f in of_pulses.items()},
-            "all_free": {str(n): float(slope * f.errors()[i]) for n, f in of_pulses.items()},
-        }
-    return found
+    def _simulate_calibrated(self, calibrated: Calibrated, folder: Path) -> None:
+        """Write the calibrated physics, and all events simulated with it."""
+        at = calibrated.problem.parameters.coordinates
+        detector, settings = calibrated.physics.at(at)
+        comment = doubts(free_parameters(calibrated))
+        for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
+            text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+            (folder / name).write_text(comment + text, encoding="utf-8")
+        simulate(
+            folder / SIM,
+            detector=detector,
+            hits=HitFile(self.sides.sim.path, placed=True),
+            settings=dict(settings),
+            seed=self.seed,
+        )

@@ -15,7 +15,6 @@ from cpunet.calibration.nuisances import (
     Physics,
     Values,
     named,
-    priors,
 )
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import (
@@ -163,12 +162,10 @@ def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]
         If a depletion voltage, as simulated, with the values of the priors, one step of the
         impurities higher, or as measured, is above the bias.
     """
-    n = len(physics.nuisances)
-    others = {name: value for name, value in given.items() if name != DEPLETION}
-    centres = np.array([prior.centre for prior in priors(physics, others)])
+    centres, _ = physics.priors(given)
     higher = np.array([(x.name == "impurity_factor") * x.step for x in physics.nuisances])
     needed, bias = [], physics.detector.bias_V
-    for coordinates in (np.zeros(n), higher, centres):
+    for coordinates in (np.zeros(len(centres)), higher, centres):
         detector, _ = physics.at(coordinates)
         scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
         needed.append(solve(detector).depletion_V(scale, tilt) + bias - detector.bias_V)

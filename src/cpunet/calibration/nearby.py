@@ -12,18 +12,20 @@ contains the start time of a pulse. Derivatives from another point are moved wit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba import prange
 
-from cpunet.calibration._shape_kernels import half_maxima, move
 from cpunet.calibration.nuisances import Physics, Values
+from cpunet.kernels import kernel
 from cpunet.simulation.again import SameHits
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.settings import SimulationSettings
 
 FloatArray = npt.NDArray[np.float32]
 # Factors by which the sampling period is divided for alignment; the first possible one is used.
@@ -31,6 +33,46 @@ FINER = (4, 5, 3, 2, 1)
 # Root mean square of the moves of the edges, in samples, for which a derivative is moved along.
 # A longer move loses shape between the samples: a third at half a sample.
 MOVED = 0.15
+
+
+@kernel(inline="always")
+def _sample(pulse: Any, at: int, length: int) -> Any:  # pragma: no cover - compiled
+    """Sample of a pulse; 0 before its start, its last sample after its end."""
+    if at < 0:
+        return np.float32(0.0)
+    return pulse[min(at, length - 1)]
+
+
+@kernel(parallel=True)
+def half_maxima(pulses: Any, otherwise: Any) -> Any:  # pragma: no cover - compiled
+    """Sample at which each pulse reaches half its final value; `otherwise` if it does not."""
+    found = otherwise.copy()
+    for i in prange(len(pulses)):
+        pulse = pulses[i]
+        level = 0.5 * pulse[-1]
+        for j in range(1, len(pulse)):
+            if pulse[j] >= level > pulse[j - 1]:
+                found[i] = j - 1 + (level - pulse[j - 1]) / (pulse[j] - pulse[j - 1])
+                break
+    return found
+
+
+@kernel(parallel=True)
+def move(pulses: Any, samples: Any) -> Any:  # pragma: no cover - compiled
+    """Shift each pulse to the left by a number of samples, with cubic interpolation."""
+    moved = np.empty_like(pulses)
+    for i in prange(len(pulses)):
+        pulse, length = pulses[i], pulses.shape[1]
+        whole = math.floor(samples[i])
+        part = samples[i] - whole
+        for j in range(length):
+            a = _sample(pulse, j + whole - 1, length)
+            b = _sample(pulse, j + whole, length)
+            c = _sample(pulse, j + whole + 1, length)
+            d = _sample(pulse, j + whole + 2, length)
+            curved = 2 * a - 5 * b + 4 * c - d + part * (3 * (b - c) + d - a)
+            moved[i, j] = b + 0.5 * part * (c - a + part * curved)
+    return moved
 
 
 class Simulator:
@@ -51,7 +93,8 @@ class Simulator:
     ) -> None:
         self.physics, self._simulated = physics, simulated
         self._same = SameHits(hits)
-        self._finer = _finer(physics.settings)
+        steps = physics.settings.dt_ns / physics.settings.step_ns
+        self._finer = next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
 
     def exact(self, coordinates: Values) -> FloatArray:
         """Pulses as `cpunet simulate` produces them, shape (events, samples)."""
@@ -96,9 +139,8 @@ class Derivative:
 
     def moved(self, half: Values) -> FloatArray:
         """Derivatives of pulses with other half maxima: each is moved with its edge."""
-        pulses = np.empty_like(self.pulses)
-        move(self.pulses, self.half - half[: len(pulses)], pulses)
-        return pulses
+        moved: FloatArray = move(self.pulses, self.half - half[: len(self.pulses)])
+        return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +185,7 @@ class Nearby:
     @cached_property
     def half(self) -> Values:
         """Half maxima of the pulses in samples."""
-        half = np.zeros(len(self.base))
-        half_maxima(self.base, half)
+        half: Values = half_maxima(self.base, np.zeros(len(self.base)))
         return half
 
     @cached_property
@@ -158,20 +199,20 @@ class Nearby:
         Only distances along the coordinates `of` count. Derivatives are out of reach, too, if
         the edges of the pulses have moved.
         """
-        found = []
-        for i in of:
+
+        def is_known(i: int) -> bool:
             known = self.derivatives.get(i)
-            if known is not None and len(known.pulses) == len(self.base):
-                away = np.abs(self.centre - known.point)
-                if (away <= reach)[list(of)].all() and self._still(known):
-                    continue
-            found.append(i)
-        return found
+            if known is None or len(known.pulses) < len(self.base):
+                return False
+            near = np.abs(self.centre - known.point) <= reach
+            return bool(near[list(of)].all()) and self._still(known)
+
+        return [i for i in of if not is_known(i)]
 
     def unknown(self, of: Sequence[int]) -> list[int]:
         """Coordinates without derivatives for any events here."""
-        known = {i: self.derivatives.get(i) for i in of}
-        return [i for i, one in known.items() if one is None or not self._still(one)]
+        known = self.derivatives
+        return [i for i in of if i not in known or not self._still(known[i])]
 
     def _still(self, known: Derivative) -> bool:
         moved = self.half[: len(known.half)] - known.half
@@ -194,8 +235,7 @@ def _slopes(
         return {}
     physics = simulator.physics
     here = simulator.quick(centre, most)
-    half = np.zeros(len(here))
-    half_maxima(here, half)
+    half = half_maxima(here, np.zeros(len(here)))
     slopes = {}
     for i in wanted:
         nuisance = physics.nuisances[i]
@@ -209,19 +249,6 @@ def _slopes(
             there = centre.copy()
             there[i] = end
             pulses = simulator.quick(there, most)
-            at = half.copy()
-            half_maxima(pulses, at)
-            moved = np.empty_like(pulses)
-            move(pulses, at - half, moved)
-            shapes.append(simulator.coarse(moved))
+            shapes.append(simulator.coarse(move(pulses, half_maxima(pulses, half) - half)))
         slopes[i] = (shapes[1] - shapes[0]) / np.float32(ends[1] - ends[0])
     return slopes
-
-
-def _finer(settings: SimulationSettings) -> int:
-    """Number of samples into which a sampling period is divided."""
-    for parts in FINER:
-        steps = settings.dt_ns / parts / settings.step_ns
-        if steps > 1 - 1e-9 and abs(steps - round(steps)) < 1e-9:
-            return parts
-    return 1

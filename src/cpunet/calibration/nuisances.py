@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
 
 from cpunet.errors import CpunetError
+from cpunet.settings import checked
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
 
@@ -268,60 +268,36 @@ class Physics:
                 of_detector[nuisance.field] = value
             else:
                 of_settings[nuisance.field] = value
-        try:
-            return (
-                Detector.model_validate(of_detector),
-                SimulationSettings.model_validate(of_settings),
-            )
-        except ValidationError as error:
-            told = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
-            why = error.errors()[0]["msg"].removeprefix("Value error, ")
-            raise CpunetError(
-                f"detector {self.detector.name}: with {told} there can be none ({why}); "
-                "narrow a `prior`, or `fix` one of them"
-            ) from error
+        told = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
+        source = (
+            f"detector {self.detector.name}: with {told} there can be none; narrow a `prior`, "
+            "or `fix` one of them"
+        )
+        return (
+            checked(Detector, of_detector, source),
+            checked(SimulationSettings, of_settings, source),
+        )
 
-    def of(self, nuisances: Sequence[Nuisance]) -> Physics:
-        """The same detector with other parameters free."""
-        return Physics(self.detector, self.settings, tuple(nuisances))
+    def in_own_unit(self, i: int, coordinate: float, error: float) -> tuple[float, float]:
+        """Value of the parameter at position `i` at a coordinate, and its error."""
+        nuisance = self.nuisances[i]
+        nominal = self.nominal(nuisance)
+        value = nuisance.value(nominal, coordinate)
+        return value, float(nuisance.slope(nominal, value) * error)
 
+    def priors(self, given: Mapping[str, tuple[float, float]]) -> tuple[Values, Values]:
+        """Centres and widths of the coordinates before any data.
 
-class Prior(NamedTuple):
-    """Prior of a coordinate: centre and standard deviation."""
-
-    centre: float
-    width: float
-
-
-def priors(physics: Physics, given: Mapping[str, tuple[float, float]]) -> list[Prior]:
-    """Priors of the free nuisances: value and error as given, or the default around 0."""
-    found = []
-    for nuisance in physics.nuisances:
-        nominal = physics.nominal(nuisance)
-        if nuisance.name not in given:
-            found.append(Prior(0.0, nuisance.prior))
-            continue
-        value, error = given[nuisance.name]
-        width = error / nuisance.slope(nominal, value)
-        found.append(Prior(nuisance.coordinate(nominal, value), width))
-    return found
-
-
-def known_before(
-    physics: Physics, given: Mapping[str, tuple[float, float]]
-) -> dict[str, tuple[float, float]]:
-    """Value and error of each free nuisance before any data, in its own unit, by name.
-
-    Examples
-    --------
-    >>> physics = Physics(Detector.model_construct(temperature_K=90.0),
-    ...     SimulationSettings(cloud_fwhm_mm=0.1), (named("cloud"), named("temperature")))
-    >>> known_before(physics, {"cloud_fwhm_mm": (0.5, 0.05)})
-    {'cloud_fwhm_mm': (0.5, 0.05), 'temperature_K': (90.0, 3.0)}
-    """
-    found = {}
-    for nuisance, prior in zip(physics.nuisances, priors(physics, given), strict=True):
-        nominal = physics.nominal(nuisance)
-        value = nuisance.value(nominal, prior.centre)
-        found[nuisance.name] = value, nuisance.slope(nominal, value) * prior.width
-    return found
+        Parameters
+        ----------
+        given
+            Value and error by name; the others have their defaults around 0.
+        """
+        centres = np.zeros(len(self.nuisances))
+        widths = np.array([nuisance.prior for nuisance in self.nuisances])
+        for i, nuisance in enumerate(self.nuisances):
+            if nuisance.name in given:
+                nominal, (value, error) = self.nominal(nuisance), given[nuisance.name]
+                centres[i] = nuisance.coordinate(nominal, value)
+                widths[i] = error / nuisance.slope(nominal, value)
+        return centres, widths

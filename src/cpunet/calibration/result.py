@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from cpunet.calibration.alternatives import BEYOND_CHANCE
 from cpunet.calibration.identifiability import Information, together
-from cpunet.calibration.joint_problem import JointParameters, JointProblem
-from cpunet.calibration.nuisances import Nuisance, Values, known_before
-from cpunet.calibration.other_chains import BEYOND_CHANCE
+from cpunet.calibration.joint_problem import JointProblem
+from cpunet.calibration.nuisances import Physics, Values
 from cpunet.networks.response_layer import ElectronicsResponse
 
 # Offsets of a profile in errors, and steps in which the other parameters are minimised.
@@ -73,10 +73,50 @@ class Calibrated:
         return chain
 
     @property
+    def physics(self) -> Physics:
+        """Physics that the coordinates refer to."""
+        return self.problem.nearby.simulator.physics
+
+    @property
     def errors(self) -> Values:
         """Standard errors of the free coordinates."""
         n = self.problem.parameters.n_chain
         return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
+
+
+@dataclass(frozen=True)
+class FreeParameter:
+    """What was found for a free parameter, in its unit.
+
+    Parameters
+    ----------
+    value, error
+        Value, and its error with the fixed parameters as simulated.
+    error_all
+        Error with all parameters considered free.
+    simulated
+        Value as simulated.
+    doubt
+        Why the value is no finding, or None.
+    prior
+        ``value``, ``error`` and ``source``.
+    """
+
+    value: float
+    error: float
+    error_all: float
+    simulated: float
+    doubt: str | None
+    prior: Mapping[str, float | str]
+
+
+@dataclass(frozen=True)
+class FixedParameter:
+    """A parameter that is as simulated; fall of chi-square, and its error, if it were free."""
+
+    value: float
+    chi_square_would_fall_by: float
+    error_if_free: float
 
 
 def described(calibrated: Calibrated) -> dict[str, Any]:
@@ -85,22 +125,19 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``parameters``: value, error (with the parameters below as simulated), error_all (with
-        all parameters considered free), simulated value and prior of each free parameter, and
-        ``doubt``, why its value is no finding, or None; ``together``: pairs of which only a
-        combination is known, with its value and error in units of the priors;
-        ``fixed``: parameters considered but kept as simulated, with the decrease of chi-square
-        and the error expected if they were free; ``chi_square``; ``directions``;
-        ``covariance`` of chain and coordinates; ``pulls`` of the functions, before and after;
-        ``profiles``; ``notes``.
+        ``parameters`` (each a `FreeParameter`) and ``fixed`` (`FixedParameter`) by name;
+        ``together``: pairs of which only a combination is known, with its value and error in
+        units of the priors; ``chi_square``; ``directions``; ``covariance`` of chain and
+        coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
     """
     problem = calibrated.problem
     vector = problem.parameters.vector()
     mean, spread = problem.by_chance
+    free = free_parameters(calibrated)
     return {
-        "parameters": _parameters(calibrated),
+        "parameters": {name: asdict(one) for name, one in free.items()},
         "together": _together(calibrated),
-        "fixed": _fixed(calibrated),
+        "fixed": {name: asdict(one) for name, one in _fixed(calibrated).items()},
         "chi_square": {
             "before": calibrated.chi_square_before,
             "after": calibrated.chi_square,
@@ -118,112 +155,97 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
         "pulls": {
             "names": list(problem.names),
             "before": calibrated.pulls_before.tolist(),
-            "after": problem.pulls(vector).tolist(),
+            "after": problem.pulls().tolist(),
         },
         "profiles": _profiles(calibrated),
         "rounds": calibrated.rounds,
         "settled": calibrated.settled,
-        "notes": notes(calibrated),
+        "notes": notes(calibrated, free),
     }
 
 
-def notes(calibrated: Calibrated) -> list[str]:
+def notes(calibrated: Calibrated, free: Mapping[str, FreeParameter]) -> list[str]:
     """Remarks on the result of a calibration."""
     problem = calibrated.problem
     found = [
-        f"the fit uses {name} = {one['value']:.4g} to make up for something else "
-        f"({one['doubt']}): free what else moves pulses so, or give a `prior` if it can be"
+        f"the fit uses {name} = {one.value:.4g} to make up for something else "
+        f"({one.doubt}): free what else moves pulses so, or give a `prior` if it can be"
         + (f"; {ADVICE[name]}" if name in ADVICE else "")
-        for name, one in _parameters(calibrated).items()
-        if one["doubt"]
+        for name, one in free.items()
+        if one.doubt
     ]
     per = calibrated.chi_square / problem.moments
-    physics = problem.nearby.simulator.physics
-    asked = {
-        physics.nuisances[i].name: fall
-        for i, fall in calibrated.promised.items()
-        if fall > WORTH_TELLING
-    }
-    best = max(asked, key=lambda name: asked[name], default=None)
     mean, spread = (number / problem.moments for number in problem.by_chance)
     if per <= mean + BEYOND_CHANCE * spread:
         found.append(
             f"chi-square is {per:.2f} per function, as by chance ({mean:.2f} ± {spread:.2f})"
             + ("" if found else ": no other physics are needed")
         )
-    else:
-        rest = (
-            f"with {best} free, too, it would fall by {asked[best]:.0f}"
-            if best
-            else "none of the parameters looked at explains it"
-        )
-        found.append(
-            f"chi-square is {per:.2f} per function, too much for chance ({mean:.2f} ± "
-            f"{spread:.2f}); {rest}"
-        )
+        return found
+    fall, best = max(((fall, i) for i, fall in calibrated.promised.items()), default=(0.0, 0))
+    rest = "none of the parameters looked at explains it"
+    if fall > WORTH_TELLING:
+        name = calibrated.physics.nuisances[best].name
+        rest = f"with {name} free, too, it would fall by {fall:.0f}"
+    found.append(
+        f"chi-square is {per:.2f} per function, too much for chance ({mean:.2f} ± "
+        f"{spread:.2f}); {rest}"
+    )
     return found
 
 
-def doubts(parameters: Mapping[str, Any]) -> str:
+def doubts(free: Mapping[str, FreeParameter]) -> str:
     """Comment on the parameters whose values are no findings, for the files of the physics."""
-    lines = [
-        f"# {name}: no finding, makes up for something else ({one['doubt']})\n"
-        for name, one in parameters.items()
-        if one["doubt"]
-    ]
-    return "".join(lines)
+    return "".join(
+        f"# {name}: no finding, makes up for something else ({one.doubt})\n"
+        for name, one in free.items()
+        if one.doubt
+    )
 
 
-def _parameters(calibrated: Calibrated) -> dict[str, Any]:
-    """Value, errors, simulated value, prior and doubt of each free parameter, by name."""
-    problem = calibrated.problem
-    parameters, physics = problem.parameters, problem.nearby.simulator.physics
-    values = physics.values(parameters.coordinates)
-    before, n = known_before(physics, parameters.given), parameters.n_chain
+def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
+    """What was found for each free parameter, by name."""
+    parameters, physics = calibrated.problem.parameters, calibrated.physics
+    centres, widths = physics.priors(parameters.given)
     errors_all = calibrated.scale * calibrated.information.errors()
     free = {}
     for k, (i, error) in enumerate(zip(parameters.free, calibrated.errors, strict=True)):
-        nuisance = physics.nuisances[i]
-        nominal, value = physics.nominal(nuisance), values[nuisance.name]
-        slope = nuisance.slope(nominal, value)
-        centre, width = before[nuisance.name]
-        free[nuisance.name] = {
-            "value": value,
-            "error": float(slope * error),
-            "error_all": float(slope * errors_all[i]),
-            "simulated": nominal,
-            "doubt": _doubt(nuisance, value, parameters, n + k),
-            "prior": {
+        name, x = physics.nuisances[i].name, float(parameters.coordinates[i])
+        value, own_error = physics.in_own_unit(i, x, error)
+        centre, width = physics.in_own_unit(i, float(centres[i]), widths[i])
+        free[name] = FreeParameter(
+            value=value,
+            error=own_error,
+            error_all=physics.in_own_unit(i, x, errors_all[i])[1],
+            simulated=physics.nominal(physics.nuisances[i]),
+            doubt=_doubt(calibrated, k, value),
+            prior={
                 "value": centre,
                 "error": width,
-                "source": "given" if nuisance.name in parameters.given else nuisance.source,
+                "source": "given" if name in parameters.given else physics.nuisances[i].source,
             },
-        }
+        )
     return free
 
 
-def _fixed(calibrated: Calibrated) -> dict[str, Any]:
-    """Value of each fixed parameter; fall of chi-square and error if it were free."""
-    parameters = calibrated.problem.parameters
-    physics = calibrated.problem.nearby.simulator.physics
-    values, found = physics.values(parameters.coordinates), {}
+def _fixed(calibrated: Calibrated) -> dict[str, FixedParameter]:
+    """What is known of each fixed parameter, by name."""
+    parameters, physics = calibrated.problem.parameters, calibrated.physics
+    found = {}
     for i, fall in calibrated.promised.items():
-        nuisance = physics.nuisances[i]
         error = calibrated.scale * calibrated.information.errors([*parameters.free, i])[-1]
-        value = values[nuisance.name]
-        found[nuisance.name] = {
-            "value": value,
-            "chi_square_would_fall_by": fall,
-            "error_if_free": float(nuisance.slope(physics.nominal(nuisance), value) * error),
-        }
+        value, own_error = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+        found[physics.nuisances[i].name] = FixedParameter(value, fall, own_error)
     return found
 
 
-def _doubt(nuisance: Nuisance, value: float, parameters: JointParameters, k: int) -> str | None:
-    """Why the value of a parameter, number `k` of all, is no finding."""
+def _doubt(calibrated: Calibrated, k: int, value: float) -> str | None:
+    """Why the value of the free parameter number `k` is no finding."""
+    parameters = calibrated.problem.parameters
+    low, high = calibrated.physics.nuisances[parameters.free[k]].possible
+    k += parameters.n_chain
     x = parameters.vector()[k]
     off = abs(x - parameters.centre[k]) / parameters.widths[k]
-    low, high = nuisance.possible
     if x in (parameters.low[k], parameters.high[k]) and value != 0:  # none of it can be true
         return "at its bound"
     if not low <= value <= high:
@@ -247,10 +269,10 @@ def _together(calibrated: Calibrated) -> list[dict[str, Any]]:
     ]
 
 
-def _profiles(calibrated: Calibrated) -> dict[str, Any]:
+def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
     """Chi-square including priors along the valley of each free coordinate."""
     problem = calibrated.problem
-    parameters, physics = problem.parameters, problem.nearby.simulator.physics
+    parameters, physics = problem.parameters, calibrated.physics
     here, n = parameters.vector(), parameters.n_chain
     if not parameters.free:
         return {}
@@ -267,7 +289,9 @@ def _profiles(calibrated: Calibrated) -> dict[str, Any]:
         for offset in OFFSETS:
             moved = here.copy()
             moved[n + k] += offset * error
-            values.append(_unbounded(nuisance, nominal, float(moved[n + k])))
+            x = float(moved[n + k])
+            added = nuisance.kind == "added"  # told without bounds
+            values.append(nominal + x if added else nuisance.value(nominal, x))
             starts = (moved, here + offset * valley)
             costs.append(min(_lowest(problem, s, others, follow) for s in starts))
         found[nuisance.name] = {"value": values, "chi_square": costs}
@@ -285,9 +309,3 @@ def _lowest(problem: JointProblem, vector: Values, others: list[int], follow: Va
         residuals = problem.residuals(vector)
         lowest = min(lowest, float(residuals @ residuals))
     return lowest
-
-
-def _unbounded(nuisance: Nuisance, nominal: float, coordinate: float) -> float:
-    if nuisance.kind == "added":
-        return nominal + coordinate
-    return nuisance.value(nominal, coordinate)

@@ -14,12 +14,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cpunet.calibration.functions import SlicedFunctions
+from cpunet.calibration.alternatives import OTHER_CHAINS, other_chain
 from cpunet.calibration.identifiability import Information, Selection
-from cpunet.calibration.joint_problem import JointParameters, JointProblem, fewest
+from cpunet.calibration.joint_problem import (
+    JointParameters,
+    JointProblem,
+    SlicedFunctions,
+    fewest,
+)
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
-from cpunet.calibration.other_chains import OTHER_CHAINS, other_chain
 from cpunet.calibration.result import Calibrated
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -66,8 +70,9 @@ class Search:
         Priors that replace the defaults: value and error by name.
     known
         Deviations from further knowledge of the coordinates.
-    free
-        Positions of the free parameters. None for those that the data determine.
+    chosen
+        Whether all parameters are free, since a user chose them; else those that the data
+        determine.
     """
 
     simulator: Simulator
@@ -76,20 +81,20 @@ class Search:
     recipe: Recipe
     given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     known: Callable[[Values], Values] = lambda _: np.empty(0)
-    free: list[int] | None = None
+    chosen: bool = False
 
     def __post_init__(self) -> None:
         self._bands = self.sets.bands()
         self._functions = [SlicedFunctions(band.moments) for band in self._bands]
         nuisances = self.simulator.physics.nuisances
-        self._looked_at = list(range(len(nuisances))) if self.free is None else list(self.free)
-        self._first = [i for i in self._looked_at if self.free or nuisances[i].first]
+        self._all = list(range(len(nuisances)))
+        self._first = [i for i in self._all if self.chosen or nuisances[i].first]
 
     def plan(self) -> Information:
         """Information of the pulses on all parameters that may become free, before a fit."""
         few = fewest(self._bands)
-        nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._looked_at, few)
-        problem = self._problem(self._chain(), nearby, self._looked_at)
+        nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._all, few)
+        problem = self._problem(self._chain(), nearby, self._all)
         problem.few = few
         return self._looked(problem)[0]
 
@@ -162,21 +167,13 @@ class Search:
         parameters = JointParameters(
             copy.deepcopy(response), self.simulator.physics, nearby.centre, free, self.given
         )
-        return JointProblem(
-            parameters,
-            bands or self._bands,
-            self._functions,
-            nearby,
-            self.energy_kev,
-            self.recipe,
-            self.known,
-            held=held,
-        )
+        sets = parameters, bands or self._bands, self._functions, nearby, self.energy_kev
+        return JointProblem(*sets, self.recipe, self.known, held)
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
         """Parameters that are free initially."""
-        if self.free is not None:
-            return list(self.free)
+        if self.chosen:
+            return self._all
         problem = self._problem(response, nearby, self._first)
         problem.few = fewest(self._bands)
         information, selection = self._looked(problem)
@@ -204,12 +201,12 @@ class Search:
 
     def _needed(self, problem: JointProblem) -> int | None:
         """Fixed parameter that held-out pulses need most, if significant."""
-        if self.free is not None:
+        if self.chosen:
             return None
         selection, free = self._examined(problem)[2], problem.parameters.free
         falls = {
             i: selection.score(free) - selection.score([*free, i])
-            for i in self._looked_at
+            for i in self._all
             if i not in free
         }
         best = max(falls, key=lambda i: falls[i], default=None)
@@ -220,12 +217,12 @@ class Search:
     ) -> tuple[dict[int, float], Information, Selection]:
         """Expected decreases of chi-square for fixed parameters, and about all of them."""
         parameters = problem.parameters
-        fixed = [i for i in self._looked_at if i not in parameters.free]
+        fixed = [i for i in self._all if i not in parameters.free]
         missing = problem.nearby.unknown(fixed)
         few = fewest(self._bands, LOOKED_AT_WITH)
         if missing:
             problem.nearby = problem.nearby.again(missing, few)
-        whole = self._problem(parameters.chain.response, problem.nearby, self._looked_at)
+        whole = self._problem(parameters.chain.response, problem.nearby, self._all)
         whole.few = few
         whole.parameters.coordinates = parameters.coordinates.copy()
         information, selection = self._looked(whole)
@@ -260,7 +257,7 @@ class Search:
         self, problem: JointProblem, selection: Selection
     ) -> list[tuple[JointProblem, Minimum]]:
         """Fits of other sets of parameters that may explain the pulses as well."""
-        if self.free is not None:
+        if self.chosen:
             return []
         free = problem.parameters.free
         here, _ = selection.cost(free)
@@ -304,8 +301,7 @@ class Search:
             problem, found = best
             promised, information, _ = self._examined(problem)
         before.weigh_like(problem)
-        vector = before.parameters.vector()
-        chi_square = problem.chi_square(problem.parameters.vector())
+        chi_square = problem.chi_square()
         mean, spread = problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
         scale = float(np.sqrt(max(1.0, chi_square / (mean + 2 * spread))))
@@ -314,8 +310,8 @@ class Search:
         return Calibrated(
             problem=problem,
             covariance=scale**2 * found.covariance,
-            chi_square_before=before.chi_square(vector),
-            pulls_before=before.pulls(vector),
+            chi_square_before=before.chi_square(),
+            pulls_before=before.pulls(),
             chi_square=chi_square,
             scale=scale,
             information=information,
@@ -326,17 +322,12 @@ class Search:
         )
 
     def _tell(self, when: str, problem: JointProblem, found: Minimum | None = None) -> None:
-        per = problem.chi_square(problem.parameters.vector()) / problem.moments
-        told = [f"{when}: chi-square {per:.2f} per moment"]
-        if found is not None:
-            parameters, physics = problem.parameters, self.simulator.physics
-            values = physics.values(parameters.coordinates)
-            errors = np.sqrt(found.covariance.diagonal()[parameters.n_chain :])
-            for i, error in zip(parameters.free, errors, strict=True):
-                nuisance = physics.nuisances[i]
-                value = values[nuisance.name]
-                slope = nuisance.slope(physics.nominal(nuisance), value)
-                told.append(f"{nuisance.name} {value:.4g} ± {slope * error:.2g}")
+        parameters, physics = problem.parameters, self.simulator.physics
+        told = [f"{when}: chi-square {problem.chi_square() / problem.moments:.2f} per moment"]
+        errors: Values = np.empty(0) if found is None else np.sqrt(found.covariance.diagonal())
+        for i, error in zip(parameters.free, errors[parameters.n_chain :], strict=True):
+            value, own = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+            told.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
         log.info(", ".join(told))
 
 
