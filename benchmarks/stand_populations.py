@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.stand_sides import Side, stand_sides
+from cpunet.electronics.stand import Side, stand_sides
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.settings import Shift
+from cpunet.simulation.settings import Shift, SimulationSettings
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")
@@ -41,8 +41,9 @@ def main() -> None:
             read_electronics("legend200"),
             read_detector("icpc"),
             {FEP: arguments.events},
-            shift=Shift.of(["default"]),
-            seed=seed,
+            Shift.of(["default"]),
+            SimulationSettings(),
+            seed,
         )
         here = [events_of(side) for side in (sim, data)]
         for all_of_side, events in zip(sides, here, strict=True):

@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from cpunet.calibration.calibrate import calibrate
     from cpunet.calibration.calibrated_run import Calibration, Plan
     from cpunet.demonstration import demo
-    from cpunet.electronics.flattening import subtract_tails
+    from cpunet.electronics.measured import subtract_tails
     from cpunet.electronics.stand import Stand, make_stand
     from cpunet.errors import CpunetError
     from cpunet.inspection import info, load
@@ -103,7 +103,7 @@ _HOMES = {
     "calibration.calibrate": ("calibrate",),
     "calibration.calibrated_run": ("Calibration", "Plan"),
     "demonstration": ("demo",),
-    "electronics.flattening": ("subtract_tails",),
+    "electronics.measured": ("subtract_tails",),
     "electronics.stand": ("Stand", "make_stand"),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),

@@ -240,15 +240,15 @@ def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
     height = quiet.gain_adc_per_kev * traces.true_energy_kev[:, None]
     expected = traces.baseline_adc[:, None] + height * traces.response
     assert np.abs(traces.waveforms - expected).max() <= 0.51
-    assert not traces.flags.any()
+    assert not traces.flag.any()
 
 
 def test_shares_of_disturbed_traces(traces: RawTraces):
     law = TailsLaw(1.5, 54.6, read_electronics("ornl").other_pulses_kev)
-    assert np.mean(traces.flags & 1 > 0) == pytest.approx(law.share_above(0.98), abs=0.09)
+    assert np.mean(traces.flag & 1 > 0) == pytest.approx(law.share_above(0.98), abs=0.09)
     often = altered("ornl", pile_up={"rate_kHz": 36.1})
     steps = Pulses.of(np.ones((N, 900)), dt_ns=4, energy_kev=np.full(N, 1000.0))
-    piled = np.mean(read_out(steps, often, seed=1).flags & 2 > 0)
+    piled = np.mean(read_out(steps, often, seed=1).flag & 2 > 0)
     assert piled == pytest.approx(0.5, abs=0.1)  # 1 - exp(-36.1 kHz x 19.2 us)
 
 
@@ -321,7 +321,7 @@ def test_wandering_is_recovered_from_levels_and_their_changes():
 
 def test_saturation_is_flagged_and_clipped(pulses: Pulses):
     traces = read_out(pulses, altered(gain_adc_per_kev=40), seed=1)
-    saturated = traces.flags & 4 > 0
+    saturated = traces.flag & 4 > 0
     assert (traces.waveforms.max(axis=1)[saturated] == 65535).all()
     assert saturated.any()
     assert not saturated[traces.true_energy_kev < 1000].all()

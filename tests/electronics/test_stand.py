@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pytest
 
 from cpunet import load
-from cpunet.electronics import stand_sides
+from cpunet.electronics import stand as stands
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand import make_stand
 from cpunet.errors import CpunetError
@@ -62,7 +62,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         # few halvings: more places are left to the drift, the others are as good
         return build_library(maps, settings.model_copy(update={"library_halvings": 3}))
 
-    monkeypatch.setattr(stand_sides, "build_library", build)
+    monkeypatch.setattr(stands, "build_library", build)
     monkeypatch.setattr(LIMIT, sum(EVENTS.values()))
     return built
 

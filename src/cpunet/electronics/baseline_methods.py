@@ -1,17 +1,24 @@
-"""Baseline methods a user would choose instead of a network, fitted to the same datasets."""
+"""Baseline methods a user would choose instead of a network, fitted to the same datasets.
+
+Each is a linear response applied to windows: a kernel on the current, then the decay. A window
+is padded before the response is applied. No charge moves before the window, and all is
+collected by its end, so the current is zero on both sides. The padding holds the parts of the
+response outside the window and allows the window to be cut again after a later alignment.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Protocol, Self
+from dataclasses import asdict, dataclass
+from typing import ClassVar, Self
 
 import numpy as np
+import numpy.typing as npt
+import scipy.fft
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import TraceNoise
 from cpunet.electronics.finishing import (
     PADDING_AFTER,
     PADDING_BEFORE,
@@ -19,31 +26,177 @@ from cpunet.electronics.finishing import (
     finish,
     record_length,
 )
-from cpunet.electronics.fitted_kernels import GaussExp, SuperpulseKernel
-from cpunet.electronics.window_response import (
-    Values,
-    currents,
-    fitted_tail_slope,
-    integrated,
-    require_enough,
-    without_decay,
-)
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import current_amplitude
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import current_amplitude, tail_slope
 from cpunet.recipes.schema import PreparationConfig
 
+Values = npt.NDArray[np.float64]
+Spectrum = npt.NDArray[np.complex128]
 
-class BaselineMethod(Protocol):
-    """A baseline method: a causal linear response fitted to unpaired pulses."""
+MIN_PULSES = 50  # of either dataset, for a fit
+TAIL_SHARE = 0.75  # of the samples after the alignment: 300 of 400, as in the paper
 
+
+def currents(windows: FloatArray) -> Values:
+    """Charge collected per sample over the whole record, shape ``(n, record)``."""
+    n, length = windows.shape
+    record = np.zeros((n, record_length(length)))
+    record[:, PADDING_BEFORE : PADDING_BEFORE + length] = np.diff(
+        windows.astype(float), axis=1, prepend=0.0
+    )
+    return record
+
+
+def integrated(current: Values, tail_slope_per_ms: float, dt_ns: float) -> Values:
+    r"""Integrate currents to charge pulses, where each step decays exponentially.
+
+    .. math:: s_j = e^{\lambda \Delta t} s_{j-1} + x_j
+
+    Parameters
+    ----------
+    current
+        Charge collected per sample, shape ``(n, samples)``.
+    tail_slope_per_ms
+        Logarithmic slope :math:`\lambda` of the tail in 1/ms, negative for a decay.
+    dt_ns
+        Sampling period :math:`\Delta t` in ns.
+
+    Examples
+    --------
+    >>> charge = integrated(np.array([[0.0, 1.0, 0.0, 0.0]]), -20.0, 50_000.0)
+    >>> charge.round(3).tolist()  # a decay time of 50 us
+    [[0.0, 1.0, 0.368, 0.135]]
+    """
+    kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -kept], current, axis=1), float)
+
+
+def respond(
+    windows: FloatArray, transfer: Spectrum, tail_slope_per_ms: float, dt_ns: float
+) -> FloatArray:
+    """Apply a kernel and a decay to windows.
+
+    Parameters
+    ----------
+    windows
+        Simulated pulses, shape ``(n, length)``.
+    transfer
+        Transfer function of the kernel at the frequencies of the record.
+    tail_slope_per_ms
+        Logarithmic slope of the tail in 1/ms, negative for a decay.
+    dt_ns
+        Sampling period in ns.
+
+    Returns
+    -------
+    numpy.ndarray
+        Records, float32, shape ``(n, record_length(length))``.
+    """
+    length = record_length(windows.shape[1])
+    records = np.empty((len(windows), length), np.float32)
+    for rows in blocks(len(windows)):
+        spectrum = scipy.fft.rfft(currents(windows[rows]), axis=1) * transfer
+        current = scipy.fft.irfft(spectrum, length, axis=1)
+        records[rows] = integrated(current, tail_slope_per_ms, dt_ns)
+    return records
+
+
+def tail_samples(length: int, align: int) -> int:
+    """Number of samples at the end of a window that contain only the decay."""
+    return max(3, int(TAIL_SHARE * (length - align)))
+
+
+def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
+    """Median logarithmic slope of the tails, in 1/ms.
+
+    Raises
+    ------
+    CpunetError
+        If no tail is positive.
+    """
+    slopes = tail_slope(data, dt_ns, tail_samples(data.shape[1], align))
+    slopes = slopes[np.isfinite(slopes)]
+    if not slopes.size:
+        raise CpunetError("no measured pulse has a positive tail; check their polarity")
+    return float(np.median(slopes))
+
+
+def without_decay(
+    data: FloatArray, tail_slope_per_ms: float, dt_ns: float, align: int
+) -> Values:
+    r"""Undo the decay (pole-zero correction) and scale the pulses to unit height.
+
+    .. math:: x_j = \sum_{k \le j} \left(s_k - e^{\lambda \Delta t} s_{k-1}\right)
+
+    with the logarithmic slope :math:`\lambda` of the tail.
+
+    Parameters
+    ----------
+    data
+        Windows of shape ``(n, length)`` with the baseline at 0.
+    tail_slope_per_ms
+        Logarithmic slope of the tail in 1/ms.
+    dt_ns
+        Sampling period in ns.
+    align
+        Sample at which the windows are aligned.
+
+    Examples
+    --------
+    An exponential decay becomes a step.
+
+    >>> decay = np.r_[np.zeros(10), np.exp(-np.arange(30) * 0.016 / 50)]  # 50 us
+    >>> without_decay(decay[np.newaxis], -20.0, 16.0, 10)[0, [9, 10, 39]].round(6).tolist()
+    [0.0, 1.0, 1.0]
+    """
+    kept = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
+    current = data.astype(float)
+    current[:, 1:] -= kept * data[:, :-1]
+    steps = np.cumsum(current, axis=1)
+    heights = steps[:, -tail_samples(data.shape[1], align) :].mean(axis=1, keepdims=True)
+    return np.asarray(steps / heights, float)
+
+
+def fitted_decay(
+    sim: FloatArray, data: FloatArray, dt_ns: float, align: int, most: int
+) -> tuple[float, FloatArray]:
+    """Tail slope (1/ms) of the data, and the first `most` of these without it.
+
+    Raises
+    ------
+    CpunetError
+        If a side has too few pulses, or no tail is positive.
+    """
+    require_enough(sim, data)
+    slope = fitted_tail_slope(data, dt_ns, align)
+    return slope, without_decay(data[:most], slope, dt_ns, align).astype(np.float32)
+
+
+def require_enough(sim: FloatArray, data: FloatArray) -> None:
+    """Raise a `CpunetError` unless a response can be fitted to the two datasets."""
+    for side, windows in (("simulated", sim), ("measured", data)):
+        if len(windows) < MIN_PULSES:
+            raise CpunetError(
+                f"{len(windows)} {side} pulses; give {MIN_PULSES} or more to fit a response to"
+            )
+
+
+@dataclass(frozen=True)
+class BaselineMethod(ABC):
+    """A baseline method: a causal linear response fitted to unpaired pulses.
+
+    Parameters
+    ----------
+    dt_ns
+        Sampling period in ns of the pulses in the fit.
+    """
+
+    dt_ns: float
     name: ClassVar[str]
 
-    @property
-    def dt_ns(self) -> float:
-        """Sampling period in ns of the pulses in the fit."""
-
     @classmethod
+    @abstractmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
         """Fit to simulated and measured pulses of different events.
 
@@ -62,25 +215,36 @@ class BaselineMethod(Protocol):
             If there are too few pulses.
         """
 
+    @abstractmethod
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Noise-free response to simulated windows.
 
         Returns
         -------
         numpy.ndarray
-            Records with padding on both sides of the window (see `response`), neither
+            Records with padding on both sides of the window (see `respond`), neither
             aligned nor normalised. `finishing.finish` converts them into windows.
         """
 
     def describe(self) -> Mapping[str, float]:
         """Fitted values by name. Each name ends with the unit."""
+        return {name: value for name, value in asdict(self).items() if name != "dt_ns"}
+
+    def translate_like_data(
+        self, waveforms: FloatArray, config: PreparationConfig
+    ) -> FloatArray:
+        """Windows translated and prepared like the data; a row that cannot be is NaN."""
+        windows = np.empty((len(waveforms), config.length), np.float32)
+        for rows in blocks(len(waveforms)):
+            records = self.translate(waveforms[rows])
+            windows[rows] = finish(records, config, dt_ns=self.dt_ns).windows
+        return windows
 
 
 @dataclass(frozen=True)
-class Raw:
+class Raw(BaselineMethod):
     """No electronics: the window with padding."""
 
-    dt_ns: float
     name: ClassVar[str] = "raw"
 
     @classmethod
@@ -95,10 +259,6 @@ class Raw:
         after = np.repeat(waveforms[:, -1:], PADDING_AFTER, axis=1)
         return np.concatenate([before, waveforms, after], axis=1, dtype=np.float32)
 
-    def describe(self) -> Mapping[str, float]:
-        """Nothing was fitted."""
-        return {}
-
 
 LONGEST = 64  # maximum tau, in samples
 MAX_PULSES = 4000  # maximum number of pulses in the fit
@@ -106,22 +266,19 @@ TOLERANCE = 1e-3  # precision of tau, in samples
 
 
 @dataclass(frozen=True)
-class RC:
+class RC(BaselineMethod):
     r"""A single RC integration followed by an exponential decay.
 
     .. math:: s_j = s_{j-1} + (x_{j-1} - s_{j-1})\, \Delta t / \tau
 
     Parameters
     ----------
-    dt_ns
-        Sampling period in ns.
     tau_ns
         Time constant of the integration in ns, at least one sampling period.
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms.
     """
 
-    dt_ns: float
     tau_ns: float
     tail_slope_per_ms: float
     name: ClassVar[str] = "rc"
@@ -136,9 +293,7 @@ class RC:
             For the reasons of `BaselineMethod.fit`, or if the data are slower than the maximum
             tau.
         """
-        require_enough(sim, data)
-        slope = fitted_tail_slope(data, dt_ns, align)
-        steps = without_decay(data[:MAX_PULSES], slope, dt_ns, align).astype(np.float32)
+        slope, steps = fitted_decay(sim, data, dt_ns, align, MAX_PULSES)
         wanted = most_frequent(current_amplitude(steps))
         window = slice(PADDING_BEFORE, PADDING_BEFORE + sim.shape[1])
         current = currents(sim[:MAX_PULSES])
@@ -166,10 +321,6 @@ class RC:
             records[rows] = integrated(current, self.tail_slope_per_ms, self.dt_ns)
         return records
 
-    def describe(self) -> Mapping[str, float]:
-        """Time constant and tail slope."""
-        return {"tau_ns": self.tau_ns, "tail_slope_per_ms": self.tail_slope_per_ms}
-
 
 def most_frequent(values: Values) -> float:
     """Median of the shortest interval that contains half of the values.
@@ -192,59 +343,3 @@ def most_frequent(values: Values) -> float:
 def _integration(current: Values, rate: float) -> Values:
     """Apply siggen's recursion. `rate` is the sampling period divided by tau."""
     return np.asarray(scipy.signal.lfilter([0.0, rate], [1.0, rate - 1.0], current), float)
-
-
-def translate_like_data(
-    method: BaselineMethod,
-    pulses: Pulses,
-    config: PreparationConfig,
-    *,
-    noise: BaselineNoise | TraceNoise | None = None,
-    seed: int | np.random.Generator = 0,
-) -> Pulses:
-    """Translate prepared simulated pulses and prepare them like the data.
-
-    Parameters
-    ----------
-    method
-        A fitted baseline method.
-    pulses
-        Prepared simulated pulses.
-    config
-        Preparation settings of the run.
-    noise, seed
-        As for `finish`, with the energies of the pulses.
-
-    Returns
-    -------
-    Pulses
-        The same events. A row is NaN if the pulse cannot be prepared.
-
-    Raises
-    ------
-    CpunetError
-        If the sampling period differs from that of the fit, or for the reasons of `finish`.
-    """
-    if not np.isclose(pulses.dt_ns, method.dt_ns):
-        raise CpunetError(
-            f"the pulses are sampled every {pulses.dt_ns:g} ns, {method.name} was fitted to "
-            f"{method.dt_ns:g} ns; resample the pulses"
-        )
-    rng = np.random.default_rng(seed)
-    windows = np.empty((len(pulses), config.length), np.float32)
-    for rows in blocks(len(pulses)):
-        part = pulses[rows]
-        windows[rows] = finish(
-            method.translate(part.waveforms),
-            config,
-            dt_ns=pulses.dt_ns,
-            noise=noise,
-            energy_kev=part.energy_kev,
-            seed=rng,
-        ).windows
-    return pulses.with_waveforms(windows)
-
-
-BASELINE_METHODS: dict[str, type[BaselineMethod]] = {
-    method.name: method for method in (Raw, RC, GaussExp, SuperpulseKernel)
-}

@@ -23,16 +23,18 @@ import numpy.typing as npt
 import scipy.fft
 import scipy.optimize
 
-from cpunet.electronics.finishing import PADDING_BEFORE, record_length
-from cpunet.electronics.window_response import (
+from cpunet.electronics.baseline_methods import (
+    RC,
+    BaselineMethod,
+    Raw,
     Spectrum,
     Values,
     currents,
+    fitted_decay,
     fitted_tail_slope,
-    require_enough,
     respond,
-    without_decay,
 )
+from cpunet.electronics.finishing import PADDING_BEFORE, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 
@@ -156,22 +158,19 @@ LONGEST = 64.0  # maximum sigma and tau, in samples
 
 
 @dataclass(frozen=True)
-class GaussExp:
+class GaussExp(BaselineMethod):
     r"""A Gaussian and an exponential kernel followed by an exponential decay.
 
     .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
 
     Parameters
     ----------
-    dt_ns
-        Sampling period in ns.
     sigma_ns, tau_ns
         Standard deviation of the Gaussian and time constant of the exponential, in ns.
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms.
     """
 
-    dt_ns: float
     sigma_ns: float
     tau_ns: float
     tail_slope_per_ms: float
@@ -180,9 +179,7 @@ class GaussExp:
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
         """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
-        require_enough(sim, data)
-        slope = fitted_tail_slope(data, dt_ns, align)
-        steps = without_decay(data[:GAUSS_PULSES], slope, dt_ns, align).astype(np.float32)
+        slope, steps = fitted_decay(sim, data, dt_ns, align, GAUSS_PULSES)
         measured = currents(steps)
         length = record_length(sim.shape[1])
         of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
@@ -216,14 +213,6 @@ class GaussExp:
         transfer = _gauss_exp(length, self.dt_ns, self.sigma_ns, self.tau_ns)
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
 
-    def describe(self) -> Mapping[str, float]:
-        """Widths of the kernel, and tail slope."""
-        return {
-            "sigma_ns": self.sigma_ns,
-            "tau_ns": self.tau_ns,
-            "tail_slope_per_ms": self.tail_slope_per_ms,
-        }
-
 
 def _gauss_exp(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spectrum:
     """Fourier transform of the kernel at the frequencies of a record."""
@@ -249,7 +238,7 @@ FADE_IN, FADE_OUT = 8, 64  # samples over which the ends of the kernel are taper
 
 
 @dataclass(frozen=True, eq=False)
-class SuperpulseKernel:
+class SuperpulseKernel(BaselineMethod):
     r"""A free kernel followed by an exponential decay.
 
     .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad
@@ -260,15 +249,12 @@ class SuperpulseKernel:
 
     Parameters
     ----------
-    dt_ns
-        Sampling period in ns.
     kernel
         Weights with a sum of 1: `LEAD` samples before zero delay and `LAG` from it on.
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms.
     """
 
-    dt_ns: float
     kernel: Values
     tail_slope_per_ms: float
     name: ClassVar[str] = "superpulse"
@@ -276,9 +262,7 @@ class SuperpulseKernel:
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
         """Divide the mean spectra, see `BaselineMethod.fit`."""
-        require_enough(sim, data)
-        slope = fitted_tail_slope(data, dt_ns, align)
-        steps = without_decay(data[:FREE_PULSES], slope, dt_ns, align).astype(np.float32)
+        slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
         length = record_length(sim.shape[1])
         current = currents(steps)
         wanted = _superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
@@ -343,3 +327,8 @@ def _transfer(kernel: Values, length: int) -> Spectrum:
     around_zero = np.zeros(length)
     around_zero[: len(kernel)] = kernel
     return np.asarray(scipy.fft.rfft(np.roll(around_zero, -LEAD)), complex)
+
+
+BASELINE_METHODS: dict[str, type[BaselineMethod]] = {
+    method.name: method for method in (Raw, RC, GaussExp, SuperpulseKernel)
+}

@@ -1,25 +1,33 @@
-"""Noise and pile-up tails of the measured side, from its baselines."""
+"""Noise and pile-up tails of the measured side, and its traces without the tails."""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+import cpunet
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import DrawnTails, passing
 from cpunet.electronics.finishing import PADDING_BEFORE
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.errors import CpunetError
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.loading import InputSet
+from cpunet.pulses.provenance import MADE_BY, SIDE
+from cpunet.pulses.reading.files import Source, pulse_file
+from cpunet.pulses.writing import PulseWriter
+from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig
 
 log = logging.getLogger(__name__)
 
 LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is stored
 NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
+_BLOCK = 4096  # traces read at a time
 MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
 
 
@@ -171,3 +179,56 @@ def _sizes(tails: PileUpTails) -> dict[str, list[float]]:
     told = np.sort(tails.kev[np.isfinite(tails.kev)])
     above = 1 - np.searchsorted(told, kev, side="right") / max(len(told), 1)
     return {"kev": kev.round(4).tolist(), "percent_above": (100 * above).round(3).tolist()}
+
+
+def subtract_tails(
+    data: Source,
+    out: str | Path,
+    *,
+    preparation: PreparationConfig | None = None,
+    force: bool = False,
+) -> PileUpTails:
+    """Write measured traces less the pile-up tails under them.
+
+    The LH5 file has the columns ``tails_kev`` and ``tails_error_kev``. Traces whose tail
+    cannot be determined are unchanged.
+
+    Parameters
+    ----------
+    data
+        Measured traces of one channel.
+    out
+        File to write.
+    preparation
+        Settings of the preparation; those of the default recipe if None.
+    force
+        Whether to replace an existing file.
+
+    Returns
+    -------
+    PileUpTails
+        The tails, measured.
+
+    Raises
+    ------
+    CpunetError
+        If the tails cannot be measured, or the file exists and `force` is off.
+    """
+    file = pulse_file(data)
+    refuse_existing(Path(out), *file.files, force=force)
+    source = file.open()
+    try:
+        config = preparation or load_recipe("fast").preparation
+        tails = PileUpTails.of(Baselines.of(source.blocks(_BLOCK), config))
+    except CpunetError as error:
+        raise CpunetError(f"{file.path}: {error}") from error
+    attrs = {MADE_BY: f"cpunet subtract_tails {cpunet.__version__}", SIDE: "measured"}
+    with PulseWriter(
+        Path(out), table="geds/raw", waveform_units="ADC", attrs=attrs, force=force
+    ) as writer:
+        for block in source.blocks(_BLOCK):
+            kev = tails.measure(block)
+            error_kev = np.where(np.isfinite(kev), tails.error_kev, np.nan)
+            columns = {"tails_kev": (kev, "keV"), "tails_error_kev": (error_kev, "keV")}
+            writer.append(tails.subtracted_from(block), columns)
+    return tails

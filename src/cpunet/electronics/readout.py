@@ -324,7 +324,7 @@ class RawTraces:
         Calibrated energies in keV, including the energy resolution.
     event_number
         Event numbers of the source.
-    flags
+    flag
         Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
         Noise-free pulses at their own clock phase in units of the full charge, without
@@ -342,7 +342,7 @@ class RawTraces:
     dt_ns: float
     energy_kev: FloatArray
     event_number: npt.NDArray[np.int64]
-    flags: npt.NDArray[np.uint8]
+    flag: npt.NDArray[np.uint8]
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
     baseline_adc: FloatArray
@@ -399,7 +399,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     )
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flags = (
+    flag = (
         np.where(other.tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
         | np.where(other.n_piled > 0, PILE_UP, 0)
         | np.where(beyond.any(axis=1), SATURATED, 0)
@@ -414,7 +414,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
             seed=int(resolution.integers(2**63)),
         ),
         event_number=pulses.event_number,
-        flags=flags,
+        flag=flag,
         response=response.astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,

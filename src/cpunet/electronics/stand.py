@@ -4,34 +4,43 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import respond
 from cpunet.electronics.readout import SATURATED, RawTraces, read_out
-from cpunet.electronics.stand_sides import LABELS, OTHER, Labels, Side, stand_sides
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
+from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, read_settings, require_seed
+from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.events import simulate_events
+from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
-from cpunet.simulation.hit_sources import wanted_events
+from cpunet.simulation.hit_sources import GammaSource, wanted_events
+from cpunet.simulation.hits import Hits
+from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
 from cpunet.tables import counted
+
+Labels = npt.NDArray[np.int64]
 
 MARKER = "stand.json"
 STAND = FolderKind(
@@ -43,14 +52,14 @@ STAND = FolderKind(
 # Events per side from which building a library of pulses (20 s on two cores) takes less time
 # than drifting their hits, about 20 each.
 _LIBRARY_FROM_EVENTS = 20_000
-# Truth about each measured trace besides its line, and its name in ``data_labels.npz``.
-OF_DATA = {
-    "flags": "flag",
-    "tails_kev": "tails_kev",
-    "n_piled": "n_piled",
-    "piled_kev": "piled_kev",
-    "piled_ns": "piled_ns",
-}
+# Truth about each measured trace besides its line, in ``data_labels.npz``.
+OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
+# What ``stand.json`` counts.
+COUNTS = ("n_sim", "n_data", "sim_lines", "data_lines", "flags")
+LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
+OTHER = 3
+# Period of the simulated pulses at the input of the chain; same as that of the library.
+_FINE_NS = 4.0
 
 
 @dataclass(repr=False)
@@ -111,17 +120,6 @@ class Stand:
     def truth(self) -> Path:
         """The file of noise-free responses of the simulated pulses."""
         return self.folder / "truth.npz"
-
-    @property
-    def counts(self) -> dict[str, Any]:
-        """Numbers of pulses, by line, and of disturbed traces."""
-        return {
-            "n_sim": self.n_sim,
-            "n_data": self.n_data,
-            "sim_lines": self.sim_lines,
-            "data_lines": self.data_lines,
-            "flags": self.flags,
-        }
 
     def __repr__(self) -> str:
         return f"<Stand {self.folder}: {self.n_sim} simulated, {self.n_data} measured>"
@@ -199,36 +197,174 @@ def make_stand(
     readout = Electronics.model_fields.keys() - {"name"}
     of_chain = {k: of_detector.pop(k) for k in [*of_detector] if k.split(".")[0] in readout}
     physics = read_settings(SimulationSettings, set_=of_settings)
-    seed, moved = require_seed(seed), Shift.of(shift) if shift else None
+    seed, moved = require_seed(seed), Shift.of(shift)
     chain = read_electronics(electronics, of_chain)
-    sim, data, readout_seed = stand_sides(
-        chain,
-        read_detector(detector, of_detector),
-        wanted_events(events, load_recipe("fast").peaks, physics.window_kev),
-        shift=moved,
-        settings=physics,
-        seed=seed,
-    )
+    wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
+    crystal = read_detector(detector, of_detector)
+    sim, data, readout_seed = stand_sides(chain, crystal, wanted, moved, physics, seed)
     mode, n_events = sim.settings.mode, sum(sim.source.events.values())
     many = mode == "library" or (mode == "auto" and n_events >= _LIBRARY_FROM_EVENTS)
     stand = Stand(Path(out), chain)
     with folder_written_aside(stand.folder, STAND, force=force) as folder:
-        library = sim.library() if many else None
+        library = build_library(sim.fields(), sim.settings) if many else None
         _write_sim(folder, sim, library, stand)
-        if many and moved is not None:
-            library = data.library()
+        if many and shift:
+            library = build_library(data.fields(), data.settings)
         _write_data(folder, data, readout_seed, library, stand)
         made = {
             "cpunet": cpunet.__version__,
-            "shift": None if moved is None else moved.model_dump(mode="json"),
+            "shift": moved.model_dump(mode="json") if shift else None,
             "seed": seed,
             "electronics": chain.model_dump(mode="json"),
             "sim": sim.provenance(),
             "data": data.provenance(),
-            "counts": stand.counts,
+            "counts": {name: getattr(stand, name) for name in COUNTS},
         }
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
     return stand
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a stand: its detector, settings of the simulation, and source of events."""
+
+    detector: Detector
+    settings: SimulationSettings
+    source: GammaSource
+
+    def provenance(self) -> dict[str, Any]:
+        """Detector, settings and hits, for ``stand.json``."""
+        return {
+            "detector": self.detector.model_dump(mode="json"),
+            "settings": self.settings.model_dump(mode="json"),
+            "hits": self.source.provenance(),
+        }
+
+    def fields(self) -> FieldMaps:
+        """Fields of the detector."""
+        with stage(f"Fields of {self.detector.name}"):
+            return compute_fields(self.detector)
+
+    def blocks(
+        self, title: str, library: PulseLibrary | None
+    ) -> Iterator[tuple[Pulses, Labels, Hits]]:
+        """Finely sampled pulses, their lines and their hits, block by block.
+
+        Energies are calibrated as in a measurement: a factor, determined from the lines in the
+        first block, corrects the median loss by charge trapping.
+
+        Raises
+        ------
+        CpunetError
+            If no event gives a signal.
+        """
+        fields = self.fields()
+        opened = self.source.open(self.detector)
+        gain = 0.0
+        with stage(title, opened.n_events) as bar:
+            for hits in opened.blocks:
+                merged = merge_hits(hits, self.detector, self.settings.cluster_mm)
+                events = simulate_events(fields, merged, self.settings, library)
+                kept = events.collected_kev > 0
+                pulses = events.pulses()
+                if len(pulses):
+                    untrapped = pulses.energy_kev + events.trapped_kev[kept]
+                    labels = labels_of(untrapped, self.source.events)
+                    gain = gain or _calibration(untrapped / pulses.energy_kev, labels)
+                    calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
+                    yield calibrated, labels, merged[kept]
+                bar.update(len(hits))
+        if not gain:
+            raise CpunetError(
+                f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
+                "give more `events`"
+            )
+
+
+def stand_sides(
+    electronics: Electronics,
+    detector: Detector,
+    events: Mapping[EnergyWindow, int],
+    shift: Shift,
+    settings: SimulationSettings,
+    seed: int,
+) -> tuple[Side, Side, int]:
+    """Sides of the simulation and of the data, and the seed of the readout.
+
+    Parameters
+    ----------
+    electronics
+        Readout chain of the data and of the truth.
+    detector
+        Detector of the simulation.
+    events
+        Number of events of each side by window.
+    shift
+        Deviations of the data's detector from the simulated one.
+    settings
+        Settings of the simulation.
+    seed
+        Seed of all random numbers.
+
+    Raises
+    ------
+    CpunetError
+        If a window has no events, the chain's period is not a multiple of that of the
+        pulses, the settings have another period, or the shifted detector is not valid.
+    """
+    for window, number in events.items():
+        if number < 1:
+            raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
+    settings = _finely_sampled(settings, electronics)
+    # seeds of the events of both sides and of the readout
+    sim_seed, data_seed, readout_seed = map(
+        int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
+    )
+    source = events, settings.source_height_mm, settings.source_radius_mm
+    sim = Side(detector, settings, GammaSource(*source, sim_seed))
+    other = shift.detector(detector), shift.settings(settings)
+    data = Side(*other, GammaSource(*source, data_seed))
+    return sim, data, readout_seed
+
+
+def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindow]) -> Labels:
+    """Labels by energy window: 0 DEP, 1 SEP, 2 FEP, 3 other; collected energies in keV."""
+    labels = np.full(len(energy_kev), OTHER)
+    for window in windows:
+        # sums of deposits are rounded
+        inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
+        labels[inside] = LABELS.get(window.name, OTHER)
+    return labels
+
+
+def _calibration(share: npt.NDArray[np.float64], labels: Labels) -> float:
+    """Median over the pulses in lines, or over all if none is in a line."""
+    of_lines = labels != OTHER
+    return float(np.median(share[of_lines] if of_lines.any() else share))
+
+
+def _finely_sampled(
+    settings: SimulationSettings, electronics: Electronics
+) -> SimulationSettings:
+    """Settings with the period of the pulses of a stand, of which the chain's is a multiple."""
+    ratio = electronics.dt_ns / _FINE_NS
+    if abs(ratio - round(ratio)) > 1e-9:
+        raise CpunetError(
+            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
+            f"{_FINE_NS:g}, the pulses' period; choose another"
+        )
+    if "dt_ns" in settings.model_fields_set and settings.dt_ns != _FINE_NS:
+        raise CpunetError(
+            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
+            "period; leave dt_ns out"
+        )
+    try:
+        return SimulationSettings.model_validate(settings.model_dump() | {"dt_ns": _FINE_NS})
+    except ValidationError as error:
+        raise CpunetError(
+            f"settings: step_ns = {settings.step_ns:g} does not divide the {_FINE_NS:g} ns of "
+            "a stand's pulses; give one that does"
+        ) from error
 
 
 def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: Stand) -> None:
@@ -281,9 +417,7 @@ def _write_data(
             for name, values in known.items():
                 values.append(getattr(traces, name))
         label = np.concatenate(labels)
-        told: dict[str, Any] = {
-            OF_DATA[name]: np.concatenate(values) for name, values in known.items()
-        }
+        told: dict[str, Any] = {n: np.concatenate(values) for n, values in known.items()}
         flag = told["flag"]
         saturated = int((flag & SATURATED > 0).sum())
         if 2 * saturated > len(flag):

@@ -16,14 +16,11 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_methods import (
-    BASELINE_METHODS,
-    BaselineMethod,
-    translate_like_data,
-)
+from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import DrawnTails, SameNoise, TraceNoise
 from cpunet.electronics.finishing import blocks, finish
+from cpunet.electronics.fitted_kernels import BASELINE_METHODS
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
@@ -174,7 +171,7 @@ class Translations:
         pulses, config = self.simulated[rows], self.ren.recipe.preparation
         found = {"raw": pulses.waveforms}
         for name, method in self.baselines.methods.items():
-            found[name] = translate_like_data(method, pulses, config).waveforms
+            found[name] = method.translate_like_data(pulses.waveforms, config)
         found["ren"] = self.ren.apply(pulses.waveforms, noise=False)
         return found if self.truth is None else found | {"truth": self.truth[rows]}
 

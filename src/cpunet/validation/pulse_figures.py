@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import blended_transform_factory
 
+from cpunet.electronics.baseline_methods import fitted_tail_slope, without_decay
 from cpunet.electronics.tails_law import TailsLaw
-from cpunet.electronics.window_response import fitted_tail_slope, without_decay
 from cpunet.plotting import COLOURS, DATA_FILL, GROUP, colours, label, linear_within, styled
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.half_maximum import BLOCK, align_half_maximum
