@@ -14,7 +14,6 @@ from scipy import signal
 from cpunet.electronics.chain import (
     Electronics,
     NoiseSpectrum,
-    electronics_names,
     read_electronics,
 )
 from cpunet.electronics.exact_response import linear_response, respond
@@ -35,6 +34,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 
+PRESETS = ("legend200", "ornl", "ringing")
 T_NS = np.arange(0, 20_000, 0.5)
 
 
@@ -71,15 +71,15 @@ def test_times_stay_in_order_and_far_enough_apart_for_residues(steps: list[int])
     assert np.abs(moved - taus).max() < 5e-3 * 40
 
 
-@pytest.mark.parametrize("name", electronics_names())
+@pytest.mark.parametrize("name", PRESETS)
 def test_impulse_is_the_derivative_of_the_step(name: str):
     chain = read_electronics(name)
-    slope = np.gradient(chain.step_response(T_NS), T_NS)
-    impulse = chain.impulse_response(T_NS)
+    slope = np.gradient(chain.transfer.step(T_NS), T_NS)
+    impulse = chain.transfer.impulse(T_NS)
     assert np.abs(slope - impulse)[1:-1].max() < 1e-4 * impulse.max() + 1e-6
 
 
-@pytest.mark.parametrize("name", electronics_names())
+@pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("fine_ns", [1, 2, 4])
 def test_sampled_steps_equal_the_analytic_ones(name: str, fine_ns: int):
     chain, shift_ns = read_electronics(name), np.array([0.0, 5.3, -20.7, 31.9])
@@ -87,19 +87,19 @@ def test_sampled_steps_equal_the_analytic_ones(name: str, fine_ns: int):
     traces = linear_response(steps, chain, shift_ns)
     inner = (np.arange(chain.length * 64) + 0.5) / 4 - chain.n_pre * chain.dt_ns
     for trace, shift in zip(traces, shift_ns, strict=True):
-        means = chain.step_response(inner - shift).reshape(chain.length, 64).mean(axis=1)
+        means = chain.transfer.step(inner - shift).reshape(chain.length, 64).mean(axis=1)
         assert np.abs(trace - means).max() < 1e-4
 
 
 def test_legend200_rises_as_measured():
-    assert 146 <= rise_ns(read_electronics("legend200").step_response(T_NS)) <= 172
+    assert 146 <= rise_ns(read_electronics("legend200").transfer.step(T_NS)) <= 172
 
 
 def test_ornl_decays_as_measured():
     chain = read_electronics("ornl")
-    late = chain.step_response([40e3, 60e3])
+    late = chain.transfer.step([40e3, 60e3])
     assert -20 / np.log(late[1] / late[0]) == pytest.approx(54.6, rel=0.01)
-    step = chain.step_response(T_NS)
+    step = chain.transfer.step(T_NS)
     # prepared pulses end at 0.80, some 6.4 us after their top
     after = step[step.argmax() + round(6400 / 0.5)] / step.max()
     assert 0.93 <= 0.80 / after <= 0.97

@@ -98,7 +98,7 @@ def test_a_step_is_that_of_the_exact_chain_averaged_over_the_period():
     spectrum = layer((55.0, 35.0)).transfer(padded)
     got = torch.fft.irfft(spectrum, padded)[:samples].numpy()
     within = (np.arange(64) + 0.5) / 64
-    wanted = chain.step_response((np.arange(samples)[:, None] + within) * DT_NS).mean(axis=1)
+    wanted = chain.transfer.step((np.arange(samples)[:, None] + within) * DT_NS).mean(axis=1)
     # no spline has the corner of a step, which no pulse of a detector has either: 0.6 % there
     np.testing.assert_allclose(got, wanted, atol=8e-3)
     np.testing.assert_allclose(got[12:], wanted[12:], atol=8e-4)

@@ -215,10 +215,10 @@ def test_the_closed_form_is_the_chain_of_the_stand():
     chain, truth = learned_chain(response, "run"), electronics(ringing=ringing)
     time_ns = np.arange(-20.0, 20_000.0, 8.0)
     np.testing.assert_allclose(
-        chain.whole.step(time_ns), truth.step_response(time_ns), atol=1e-12
+        chain.whole.step(time_ns), truth.transfer.step(time_ns), atol=1e-12
     )
     np.testing.assert_allclose(
-        chain.whole.impulse(time_ns), truth.impulse_response(time_ns), atol=1e-14
+        chain.whole.impulse(time_ns), truth.transfer.impulse(time_ns), atol=1e-14
     )
     undecayed = true_chain_of(truth).undecayed.step(time_ns)
     np.testing.assert_allclose(chain.undecayed.step(time_ns), undecayed, atol=1e-6)

@@ -101,7 +101,7 @@ def learned_rise_ns(response: ElectronicsResponse) -> float:
 @pytest.mark.parametrize("which", STARTS)
 def test_the_chain_is_found(request, which: str) -> None:
     found: Told = request.getfixturevalue(which)
-    true_rise = rise_ns(CHAIN.step_response(np.arange(4000.0)))
+    true_rise = rise_ns(CHAIN.transfer.step(np.arange(4000.0)))
     assert learned_rise_ns(found.response) == pytest.approx(true_rise, rel=0.02)
     numbers = found.response.describe()
     assert numbers["decay_us"] == pytest.approx(80, rel=0.01)
@@ -173,7 +173,7 @@ def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
     error = fit.errors["drift.stretch.1"]
     assert error < 0.03
     assert abs(numbers["drift_stretch"] - 0.25) < 4 * error
-    true_rise = rise_ns(CHAIN.step_response(np.arange(4000.0)))
+    true_rise = rise_ns(CHAIN.transfer.step(np.arange(4000.0)))
     assert learned_rise_ns(response) == pytest.approx(true_rise, rel=0.02)
     assert numbers["slow_400_ns"] == pytest.approx(0.065, rel=0.1)
 

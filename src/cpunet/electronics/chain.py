@@ -6,10 +6,9 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
+from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.settings import (
     Config,
     Fraction,
@@ -17,7 +16,6 @@ from cpunet.settings import (
     Positive,
     Samples,
     Set,
-    names,
     read_settings,
 )
 
@@ -308,55 +306,8 @@ class Electronics(Config):
             )
         return chain
 
-    def step_response(self, t_ns: npt.ArrayLike) -> FloatArray:
-        r"""Response to a unit charge at time 0; zero before it.
-
-        .. math:: r(t) = \mathcal{L}^{-1}\left[H(s) / s\right](t)
-
-        with the transfer function :math:`H` of `transfer`.
-
-        Parameters
-        ----------
-        t_ns
-            Times in ns, any shape.
-
-        Examples
-        --------
-        >>> from cpunet.electronics.chain import read_electronics
-        >>> read_electronics("legend200").step_response([-16, 0, 1000]).round(2).tolist()
-        [0.0, 0.0, 0.99]
-
-        A single decay and one pole give the difference of two exponentials.
-
-        >>> from math import exp
-        >>> chain = read_electronics("ornl").model_copy(
-        ...     update=dict(slow=None, overshoot=None, ringing=None,
-        ...                 bandwidth_poles_ns=(50.0,),
-        ...                 decays=(Decay(fraction=1.0, tau_us=50.0),))
-        ... )
-        >>> expected = (exp(-1e3 / 5e4) - exp(-1e3 / 50)) / (1 - 50 / 5e4)
-        >>> bool(abs(chain.step_response(1e3) - expected) < 1e-12)
-        True
-        """
-        return self.transfer.step(t_ns)
-
-    def impulse_response(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Impulse response in 1/ns, the derivative of `step_response`, at times in ns."""
-        return self.transfer.impulse(t_ns)
-
 
 _PRESETS = Path(__file__).parent / "presets"
-
-
-def electronics_names() -> list[str]:
-    """Names of the preset readout chains.
-
-    Examples
-    --------
-    >>> electronics_names()
-    ['legend200', 'ornl', 'ringing']
-    """
-    return names(_PRESETS)
 
 
 def read_electronics(path: str | Path | Electronics, overrides: Set = ()) -> Electronics:
@@ -365,7 +316,7 @@ def read_electronics(path: str | Path | Electronics, overrides: Set = ()) -> Ele
     Parameters
     ----------
     path
-        Name of a preset (see `electronics_names`) or a YAML file with the fields of
+        Name of a preset (ornl, legend200, ringing) or a YAML file with the fields of
         `Electronics`. Or a readout chain, for overrides.
     overrides
         Values as ``"earlier_pulses.rate_kHz=3"``.

@@ -9,7 +9,7 @@ drawn with this probability. Raw traces have not passed any cuts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -106,26 +106,17 @@ class DrawnTails:
 
     def describe(self) -> dict[str, Any]:
         """Serialise to a mapping that `of` reads."""
-        return {
-            "rate_khz": self.law.rate_khz,
-            "decay_us": self.law.decay_us,
-            "energies_kev": list(self.law.energies_kev),
-            "height": self.height,
-            "lead_us": self.lead_us,
-            "dt_ns": self.dt_ns,
-            "passed": None if self.passed is None else list(self.passed),
-        }
+        told = asdict(self)
+        law: dict[str, Any] = told.pop("law")
+        del told["decay_error_us"]
+        return law | told
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Self:
         """Read a mapping written by `describe`."""
-        law = TailsLaw(
-            float(told["rate_khz"]), float(told["decay_us"]), tuple(told["energies_kev"])
-        )
+        law = TailsLaw(told["rate_khz"], told["decay_us"], tuple(told["energies_kev"]))
         passed = None if told["passed"] is None else tuple(told["passed"])
-        return cls(
-            law, float(told["height"]), float(told["lead_us"]), float(told["dt_ns"]), passed
-        )
+        return cls(law, told["height"], told["lead_us"], told["dt_ns"], passed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -42,56 +41,6 @@ class InTracePileUp:
     kev: FloatArray
     after_ns: FloatArray
     partner: npt.NDArray[np.int64]
-
-    @classmethod
-    def draw(
-        cls,
-        n: int,
-        rate_khz: float,
-        energies_kev: Sequence[float],
-        before_ns: float,
-        record_ns: float,
-        rng: np.random.Generator,
-    ) -> Self:
-        """Draw piled-up pulses at any time of a record.
-
-        Parameters
-        ----------
-        n
-            Number of traces.
-        rate_khz
-            Rate of the pulses in kHz.
-        energies_kev
-            Quantiles of their energies in keV, see
-            `cpunet.electronics.tails_law.TailsLaw`.
-        before_ns, record_ns
-            Duration of the record before the trace's own pulse, and of the whole record, in ns.
-        rng
-            Random generator.
-
-        Raises
-        ------
-        CpunetError
-            If more than `MAX_EXPECTED` pulses are expected in a record.
-
-        Examples
-        --------
-        1 kHz in a record of 20 us corresponds to 0.02 pulses per trace.
-
-        >>> rng = np.random.default_rng(1)
-        >>> piled = InTracePileUp.draw(10_000, 1.0, (10, 2615), 5e3, 20e3, rng)
-        >>> 150 < len(piled.row) < 250, bool((piled.after_ns >= -5e3).all())
-        (True, True)
-        """
-        expected = rate_khz * 1e-6 * record_ns
-        if expected > MAX_EXPECTED:
-            raise CpunetError(
-                f"pile-up at {rate_khz:g} kHz: {expected:.3g} pulses in a record of "
-                f"{1e-3 * record_ns:.3g} us, more than {MAX_EXPECTED:g}; give a lower rate"
-            )
-        row, kev, time_us = earlier_pulses(n, rate_khz, 1e-3 * record_ns, energies_kev, rng)
-        partner = rng.integers(max(n, 1), size=len(row))
-        return cls(n, row, kev, 1e3 * time_us - before_ns, partner)
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Self:
         """Piled-up pulses of selected traces, with the traces renumbered."""
@@ -190,7 +139,7 @@ class DrawnPileUp:
     rate_khz
         Rate of the pulses in kHz.
     energies_kev
-        Quantiles of their energies in keV.
+        Quantiles of their energies in keV, see `cpunet.electronics.tails_law.TailsLaw`.
     dt_ns
         Sampling period in ns.
     """
@@ -200,12 +149,29 @@ class DrawnPileUp:
     dt_ns: float
 
     def draw(self, n: int, before: int, length: int, rng: np.random.Generator) -> InTracePileUp:
-        """Draw pulses for records of `length` samples, `before` before the own pulse."""
-        return InTracePileUp.draw(
-            n,
-            self.rate_khz,
-            self.energies_kev,
-            before * self.dt_ns,
-            length * self.dt_ns,
-            rng,
-        )
+        """Draw pulses for records of `length` samples, `before` before the own pulse.
+
+        Raises
+        ------
+        CpunetError
+            If more than `MAX_EXPECTED` pulses are expected in a record.
+
+        Examples
+        --------
+        1 kHz in a record of 20 us corresponds to 0.02 pulses per trace.
+
+        >>> rng = np.random.default_rng(1)
+        >>> piled = DrawnPileUp(1.0, (10, 2615), 20.0).draw(10_000, 250, 1000, rng)
+        >>> 150 < len(piled.row) < 250, bool((piled.after_ns >= -5e3).all())
+        (True, True)
+        """
+        record_us = 1e-3 * (length * self.dt_ns)
+        expected = self.rate_khz * 1e-3 * record_us
+        if expected > MAX_EXPECTED:
+            raise CpunetError(
+                f"pile-up at {self.rate_khz:g} kHz: {expected:.3g} pulses in a record of "
+                f"{record_us:.3g} us, more than {MAX_EXPECTED:g}; give a lower rate"
+            )
+        row, kev, time_us = earlier_pulses(n, self.rate_khz, record_us, self.energies_kev, rng)
+        partner = rng.integers(max(n, 1), size=len(row))
+        return InTracePileUp(n, row, kev, 1e3 * time_us - before * self.dt_ns, partner)

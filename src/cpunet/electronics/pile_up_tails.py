@@ -138,16 +138,6 @@ def read_baselines(
     return mean, left, np.where(np.isfinite(width), width, np.inf)
 
 
-def widest(width: FloatArray) -> float:
-    """RMS beyond which a baseline holds another pulse."""
-    finite = width[np.isfinite(width)]
-    if len(finite) < MIN_BASELINES:
-        raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
-    centre = float(np.median(finite))
-    sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))
-    return centre + max(DISTURBED * sigma, 0.1 * centre)
-
-
 def mode(values: FloatArray) -> float:
     """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
     ordered = np.sort(values)
@@ -164,14 +154,6 @@ def lower_spread(values: FloatArray) -> float:
     """Standard deviation of the side below 0, which tails do not affect."""
     below = -values[values <= 0]
     return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
-
-
-def lifted(above: FloatArray, left: FloatArray) -> bool:
-    """Whether tilted baselines are as high as their tilt implies, as with DC coupling."""
-    if len(above) < MIN_LARGE:
-        return False
-    ratio = float(np.median(above[:, : above.shape[1] // 4].mean(axis=1) / left))
-    return 1 / COUPLED < ratio < COUPLED
 
 
 def own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None:
@@ -294,7 +276,10 @@ class PileUpTails:
         level = mode(mean[quiet])
         tilted = left > LARGE * lower_spread(left[quiet])
         large = seen.values[quiet & tilted] - level
-        coupled = lifted(large, left[quiet & tilted])
+        coupled = False
+        if len(large) >= MIN_LARGE:  # with DC coupling they are as high as their tilt implies
+            high = large[:, : large.shape[1] // 4].mean(axis=1) / left[quiet & tilted]
+            coupled = 1 / COUPLED < float(np.median(high)) < COUPLED
         own = own_decay_us(large, seen.dt_ns) if coupled else None
         error: float | None = None
         if own is not None and decay_us is None:
@@ -404,7 +389,12 @@ def _read(
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
     """Mean of each baseline, tail, whether it holds no other pulse, and largest RMS."""
     mean, left, width = read_baselines(seen.values, seen.dt_ns, decay_us)
-    broadest = widest(width)
+    finite = width[np.isfinite(width)]
+    if len(finite) < MIN_BASELINES:
+        raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
+    centre = float(np.median(finite))
+    sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))
+    broadest = centre + max(DISTURBED * sigma, 0.1 * centre)
     return mean, left, width <= broadest, broadest
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,10 @@ from scipy.signal import lfilter
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum, Wander
 from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.in_trace_pile_up import DrawnPileUp
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray as PulseArray
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.simulation.gammas.sample import with_resolution
@@ -29,7 +31,7 @@ from cpunet.simulation.gammas.sample import with_resolution
 _MIN_SAMPLES = 8192
 _TRACES_AT_A_TIME = 128
 # Measured traces kept for cutting; some tens of MB.
-_MAX_BASELINES = 2000
+_MAX_BASELINES = 2048
 
 
 def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatArray:
@@ -131,17 +133,13 @@ def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.floa
             f"{path}: baselines sampled every {source.dt_ns:g} ns, the electronics every "
             f"{dt_ns:g} ns; give others as noise.baselines_file"
         )
-    kept: list[npt.NDArray[np.float32]] = []
-    for block in source.blocks(256):
-        if block.length < length:
-            raise CpunetError(
-                f"{path}: baselines of {block.length} samples are shorter than the record of "
-                f"{length}; lower length or give longer noise.baselines_file"
-            )
-        kept.append(block.waveforms - block.waveforms.mean(axis=1, keepdims=True))
-        if sum(map(len, kept)) >= _MAX_BASELINES:
-            break
-    baselines = np.concatenate(kept) if kept else np.zeros((0, length), np.float32)
+    whole = next(source.blocks(_MAX_BASELINES)).waveforms
+    if whole.shape[1] < length:
+        raise CpunetError(
+            f"{path}: baselines of {whole.shape[1]} samples are shorter than the record of "
+            f"{length}; lower length or give longer noise.baselines_file"
+        )
+    baselines = np.asarray(whole - whole.mean(axis=1, keepdims=True), np.float32)
     finite = np.isfinite(baselines).all(axis=1)
     if not finite.all():
         bad = int(np.argmin(finite))
@@ -274,14 +272,8 @@ def _add_piled(
 ) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Add piled-up pulses anywhere in the record, with shapes of randomly chosen pulses."""
     dt_ns = electronics.dt_ns
-    piled = InTracePileUp.draw(
-        len(pulses),
-        electronics.pile_up.rate_kHz,
-        electronics.other_pulses_kev,
-        electronics.n_pre * dt_ns,
-        electronics.length * dt_ns,
-        rng,
-    )
+    others = electronics.pile_up.rate_kHz, electronics.other_pulses_kev, dt_ns
+    piled = DrawnPileUp(*others).draw(len(pulses), electronics.n_pre, electronics.length, rng)
     shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
     np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
     return piled.largest()
@@ -351,8 +343,15 @@ class RawTraces:
     piled_kev: FloatArray
     piled_ns: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.waveforms)
+    def pulses(self) -> Pulses:
+        """The traces as pulses; the integers of the digitiser stay integers."""
+        return Pulses(
+            waveforms=cast(PulseArray, self.waveforms),
+            dt_ns=self.dt_ns,
+            energy_kev=self.energy_kev,
+            event_number=self.event_number,
+            peak=np.full(len(self.waveforms), ""),
+        )
 
 
 def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:

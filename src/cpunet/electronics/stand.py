@@ -7,20 +7,19 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import respond
-from cpunet.electronics.readout import SATURATED, RawTraces, read_out
+from cpunet.electronics.readout import SATURATED, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.progress import stage
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
@@ -358,13 +357,8 @@ def _finely_sampled(
             f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
             "period; leave dt_ns out"
         )
-    try:
-        return SimulationSettings.model_validate(settings.model_dump() | {"dt_ns": _FINE_NS})
-    except ValidationError as error:
-        raise CpunetError(
-            f"settings: step_ns = {settings.step_ns:g} does not divide the {_FINE_NS:g} ns of "
-            "a stand's pulses; give one that does"
-        ) from error
+    values = settings.model_dump() | {"dt_ns": _FINE_NS}
+    return checked(SimulationSettings, values, f"settings, for a stand's {_FINE_NS:g} ns")
 
 
 def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: Stand) -> None:
@@ -412,7 +406,7 @@ def _write_data(
         for fine, label, _ in side.blocks("Measured events", library):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
-            writer.append(_as_pulses(traces))
+            writer.append(traces.pulses())
             labels.append(label)
             for name, values in known.items():
                 values.append(getattr(traces, name))
@@ -442,17 +436,6 @@ def _block_means(pulses: Pulses, per_sample: int) -> Pulses:
         dt_ns=pulses.dt_ns * per_sample,
         energy_kev=pulses.energy_kev,
         event_number=pulses.event_number,
-    )
-
-
-def _as_pulses(traces: RawTraces) -> Pulses:
-    # the writer stores samples unchanged: the integers of a digitiser stay integers
-    return Pulses(
-        waveforms=cast(FloatArray, traces.waveforms),
-        dt_ns=traces.dt_ns,
-        energy_kev=traces.energy_kev,
-        event_number=traces.event_number,
-        peak=np.full(len(traces), ""),
     )
 
 

@@ -98,21 +98,25 @@ def fit_rate(
     known = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
     highest = float(np.clip(known.max(initial=0.0), 100.0, HIGHEST_KEV))
     likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
-    best = _Candidate.best(likelihood)
+    fixed = None
+    vector, gain = likelihood.best()
     if len(known):
         own = np.histogram(np.log(known), _edges(likelihood.energies))[0] / len(known)
-        recorded = _Candidate.best(likelihood, own)
-        if best.log_likelihood <= recorded.log_likelihood + WORTH:
-            best = recorded
-    expected, error = best.expected
-    energies = _quantiles(likelihood.energies, best.weights)
+        recorded, of_recorded = likelihood.best(own)
+        if gain <= of_recorded + WORTH:
+            fixed, vector, gain = own, recorded, of_recorded
+    curvature = _curvature(lambda v: -likelihood.value(v, fixed), vector, likelihood.sigma)
+    variance = float(np.linalg.pinv(curvature, hermitian=True)[0, 0])
+    expected = float(np.exp(vector[0]))
+    error = expected * float(np.sqrt(max(variance, 0.0)))
+    energies = _quantiles(likelihood.energies, likelihood.weights(vector, fixed))
     return RateFit(
         law=TailsLaw(1e3 * expected / decay_us, decay_us, energies),
         rate_error_khz=1e3 * error / decay_us,
-        level_kev=float(best.vector[1]),
-        sigma_kev=float(np.exp(best.vector[2])),
-        recorded=best.fixed is not None,
-        gain_of_law=best.log_likelihood - likelihood.without(),
+        level_kev=float(vector[1]),
+        sigma_kev=float(np.exp(vector[2])),
+        recorded=fixed is not None,
+        gain_of_law=gain - likelihood.without(),
     )
 
 
@@ -152,6 +156,35 @@ class _Likelihood:
         at = np.interp(self.kev, self.grid, density, left=0.0, right=0.0)
         return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
 
+    def value(self, vector: FloatArray, fixed: FloatArray | None) -> float:
+        """Log-likelihood, with priors, at a vector of logarithms and the level."""
+        prior = 0.0
+        if fixed is None:
+            for value, (centre, width) in zip(vector[3:], (MEDIAN, WIDTH), strict=True):
+                prior -= 0.5 * ((value - centre) / width) ** 2
+        expected, sigma = np.exp(np.clip(vector[[0, 2]], -20.0, 6.0))
+        weights = self.weights(vector, fixed)
+        return self(float(expected), float(vector[1]), float(sigma), weights) + prior
+
+    def weights(self, vector: FloatArray, fixed: FloatArray | None) -> FloatArray:
+        """Weights of the energies: fixed ones, or those of a log-normal spectrum."""
+        if fixed is not None:
+            return fixed
+        width = np.exp(np.clip(vector[4], -2.0, 2.0))
+        logs = -0.5 * ((np.log(self.energies) - vector[3]) / width) ** 2
+        weights = np.exp(logs - logs.max())
+        return np.asarray(weights / weights.sum(), float)
+
+    def best(self, fixed: FloatArray | None = None) -> tuple[FloatArray, float]:
+        """Vector and log-likelihood of the best fit, with fixed weights or a spectrum."""
+        rest = [0.0, np.log(self.sigma)]
+        if fixed is None:
+            rest += [MEDIAN[0], WIDTH[0]]
+        starts = ((start, *rest) for start in np.log([0.005, 0.1]))
+        fits = [_minimum(lambda v: -self.value(v, fixed), start) for start in starts]
+        found = min(fits, key=lambda one: float(one.fun))
+        return np.asarray(found.x, float), -float(found.fun)
+
     def without(self) -> float:
         """Maximum log-likelihood without any tails."""
         weights = np.zeros(len(self.energies))
@@ -190,66 +223,6 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
     return MAX_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """Best-fit law for one kind of spectrum."""
-
-    likelihood: _Likelihood
-    fixed: FloatArray | None
-    vector: FloatArray
-    log_likelihood: float
-
-    @classmethod
-    def best(cls, likelihood: _Likelihood, fixed: FloatArray | None = None) -> _Candidate:
-        """Fit with fixed weights of the energies, or with a log-normal spectrum."""
-        rest = [0.0, np.log(likelihood.sigma)]
-        if fixed is None:
-            rest += [MEDIAN[0], WIDTH[0]]
-        found = min(
-            (
-                _minimum(lambda v: -_value(likelihood, fixed, v), (start, *rest))
-                for start in np.log([0.005, 0.1])
-            ),
-            key=lambda one: float(one.fun),
-        )
-        vector = np.asarray(found.x, float)
-        return cls(likelihood, fixed, vector, -float(found.fun))
-
-    @property
-    def weights(self) -> FloatArray:
-        """Weights of the energies."""
-        return _weights(self.likelihood.energies, self.fixed, self.vector)
-
-    @property
-    def expected(self) -> tuple[float, float]:
-        """Expected number of pulses per decay time, and its standard error."""
-        expected = float(np.exp(self.vector[0]))
-        curvature = _curvature(
-            lambda v: -_value(self.likelihood, self.fixed, v), self.vector, self.likelihood
-        )
-        variance = float(np.linalg.pinv(curvature, hermitian=True)[0, 0])
-        return expected, expected * float(np.sqrt(max(variance, 0.0)))
-
-
-def _value(likelihood: _Likelihood, fixed: FloatArray | None, vector: FloatArray) -> float:
-    weights = _weights(likelihood.energies, fixed, vector)
-    prior = 0.0
-    if fixed is None:
-        for value, (centre, width) in zip(vector[3:], (MEDIAN, WIDTH), strict=True):
-            prior -= 0.5 * ((value - centre) / width) ** 2
-    expected, sigma = np.exp(np.clip(vector[[0, 2]], -20.0, 6.0))
-    return likelihood(float(expected), float(vector[1]), float(sigma), weights) + prior
-
-
-def _weights(energies: FloatArray, fixed: FloatArray | None, vector: FloatArray) -> FloatArray:
-    if fixed is not None:
-        return fixed
-    width = np.exp(np.clip(vector[4], -2.0, 2.0))
-    logs = -0.5 * ((np.log(energies) - vector[3]) / width) ** 2
-    weights = np.exp(logs - logs.max())
-    return np.asarray(weights / weights.sum(), float)
-
-
 def _minimum(function: Function, start: Sequence[float]) -> OptimizeResult:
     import scipy.optimize  # costs more than all the rest, and few channels come so far
 
@@ -259,9 +232,9 @@ def _minimum(function: Function, start: Sequence[float]) -> OptimizeResult:
     return scipy.optimize.minimize(function, start, method="Nelder-Mead", options=options)
 
 
-def _curvature(function: Function, at: FloatArray, likelihood: _Likelihood) -> FloatArray:
+def _curvature(function: Function, at: FloatArray, sigma_kev: float) -> FloatArray:
     """Second derivatives by finite differences."""
-    steps = np.array([0.1, 0.2 * likelihood.sigma, 0.05, 0.1, 0.1])[: len(at)]
+    steps = np.array([0.1, 0.2 * sigma_kev, 0.05, 0.1, 0.1])[: len(at)]
     moves = np.diag(steps)
     n = len(at)
     found = np.empty((n, n))
