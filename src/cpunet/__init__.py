@@ -14,89 +14,53 @@ from typing import TYPE_CHECKING, Any
 from cpunet.installation import other_package
 
 __version__ = "0.1.0"
-__all__ = [
-    "IREN",
-    "REN",
-    "Adc",
-    "Calibration",
-    "Comparison",
-    "CpunetError",
-    "FileOptions",
-    "HitFile",
-    "HitOptions",
-    "LegendParameters",
-    "LithiumLayer",
-    "Plan",
-    "PulseFile",
-    "Pulses",
-    "ReadOptions",
-    "Report",
-    "Run",
-    "Simulation",
-    "Stand",
-    "Translation",
-    "__version__",
-    "calibrate",
-    "check",
-    "compare",
-    "demo",
-    "expand_library",
-    "export_legend",
-    "export_onnx",
-    "import_weights",
-    "info",
-    "list_recipes",
-    "lithium_table",
-    "load",
-    "make_library",
-    "make_stand",
-    "merge_libraries",
-    "open_pulses",
-    "read_library",
-    "response",
-    "simulate",
-    "subtract_tails",
-    "train",
-    "translate",
-    "translate_library",
-    "tune",
-    "validate",
-]
 
 if TYPE_CHECKING:
-    from cpunet.calibration.calibrate import calibrate
-    from cpunet.calibration.calibrated_run import Calibration, Plan
-    from cpunet.demonstration import demo
-    from cpunet.electronics.measured import subtract_tails
-    from cpunet.electronics.stand import Stand, make_stand
-    from cpunet.errors import CpunetError
-    from cpunet.inspection import info, load
-    from cpunet.legend.current_library import expand_library, merge_libraries, read_library
-    from cpunet.legend.export import LegendParameters, export_legend
-    from cpunet.legend.lithium import LithiumLayer, lithium_table
-    from cpunet.legend.make_library import make_library
-    from cpunet.legend.translate_library import translate_library
-    from cpunet.pulses.container import Pulses
-    from cpunet.pulses.reading import open_pulses
-    from cpunet.pulses.reading.files import FileOptions, PulseFile, ReadOptions
-    from cpunet.recipes import list_recipes
-    from cpunet.simulation.hit_sources import HitFile
-    from cpunet.simulation.hits import HitOptions
-    from cpunet.simulation.simulate import Simulation, simulate
-    from cpunet.training.check import check
-    from cpunet.training.published import import_weights
-    from cpunet.training.response import response
-    from cpunet.training.run import Run
-    from cpunet.training.train import train
-    from cpunet.translation.export import export_onnx
-    from cpunet.translation.options import Adc
-    from cpunet.translation.translate import translate
-    from cpunet.translation.translation import Translation
-    from cpunet.translation.translator import IREN, REN
-    from cpunet.validation.compare import Comparison, compare
-    from cpunet.validation.report import Report
-    from cpunet.validation.tune import tune
-    from cpunet.validation.validate import validate
+    from cpunet.calibration.calibrate import calibrate as calibrate
+    from cpunet.calibration.calibrated_run import Calibration as Calibration
+    from cpunet.calibration.calibrated_run import Plan as Plan
+    from cpunet.demonstration import demo as demo
+    from cpunet.electronics.measured import subtract_tails as subtract_tails
+    from cpunet.electronics.stand import Stand as Stand
+    from cpunet.electronics.stand import make_stand as make_stand
+    from cpunet.errors import CpunetError as CpunetError
+    from cpunet.inspection import info as info
+    from cpunet.inspection import load as load
+    from cpunet.legend.current_library import expand_library as expand_library
+    from cpunet.legend.current_library import merge_libraries as merge_libraries
+    from cpunet.legend.current_library import read_library as read_library
+    from cpunet.legend.export import LegendParameters as LegendParameters
+    from cpunet.legend.export import export_legend as export_legend
+    from cpunet.legend.lithium import LithiumLayer as LithiumLayer
+    from cpunet.legend.lithium import lithium_table as lithium_table
+    from cpunet.legend.make_library import make_library as make_library
+    from cpunet.legend.translate_library import translate_library as translate_library
+    from cpunet.pulses.container import Pulses as Pulses
+    from cpunet.pulses.reading import open_pulses as open_pulses
+    from cpunet.pulses.reading.files import FileOptions as FileOptions
+    from cpunet.pulses.reading.files import PulseFile as PulseFile
+    from cpunet.pulses.reading.files import ReadOptions as ReadOptions
+    from cpunet.recipes import list_recipes as list_recipes
+    from cpunet.simulation.hit_sources import HitFile as HitFile
+    from cpunet.simulation.hits import HitOptions as HitOptions
+    from cpunet.simulation.simulate import Simulation as Simulation
+    from cpunet.simulation.simulate import simulate as simulate
+    from cpunet.training.check import check as check
+    from cpunet.training.published import import_weights as import_weights
+    from cpunet.training.response import response as response
+    from cpunet.training.run import Run as Run
+    from cpunet.training.train import train as train
+    from cpunet.translation.export import export_onnx as export_onnx
+    from cpunet.translation.options import Adc as Adc
+    from cpunet.translation.translate import translate as translate
+    from cpunet.translation.translation import Translation as Translation
+    from cpunet.translation.translator import IREN as IREN
+    from cpunet.translation.translator import REN as REN
+    from cpunet.validation.compare import Comparison as Comparison
+    from cpunet.validation.compare import compare as compare
+    from cpunet.validation.report import Report as Report
+    from cpunet.validation.tune import tune as tune
+    from cpunet.validation.validate import validate as validate
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _HOMES = {
@@ -107,34 +71,24 @@ _HOMES = {
     "electronics.stand": ("Stand", "make_stand"),
     "errors": ("CpunetError",),
     "inspection": ("info", "load"),
-    "simulation.hit_sources": ("HitFile",),
-    "legend.export": (
-        "LegendParameters",
-        "export_legend",
-    ),
-    "legend.lithium": (
-        "LithiumLayer",
-        "lithium_table",
-    ),
+    "legend.current_library": ("expand_library", "merge_libraries", "read_library"),
+    "legend.export": ("LegendParameters", "export_legend"),
+    "legend.lithium": ("LithiumLayer", "lithium_table"),
     "legend.make_library": ("make_library",),
-    "legend.current_library": (
-        "expand_library",
-        "merge_libraries",
-        "read_library",
-    ),
     "legend.translate_library": ("translate_library",),
-    "translation.export": ("export_onnx",),
-    "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "pulses.container": ("Pulses",),
     "pulses.reading": ("open_pulses",),
+    "pulses.reading.files": ("FileOptions", "PulseFile", "ReadOptions"),
     "recipes": ("list_recipes",),
+    "simulation.hit_sources": ("HitFile",),
     "simulation.hits": ("HitOptions",),
+    "simulation.simulate": ("Simulation", "simulate"),
     "training.check": ("check",),
     "training.published": ("import_weights",),
-    "simulation.simulate": ("Simulation", "simulate"),
     "training.response": ("response",),
     "training.run": ("Run",),
     "training.train": ("train",),
+    "translation.export": ("export_onnx",),
     "translation.options": ("Adc",),
     "translation.translate": ("translate",),
     "translation.translation": ("Translation",),
@@ -144,6 +98,7 @@ _HOMES = {
     "validation.tune": ("tune",),
     "validation.validate": ("validate",),
 }
+__all__ = sorted(["__version__", *(name for names in _HOMES.values() for name in names)])
 
 
 def __getattr__(name: str) -> Any:
@@ -156,4 +111,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

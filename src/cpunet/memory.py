@@ -1,12 +1,18 @@
-"""What the C library does with freed memory, for the whole process; only glibc is asked.
+"""Threads and memory of this process, for the whole program.
 
-Both numbers are set each time, so that no choice of an earlier job remains.
+Both numbers that the C library is told are set each time, so that no choice of an earlier job
+remains.  OpenBLAS threads wait for each other in busy loops.  The matrices here are small: a
+second thread brings no gain on idle cores.  On busy cores the other threads wait for one that
+has no core; this made scores take twelve times as long.
 """
 
 from __future__ import annotations
 
 import ctypes
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from threadpoolctl import ThreadpoolController
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # constants of glibc's malloc.h
 
@@ -34,3 +40,13 @@ def _choose(mmap_bytes: int, trim_bytes: int) -> None:
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, mmap_bytes)
         library.mallopt(_TRIM_THRESHOLD, trim_bytes)
+
+
+@contextmanager
+def one_thread_for_matrices() -> Iterator[None]:
+    """Let matrix products and decompositions use one thread; also a decorator of jobs."""
+    import scipy.linalg  # noqa: F401 - loads its own OpenBLAS, to be limited as well
+
+    # OpenBLAS only: torch can have its own library, and the matrices of networks are large
+    with ThreadpoolController().select(internal_api="openblas").limit(limits=1):
+        yield

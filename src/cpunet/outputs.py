@@ -82,7 +82,7 @@ def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
 def require_kind(target: Path, kind: FolderKind) -> None:
     """Raise a `CpunetError` if `target` is neither missing, empty nor a folder of this kind."""
     empty = target.is_dir() and not any(target.iterdir())
-    if target.exists() and not (empty or made_here(target, kind)):
+    if target.exists() and not (empty or _marker(target).get("kind") == kind.name):
         raise CpunetError(
             f"{target}: is no folder that {kind.command} made, so `force` does not replace it; "
             "choose another name"
@@ -99,11 +99,6 @@ def require_replaceable(target: Path, kind: FolderKind) -> None:
                 f"{target}: holds {name}, which cpunet did not write; move it elsewhere, or "
                 "choose another name"
             )
-
-
-def made_here(folder: Path, kind: FolderKind) -> bool:
-    """Whether a folder was made by this program and is of the given kind."""
-    return _marker(folder).get("kind") == kind.name
 
 
 def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:

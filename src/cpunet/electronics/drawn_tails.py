@@ -23,6 +23,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.cuts import CutWindows, apply_cuts
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import PreparationConfig
+from cpunet.settings import plain
 
 # Tails in keV at which the probability of passing the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
@@ -106,10 +107,9 @@ class DrawnTails:
 
     def describe(self) -> dict[str, Any]:
         """Serialise to a mapping that `of` reads."""
-        told = asdict(self)
-        law: dict[str, Any] = told.pop("law")
+        told: dict[str, Any] = plain(asdict(self))
         del told["decay_error_us"]
-        return law | told
+        return {**told.pop("law"), **told}
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Self:

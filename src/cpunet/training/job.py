@@ -20,8 +20,7 @@ from torch import nn
 
 from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
-from cpunet.matrices import one_thread_for_matrices
-from cpunet.memory import keep_freed_memory
+from cpunet.memory import keep_freed_memory, one_thread_for_matrices
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.outputs import folder_written_aside

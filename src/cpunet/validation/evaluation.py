@@ -12,7 +12,7 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.matrices import one_thread_for_matrices
+from cpunet.memory import one_thread_for_matrices
 from cpunet.plotting import NO_NOISE
 from cpunet.progress import stage
 from cpunet.pulses.loading import (
