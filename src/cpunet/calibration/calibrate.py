@@ -205,9 +205,7 @@ class _Job:
         clock, started = time.perf_counter(), datetime.now(UTC)
         _ = self.sides
         with stage("Calibrating") as bar:
-            search = self._search(bar.update)
-            bar.total = search.simulations
-            calibrated = search.run()
+            calibrated = self._search(bar.update).run()
         per = calibrated.chi_square / calibrated.problem.moments
         if per > HOPELESS:
             raise CpunetError(

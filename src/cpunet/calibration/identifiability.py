@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -58,8 +57,8 @@ class Direction:
         text = " ".join(f"{'+' if c > 0 else '−'} {abs(c):.2f} {n}" for n, c in shown)
         return text.removeprefix("+ ")
 
-    def describe(self) -> dict[str, Any]:
-        """Serialise to a mapping."""
+    def describe(self) -> dict[str, dict[str, float] | float | str]:
+        """Content for JSON."""
         return {"components": self.components, "error": self.error, "words": self.words}
 
 

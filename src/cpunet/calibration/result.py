@@ -253,7 +253,7 @@ def _doubt(calibrated: Calibrated, k: int, value: float) -> str | None:
     return f"{off:.1f} errors of its prior from it" if off > FAR else None
 
 
-def _together(calibrated: Calibrated) -> list[dict[str, Any]]:
+def _together(calibrated: Calibrated) -> list[dict[str, dict[str, float] | float | str]]:
     """Pairs of free parameters of which only a combination is known."""
     parameters = calibrated.problem.parameters
     n = parameters.n_chain

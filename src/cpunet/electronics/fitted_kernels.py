@@ -79,11 +79,6 @@ def crossing(steps: Values, fraction: float) -> Values:
     return np.asarray(np.where(known, last + (fraction - low) / rise, np.nan), float)
 
 
-def rise_times(steps: Values) -> Values:
-    """Rise times from 2 to 95 % of pulses of unit height in samples; NaN if undefined."""
-    return crossing(steps, RISE_END) - crossing(steps, RISE_START)
-
-
 def slices(current: Values) -> Groups:
     """Rows of single-site-like pulses between quantiles of rise time.
 
@@ -100,7 +95,8 @@ def slices(current: Values) -> Groups:
     CpunetError
         If too few pulses rise from baseline to top.
     """
-    rise = rise_times(np.cumsum(current, axis=1))
+    steps = np.cumsum(current, axis=1)
+    rise = crossing(steps, RISE_END) - crossing(steps, RISE_START)
     rows = np.flatnonzero(np.isfinite(rise))
     if len(rows) < 2 * SLICES / SINGLE_SITE:
         raise CpunetError(
@@ -117,10 +113,7 @@ def slices(current: Values) -> Groups:
 
 
 def superpulses(
-    spectra: Spectrum,
-    half_times: Values,
-    groups: Groups,
-    length: int,
+    spectra: Spectrum, half_times: Values, groups: Groups, length: int
 ) -> Superpulses:
     r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
 

@@ -55,6 +55,7 @@ _LIBRARY_FROM_EVENTS = 20_000
 OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 # What ``stand.json`` counts.
 COUNTS = ("n_sim", "n_data", "sim_lines", "data_lines", "flags")
+MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
 LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
 OTHER = 3
 # Period of the simulated pulses at the input of the chain; same as that of the library.
@@ -269,7 +270,8 @@ class Side:
                 if len(pulses):
                     untrapped = pulses.energy_kev + events.trapped_kev[kept]
                     labels = labels_of(untrapped, self.source.events)
-                    gain = gain or _calibration(untrapped / pulses.energy_kev, labels)
+                    share, lines = untrapped / pulses.energy_kev, labels != OTHER
+                    gain = gain or float(np.median(share[lines] if lines.any() else share))
                     calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                     yield calibrated, labels, merged[kept]
                 bar.update(len(hits))
@@ -336,12 +338,6 @@ def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindo
     return labels
 
 
-def _calibration(share: npt.NDArray[np.float64], labels: Labels) -> float:
-    """Median over the pulses in lines, or over all if none is in a line."""
-    of_lines = labels != OTHER
-    return float(np.median(share[of_lines] if of_lines.any() else share))
-
-
 def _finely_sampled(
     settings: SimulationSettings, electronics: Electronics
 ) -> SimulationSettings:
@@ -370,7 +366,7 @@ def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: St
     rows = folder / "truth.rows"
     with (
         rows.open("wb") as truth,
-        PulseWriter(folder / "sim.lh5", attrs=_made_by("simulated")) as writer,
+        PulseWriter(folder / "sim.lh5", attrs=MADE | {SIDE: "simulated"}) as writer,
     ):
         for fine, label, hits in side.blocks("Simulated events", library):
             writer.append(_block_means(fine, per_sample))
@@ -400,7 +396,10 @@ def _write_data(
     labels: list[Labels] = []
     known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in OF_DATA}
     writer = PulseWriter(
-        folder / "data.lh5", table="geds/raw", waveform_units="ADC", attrs=_made_by("measured")
+        folder / "data.lh5",
+        table="geds/raw",
+        waveform_units="ADC",
+        attrs=MADE | {SIDE: "measured"},
     )
     with writer:
         for fine, label, _ in side.blocks("Measured events", library):
@@ -442,7 +441,3 @@ def _block_means(pulses: Pulses, per_sample: int) -> Pulses:
 def _by_line(labels: Labels) -> Counter[str]:
     names = {number: name for name, number in LABELS.items()} | {OTHER: "other"}
     return Counter({name: int((labels == i).sum()) for i, name in names.items()})
-
-
-def _made_by(side: str) -> dict[str, str | float]:
-    return {MADE_BY: f"cpunet stand {cpunet.__version__}", SIDE: side}
