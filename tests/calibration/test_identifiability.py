@@ -126,8 +126,7 @@ def test_what_is_told_begins_with_what_held_out_pulses_need():
         np.zeros(2),
     )
     alike = Information(nuisances, np.full((2, 2), 100.0) / np.outer(widths, widths), widths, 1)
-    assert one.begin(alike, [0, 1]) == [1]
-    assert one.begin(alike, [0]) == [0]
+    assert one.begin(alike) == [1]
 
 
 def test_other_sets_lack_or_exchange_one():

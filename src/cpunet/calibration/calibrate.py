@@ -6,11 +6,11 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import yaml
@@ -29,10 +29,8 @@ from cpunet.calibration.calibrated_run import (
 from cpunet.calibration.figures import calibration_figures
 from cpunet.calibration.inputs import (
     DEPLETION,
-    CalibrationInputs,
     Freedom,
     known_depletion,
-    read_sides,
     require_depletion,
 )
 from cpunet.calibration.nearby import Simulator
@@ -45,14 +43,22 @@ from cpunet.memory import keep_freed_memory, one_thread_for_matrices
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.progress import stage
 from cpunet.pulses.channels import ALL, CHANNEL, Outcome, Pair, each_channel, paired
-from cpunet.pulses.loading import load_pulses
+from cpunet.pulses.loading import (
+    InputSet,
+    load_pulses,
+    require_both_sides,
+    require_same_sampling,
+)
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
+from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.simulate import simulate
 from cpunet.training.job import TrainingJob, train_chain
+from cpunet.training.moments import MIN_PULSES
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run import RUN
 
@@ -158,6 +164,7 @@ def calibrate(
     return each_channel(paired(*sides), target, act)
 
 
+@one_thread_for_matrices()
 def _calibrated(
     given: tuple[Recipe, Freedom, str, int, int],
     plan: bool,
@@ -169,7 +176,7 @@ def _calibrated(
     """Calibrate one channel, or plan to."""
     if out is not None:
         refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
-    job = _Job(pair[0], pair[1], *given)
+    job = _Job.of(pair, *given)
     if plan:
         planned = job.plan()
         if out is not None:
@@ -181,35 +188,56 @@ def _calibrated(
     return Calibration.load(out)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Job:
-    """A calibration to run or to plan, see `calibrate`."""
+    """A calibration to run or to plan, with its pulses, see `calibrate`.
 
-    sim: PulseFile
-    data: PulseFile
+    `stored` is the physics of the simulated side, with the hits of each event of its file.
+    """
+
+    sim: InputSet
+    data: InputSet
+    stored: StoredSimulation
+    selection: EnergySelection
     recipe: Recipe
     freedom: Freedom
     peak: str
-    events: int
     seed: int
 
-    @cached_property
-    def sides(self) -> CalibrationInputs:
-        """Both sides, read and prepared."""
-        return read_sides(self.sim, self.data, self.recipe, self.peak, self.events, self.seed)
+    @classmethod
+    def of(
+        cls, pair: Pair, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
+    ) -> Self:
+        """Read and prepare both sides; of the simulated one some `events`."""
+        selection = parse_selection(peak, recipe.peaks)
+        data = load_pulses(pair[1], "measured", recipe, selection)
+        stored = StoredSimulation.read(pair[0].path)
+        sim = load_pulses(pair[0], "simulated", recipe, selection)
+        require_same_sampling(sim, data)
+        for note in require_both_sides(sim, data, selection):
+            log.warning(note)
+        fewest = min(len(sim.prepared), len(data.prepared))
+        if fewest < MIN_PULSES:
+            raise CpunetError(
+                f"{fewest} pulses of {peak} on a side tell nothing of the physics, nor of the "
+                f"readout, which takes {MIN_PULSES}",
+                "give more files, or more energies as `peak`; all stays known as it was",
+            )
+        # in random order, so that any first part is a representative sample
+        rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
+        some = replace(sim, prepared=sim.prepared[rows])
+        return cls(some, data, stored, selection, recipe, freedom, peak, seed)
 
-    @one_thread_for_matrices()
     def run(self, folder: Path, out: Path) -> None:
         """Calibrate detector and readout together, and write all to a folder, later `out`."""
         keep_freed_memory()
         clock, started = time.perf_counter(), datetime.now(UTC)
-        _ = self.sides
         with stage("Calibrating") as bar:
             calibrated = self._search(bar.update).run()
         per = calibrated.chi_square / calibrated.problem.moments
         if per > HOPELESS:
             raise CpunetError(
-                f"{self.data.path}: no physics near those of {self.sides.stored.detector.name} "
+                f"{self.data.path}: no physics near those of {self.stored.detector.name} "
                 f"make the simulation look like it (chi-square {per:.0f} per function); is it "
                 "of another detector, or of other energies (`peak`)?"
             )
@@ -217,13 +245,11 @@ class _Job:
         for note in content["notes"]:
             log.info(titled(note))
         self._simulate_calibrated(calibrated, folder)
-        again = load_pulses(
-            PulseFile(folder / SIM), "simulated", self.recipe, self.sides.selection
-        )
+        again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, self.selection)
         # not stretched: what is off in the drift is for the physics to explain
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
         recipe = self.recipe.model_copy(update={"training": training})
-        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.sides.data, folder)
+        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.data, folder)
         run = train_chain(job, calibrated.response)
         seconds = round(time.perf_counter() - clock, 1)
         assert run.fit is not None  # of a chain
@@ -242,10 +268,8 @@ class _Job:
             figure.savefig(folder / f"{name}.png", dpi=DPI)
         run.model_copy(update=changes).write(folder)
 
-    @one_thread_for_matrices()
     def plan(self) -> Plan:
         """Forecast how well the pulses constrain the physics, before any fit."""
-        _ = self.sides
         with stage("Planning") as bar:
             search = self._search(bar.update)
             physics = search.simulator.physics
@@ -264,7 +288,7 @@ class _Job:
         return Plan(
             {
                 "cpunet": cpunet.__version__,
-                "detector": self.sides.stored.detector.name,
+                "detector": self.stored.detector.name,
                 "pulses": list(PLANNED),
                 "errors": errors,
                 "directions": {
@@ -276,19 +300,19 @@ class _Job:
 
     def _search(self, simulated: Callable[[], None]) -> Search:
         """The search, ready to start."""
-        sides, given = self.sides, self.freedom.priors
+        given = self.freedom.priors
         preparation = self.recipe.preparation
-        tails, _ = tails_of(sides.data)
+        tails, _ = tails_of(self.data)
         drawn = None
         if tails is not None and tails.law is not None:
-            drawn = drawn_like(tails, sides.data, preparation)
-        noise, note = measured_noise(sides.data, preparation, tails)
+            drawn = drawn_like(tails, self.data, preparation)
+        noise, note = measured_noise(self.data, preparation, tails)
         if note is not None:
             log.warning(note)
-        physics = Physics(sides.stored.detector, sides.stored.settings, self.freedom.looked_at)
+        physics = Physics(self.stored.detector, self.stored.settings, self.freedom.looked_at)
         require_depletion(physics, given)
-        pulses, measured = sides.sim.prepared.pulses, sides.data.prepared.pulses
-        hits = sides.stored.hits[sides.sim.prepared.index]
+        pulses, measured = self.sim.prepared.pulses, self.data.prepared.pulses
+        hits = self.stored.hits[self.sim.prepared.index]
         rng = np.random.default_rng(self.seed)
         return Search(
             simulator=Simulator(hits, physics, simulated),
@@ -302,10 +326,10 @@ class _Job:
 
     def _content(self, calibrated: Calibrated) -> dict[str, Any]:
         """Content of ``calibration.json``, but for the last fit."""
-        compared, sides = calibrated.problem.bands, self.sides
+        compared = calibrated.problem.bands
         content = {
             "cpunet": cpunet.__version__,
-            "detector": sides.stored.detector.name,
+            "detector": self.stored.detector.name,
             "data": str(self.data.path),
             "peak": self.peak,
             "seed": self.seed,
@@ -317,7 +341,7 @@ class _Job:
         }
         fits = calibrated.alternatives
         if len(fits) > 1:  # other physics explain the data about as well
-            rows, decide = side_by_side(fits, sides.stored.hits, self.recipe, sides.selection)
+            rows, decide = side_by_side(fits, self.stored.hits, self.recipe, self.selection)
             content |= {"alternatives": rows, "would_decide": decide}
             remedy = f"`peak` {','.join([self.peak, *decide[:2]])} would decide"
             if not decide:
@@ -337,7 +361,7 @@ class _Job:
         simulate(
             folder / SIM,
             detector=detector,
-            hits=HitFile(self.sides.sim.path, placed=True),
+            hits=HitFile(self.sim.path, placed=True),
             settings=dict(settings),
             seed=self.seed,
         )

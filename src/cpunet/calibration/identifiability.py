@@ -244,21 +244,19 @@ class Selection:
         left = self.residuals + self.jacobian @ move
         return float(left @ left), self.coordinates + move[self._n_chain :]
 
-    def begin(self, information: Information, allowed: Sequence[int]) -> list[int]:
+    def begin(self, information: Information) -> list[int]:
         """Parameters that the pulses determine, the one that held-out pulses need most first.
 
         Parameters
         ----------
         information
             Of all columns of the physics.
-        allowed
-            Columns of the physics to choose from.
         """
         chosen: list[int] = []
         while True:
             known = [
                 i
-                for i in allowed
+                for i in range(len(self.coordinates))
                 if i not in chosen
                 and information.errors([*chosen, i])[-1] < TOLD * information.widths[i]
             ]

@@ -1,36 +1,16 @@
-"""Inputs of a calibration: a simulation with its hits, a measurement, and priors."""
+"""What is free in a calibration, and what is known before: priors and a depletion voltage."""
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from cpunet.calibration.nuisances import (
-    NUISANCES,
-    Nuisance,
-    Physics,
-    Values,
-    named,
-)
+from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
 from cpunet.errors import CpunetError
-from cpunet.pulses.loading import (
-    InputSet,
-    load_pulses,
-    require_both_sides,
-    require_same_sampling,
-)
-from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.pulses.reading.files import PulseFile
-from cpunet.recipes.schema import Recipe
-from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.superposition import solve
-from cpunet.training.moments import MIN_PULSES
-
-log = logging.getLogger(__name__)
 
 DEPLETION = "depletion_voltage"
 _PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
@@ -101,56 +81,6 @@ class Freedom:
         return tuple(
             n for n in NUISANCES if n.name not in self.fixed and n.name != "li_thickness_mm"
         )
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationInputs:
-    """Both sides, read and prepared, and the physics of the simulated side.
-
-    Parameters
-    ----------
-    sim, data
-        Prepared pulses of both sides.
-    stored
-        Detector, settings and hits, one event per pulse of the file.
-    selection
-        Selected energies.
-    """
-
-    sim: InputSet
-    data: InputSet
-    stored: StoredSimulation
-    selection: EnergySelection
-
-
-def read_sides(
-    sim: PulseFile, data_file: PulseFile, recipe: Recipe, peak: str, events: int, seed: int
-) -> CalibrationInputs:
-    """Read and prepare both sides, see `cpunet.calibrate`.
-
-    Raises
-    ------
-    CpunetError
-        If an input cannot be used.
-    """
-    selection = parse_selection(peak, recipe.peaks)
-    data = load_pulses(data_file, "measured", recipe, selection)
-    stored = StoredSimulation.read(sim.path)
-    simulated = load_pulses(sim, "simulated", recipe, selection)
-    require_same_sampling(simulated, data)
-    for note in require_both_sides(simulated, data, selection):
-        log.warning(note)
-    fewest = min(len(simulated.prepared), len(data.prepared))
-    if fewest < MIN_PULSES:
-        raise CpunetError(
-            f"{fewest} pulses of {peak} on a side tell nothing of the physics, nor of the "
-            f"readout, which takes {MIN_PULSES}",
-            "give more files, or more energies as `peak`; all stays known as it was",
-        )
-    # in random order, so that any first part is a representative sample
-    rows = np.random.default_rng(seed).permutation(len(simulated.prepared))[:events]
-    some = replace(simulated, prepared=simulated.prepared[rows])
-    return CalibrationInputs(some, data, stored, selection)
 
 
 def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]) -> None:

@@ -168,7 +168,7 @@ class Search:
         problem = self._problem(response, nearby, self._first)
         problem.few = fewest(self._bands)
         information, selection = self._looked(problem)
-        return [self._first[i] for i in selection.begin(information, range(len(self._first)))]
+        return [self._first[i] for i in selection.begin(information)]
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
         """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
