@@ -122,14 +122,8 @@ class ReadoutNoise(Config):
         return self
 
 
-class EarlierPulses(Config):
-    """Pulses before the record, a Poisson process. Their tails lie under the traces."""
-
-    rate_kHz: _Rate
-
-
-class PileUp(Config):
-    """Piled-up pulses within the record, a Poisson process."""
+class OtherPulses(Config):
+    """Rate of the pulses before a trace, or within its record."""
 
     rate_kHz: _Rate
 
@@ -212,8 +206,8 @@ class Electronics(Config):
     baseline_mean_adc: NonNegative
     baseline_spread_adc: NonNegative
     trigger_jitter_ns: Annotated[float, Field(ge=0, le=MAX_JITTER_NS)]
-    earlier_pulses: EarlierPulses
-    pile_up: PileUp
+    earlier_pulses: OtherPulses
+    pile_up: OtherPulses
     other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
     hum: Hum | None = None
     wander: Wander | None = None

@@ -112,9 +112,7 @@ def slices(current: Values) -> Groups:
     ]
 
 
-def superpulses(
-    spectra: Spectrum, half_times: Values, groups: Groups, length: int
-) -> Superpulses:
+def superpulses(spectra: Spectrum, steps: Values, groups: Groups) -> Superpulses:
     r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
 
     .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
@@ -125,14 +123,13 @@ def superpulses(
     ----------
     spectra
         Spectra of the currents, shape ``(n, length // 2 + 1)``.
-    half_times
-        Sample of the half maximum of each pulse, finite in all groups.
+    steps
+        The pulses, of unit height; their half maxima are finite in all groups.
     groups
         Rows of each slice.
-    length
-        Number of samples of the records.
     """
-    turn = 2j * np.pi * scipy.fft.rfftfreq(length)
+    half_times = crossing(steps, 0.5)
+    turn = 2j * np.pi * scipy.fft.rfftfreq(steps.shape[1])
     means = np.empty((len(groups), spectra.shape[1]), complex)
     error = np.empty(means.shape)
     for k, rows in enumerate(groups):
@@ -217,7 +214,7 @@ def _gauss_exp(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spe
 def _mean_currents(spectra: Spectrum, groups: Groups, length: int) -> Values:
     """Superpulses of currents around the half maximum, shape ``(slices, 2 * EDGE)``."""
     steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
-    means = superpulses(spectra, crossing(steps, 0.5), groups, length)
+    means = superpulses(spectra, steps, groups)
     return np.asarray(
         np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)[:, : 2 * EDGE],
         float,
@@ -295,9 +292,7 @@ class SuperpulseKernel(BaselineMethod):
 
 def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
     """Superpulses of currents, aligned and sliced by their responses."""
-    steps = np.cumsum(response, axis=1)
-    half_times = crossing(steps, 0.5)
-    return superpulses(spectra, half_times, slices(response), response.shape[1])
+    return superpulses(spectra, np.cumsum(response, axis=1), slices(response))
 
 
 def _kernel(data: Superpulses, sim: Superpulses, length: int) -> Values:
