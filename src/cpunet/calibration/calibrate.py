@@ -233,7 +233,9 @@ class _Job:
         keep_freed_memory()
         clock, started = time.perf_counter(), datetime.now(UTC)
         with stage("Calibrating") as bar:
-            calibrated = self._search(bar.update).run()
+            search = self._search(bar.update)
+            bar.total = search.simulations
+            calibrated = search.run()
         per = calibrated.chi_square / calibrated.problem.moments
         if per > HOPELESS:
             raise CpunetError(

@@ -47,6 +47,7 @@ NEEDED, MAX_MORE = 25.0, 3
 # Other sets of parameters are fitted if chi-square would rise by less than this in a linear
 # forecast, and are alternatives if it does so by less than the second; most, and their rounds.
 LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
+USUAL_ROUNDS = 4  # of most searches, for the remaining time
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
 
@@ -129,6 +130,15 @@ class Search:
             last = _relaxed(moved, last)
             nearby = self._moved(nearby, last, free)
         return self._ended(problem, found, before, number, settled=settled)
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations of a usual search, for the remaining time.
+
+        Derivatives take two each: of the first parameters, of all, and for other physics.
+        """
+        others = 0 if self.chosen else MAX_OTHERS * (1 + 2 * len(self._first))
+        return USUAL_ROUNDS + 3 + 2 * (len(self._first) + self._n) + others
 
     @property
     def _n(self) -> int:
