@@ -156,6 +156,27 @@ def _missing(pulse, start, stop, height):  # type: ignore[no-untyped-def]
 
 
 @_compiled
+def crossings(waveforms, levels, stops):  # type: ignore[no-untyped-def]
+    """Times in samples of the last crossings of levels before a sample; NaN without one.
+
+    They are those of dspeed's ``interpolated_time_point_thresh``, backward and with straight
+    lines between samples, of waveforms ``(n, length)`` and levels ``(n, levels)``, searched
+    from the samples `stops`.
+    """
+    times = np.full(levels.shape, math.nan)
+    for row in range(len(waveforms)):
+        pulse = waveforms[row]
+        for column in range(levels.shape[1]):
+            level = np.float64(levels[row, column])
+            for i in range(stops[row], 1, -1):
+                before, after = np.float64(pulse[i - 1]), np.float64(pulse[i])
+                if before < level <= after or before > level >= after:
+                    times[row, column] = i - 1 + (level - before) / (after - before)
+                    break
+    return times
+
+
+@_compiled
 def missing_areas(waveforms, starts, stops):  # type: ignore[no-untyped-def]
     r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
 

@@ -161,15 +161,10 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     """
 
     def one_block(block: FloatArray) -> Values:
-        from dspeed.processors import interpolated_time_point_thresh, min_max
-
-        _, end, _, height = min_max(block)
-        # dspeed checks for a NaN start only after casting it to an integer
-        known = np.isfinite(end)
-        start = interpolated_time_point_thresh(
-            block, start_fraction * height, np.where(known, end, 0).astype(int), 0, ord("l")
-        )
-        return np.where(known, (end.astype(float) - start) * dt_ns, np.nan)
+        end = block.argmax(axis=1)
+        height = np.take_along_axis(block, end[:, np.newaxis], axis=1)
+        start = kernels.crossings(block, start_fraction * height, end)[:, 0]
+        return np.asarray((end - start) * dt_ns)
 
     return _by_blocks(one_block, waveforms, shortest=2)
 
@@ -263,7 +258,6 @@ def _by_blocks(
     values = np.empty(len(waveforms))
     for first in range(0, len(waveforms), BLOCK):
         rows = slice(first, first + BLOCK)
-        # dspeed's processors accept float32 and float64 only
         values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
     return values
 

@@ -197,17 +197,11 @@ def _of_block(
 
 def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
     """Time points and the times derived from them, in ns."""
-    from dspeed.processors import interpolated_time_point_thresh, min_max
-
-    _, top, _, height = min_max(block)
+    top, height = block.argmax(axis=1), block.max(axis=1)
     positive = height > 0  # False for NaN
-    stop = np.where(positive, top, 0).astype(np.int64)
-    thresholds = np.outer(
-        np.where(positive, height, np.nan), np.array(list(TIME_POINTS.values()))
-    )
-    samples = interpolated_time_point_thresh(
-        block[:, np.newaxis], thresholds.astype(np.float32), stop[:, np.newaxis], 0, ord("l")
-    ).astype(float)
+    stop = np.where(positive, top, 0)
+    levels = np.outer(np.where(positive, height, np.nan), np.array(list(TIME_POINTS.values())))
+    samples = kernels.crossings(block, levels.astype(np.float32), stop)
     times: dict[str, Values] = dict(
         zip(TIME_POINTS, ((samples - aligned) * dt_ns).T, strict=True)
     )
