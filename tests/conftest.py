@@ -80,7 +80,6 @@ def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     from matplotlib.figure import Figure
 
     patch.setattr("cpunet.validation.report._drawn", lambda _drawing, _bar: Figure())
-    patch.setattr("cpunet.validation.page.figure_png", lambda _figure: b"")
 
 
 @pytest.fixture

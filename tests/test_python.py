@@ -293,7 +293,7 @@ def test_every_method_and_the_truth_stand_beside_the_ren(whole: cpunet.Report) -
 @pytest.mark.thorough
 def test_a_quick_look_has_three_figures_and_says_what_it_is(whole: cpunet.Report) -> None:
     assert whole.folder is not None
-    drawn = {path.stem for path in whole.folder.glob("*.png")}
+    drawn = {path.stem for path in whole.folder.glob("*.svg")}
     assert drawn == {"SEP_mean_pulse", "SEP_current_amplitude", "SEP_single_pulse"}
     page = (whole.folder / "report.html").read_text()
     assert "This is a quick look" in page

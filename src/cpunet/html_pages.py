@@ -11,25 +11,26 @@ import re
 from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.backend_bases import FigureCanvasBase
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from cpunet.plotting import GROUP
 
-DPI = 150
 NOTEBOOK_DPI = 80
-COMPRESSION = 1  # of PNG, 0 … 9: files a tenth larger than with the usual 6, in half the time
 # in SVG: blanks, L between points, fonts, which the style sheet has, and rotations by nothing
 _NEEDLESS = (
     r"""\n *(?=<)| \n(?="|z)|\nL |font-family: [^;"]*(; )?| transform="rotate\(-0 [^"]*\""""
 )
+# what an element of a page has from the page and its style sheet
+_ALONE = """xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"
+ font-family="DejaVu Sans, Verdana, sans-serif" stroke-linejoin="round\""""
 WIDE = 2.0  # aspect ratio from which a figure takes the full width of the page
 
 
@@ -71,30 +72,22 @@ def joined(parts: Iterable[str]) -> Markup:
     return Markup("\n").join(parts)
 
 
-def figure_html(caption: str, figure: Figure) -> Markup:
-    """Return a figure with its caption, as SVG."""
-    svg = Markup(figure_svg(figure, salt=caption))
+def figure_html(caption: str, figure: Figure, file: Path | None = None) -> Markup:
+    """Return a figure with its caption, as SVG, and write it to a file of its own."""
+    svg = figure_svg(figure, salt=caption)
     width, height = figure.get_size_inches()
-    return part("figure", caption, svg, width, width >= WIDE * height)
+    if file is not None:
+        size = f'width="{width:g}in" height="{height:g}in"'
+        file.write_text(svg.replace("<svg", f"<svg {_ALONE} {size}", 1), encoding="utf-8")
+    return part("figure", caption, Markup(svg), width, width >= WIDE * height)
 
 
 def notebook_picture(figure: Figure) -> Markup:
     """Return a figure as a small PNG in base64."""
-    return Markup(base64.b64encode(figure_png(figure, NOTEBOOK_DPI)).decode("ascii"))
-
-
-def figure_png(figure: Figure, dpi: int = DPI) -> bytes:
-    """Draw a figure; equal figures give equal bytes."""
     stream = io.BytesIO()
-    figure.set_dpi(dpi)
-    # ``Figure.savefig`` would process every figure twice, once without drawing;
-    # without the program's name and version, equal figures give equal files
-    FigureCanvasAgg(figure).print_png(  # type: ignore[no-untyped-call]
-        stream, metadata={"Software": None}, pil_kwargs={"compress_level": COMPRESSION}
-    )
-    FigureCanvasBase(figure)  # releases the pixel buffer, which the figure would keep
-    figure.set_layout_engine("none")  # SVG of the same figure has its panels where they are
-    return stream.getvalue()
+    # without the program's name and version, equal figures give equal bytes
+    figure.savefig(stream, format="png", dpi=NOTEBOOK_DPI, metadata={"Software": None})
+    return Markup(base64.b64encode(stream.getvalue()).decode("ascii"))
 
 
 def figure_svg(figure: Figure, salt: str) -> str:

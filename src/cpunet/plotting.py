@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
+import numpy.typing as npt
+
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.container import Container
     from matplotlib.figure import Figure
 
@@ -29,6 +32,7 @@ COLOURS = {
 }
 SPARE_COLOURS = ("#8C6D1F", "#5B3A8C", "#9E2A2B", "#4F6D7A", "#B8A200")
 DATA_FILL = "0.80"
+RIGHT = 0.15  # margin of figures in inches
 
 GROUP = "method-"  # begins the group id of what a figure draws of a method
 # suffix of the name of a method without noise
@@ -59,7 +63,9 @@ _STYLE = {
     "grid.color": "0.92",
     "axes.axisbelow": True,
     "figure.constrained_layout.use": True,
+    "axes.titley": 1.0,  # else the title is placed by the labels, which takes long
 }
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
@@ -104,6 +110,77 @@ def group(drawn: Container, method: str) -> None:
     """Mark points with errors as those of a method, by which a page hides them."""
     for artist in drawn.get_children():
         artist.set_gid(GROUP + method)
+
+
+def panels(
+    size: tuple[float, float],
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    left: float = 0.85,
+    top: float = 0.35,
+    bottom: float = 0.5,
+    between: tuple[float, float] = (0.65, 0.4),
+    **how: Any,
+) -> tuple[Figure, npt.NDArray[Any]]:
+    """A figure with panels in fixed places; to fit them to labels takes as long as to draw.
+
+    Parameters
+    ----------
+    size
+        Width and height of the figure in inches.
+    rows, columns
+        Numbers of panels.
+    left, top, bottom
+        Margins in inches.
+    between
+        Gaps in inches between columns and between rows.
+    how
+        Further arguments of `Figure.subplots`.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size)
+    figure.set_layout_engine("none")
+    width, height = size[0] - left - RIGHT, size[1] - top - bottom
+    of_one = [
+        (whole - (n - 1) * gap) / n
+        for whole, n, gap in zip((width, height), (columns, rows), between, strict=True)
+    ]
+    places = {
+        "left": left / size[0],
+        "right": 1 - RIGHT / size[0],
+        "bottom": bottom / size[1],
+        "top": 1 - top / size[1],
+        "wspace": between[0] / of_one[0],
+        "hspace": between[1] / of_one[1],
+    }
+    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=places, **how)
+
+
+def legend_height(entries: int, columns: int = 1, *, titled: bool = True) -> float:
+    """Room in inches for a legend above the panels."""
+    return 0.16 + 0.178 * -(-entries // columns) + 0.2 * titled
+
+
+def logarithmic(axis: Axis) -> None:
+    """Label a logarithmic axis in plain text, which is drawn faster than formulas."""
+    from matplotlib.ticker import LogFormatter
+
+    class Powers(LogFormatter):
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return _power(x) if super().__call__(x, pos) else ""
+
+    axis.set_major_formatter(Powers())
+    axis.set_minor_formatter(Powers(minor_thresholds=(2, 0.5)))
+
+
+def _power(value: float) -> str:
+    """A value as ``0.2`` or ``3×10⁻⁸``."""
+    digit, _, exponent = f"{value:.0e}".partition("e")
+    if abs(int(exponent)) <= 2:
+        return f"{value:g}"
+    return f"{digit}×10".removeprefix("1×") + str(int(exponent)).translate(_SUPERSCRIPT)
 
 
 def linear_within(axes: Axes, limit: float) -> None:

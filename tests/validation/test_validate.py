@@ -235,7 +235,7 @@ def test_a_report_again(report, tmp_path):
         assert np.array_equal(one.values(), other.values())
     assert again.plot("SEP", "drift_time").axes
     assert again.scores.sort_index().equals(report.scores.sort_index())
-    assert (again.folder / "FEP_mean_pulse.png").is_file()
+    assert (again.folder / "FEP_mean_pulse.svg").is_file()
     with pytest.raises(CpunetError, match="is a report already; copy the folder"):
         again.save(tmp_path / "copy")
 
@@ -300,5 +300,5 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
     scores = metrics["peaks"]["300-"]
     assert scores["n_data"] == made.data.used
     assert set(scores["parameters"]) == {"current_amplitude", "drift_time", "tail_slope"}
-    for name in ("metrics.json", "report.html", "losses.png"):
+    for name in ("metrics.json", "report.html", "losses.svg"):
         assert (tmp_path / "report" / name).is_file()

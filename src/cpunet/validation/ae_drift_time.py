@@ -14,7 +14,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cpunet.plotting import GROUP, colours, group, label, linear_within, styled
+from cpunet.plotting import (
+    GROUP,
+    colours,
+    group,
+    label,
+    legend_height,
+    linear_within,
+    panels,
+    styled,
+)
 from cpunet.pulses.parameters import PARAMETERS
 
 Values = npt.NDArray[np.float64]
@@ -77,8 +86,15 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
     """
     methods = table["methods"]
     palette = colours(methods)
-    figure = Figure(figsize=(6.4, 5.4))
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    figure, ((above,), (below,)) = panels(
+        (6.4, 5.4),
+        2,
+        left=1.1,
+        top=legend_height(len(methods), 3),
+        between=(0, 0.15),
+        sharex=True,
+        height_ratios=(3, 2),
+    )
     ratios: list[float] = []
     for method, rows in methods.items():
         known = [row for row in rows if "missing" not in row]

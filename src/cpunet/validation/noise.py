@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
-from cpunet.plotting import colours, group, label, styled
+from cpunet.plotting import colours, group, label, logarithmic, panels, styled
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
@@ -108,8 +108,9 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
     palette = colours(methods)
     frequency = np.asarray(found["frequency_mhz"])
-    figure = Figure(figsize=(5.6, 4.4))
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    figure, ((above,), (below,)) = panels(
+        (5.6, 4.4), 2, left=1.0, between=(0, 0.15), sharex=True, height_ratios=(3, 2)
+    )
     data = np.asarray(found["data"]["power"])
     for method in methods:
         power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))
@@ -131,6 +132,8 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
         yscale="linear" if silent else "log",
     )
     above.legend()
+    for axis in (below.xaxis, *([] if silent else [above.yaxis])):
+        logarithmic(axis)
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
 

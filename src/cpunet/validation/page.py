@@ -15,7 +15,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cpunet.html_pages import asset, figure_html, figure_png, joined, part, rendered
+from cpunet.html_pages import asset, figure_html, joined, part, rendered
 from cpunet.plotting import NO_NOISE, colours, label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
@@ -46,7 +46,7 @@ def write_page(
     figures: Mapping[str, Figure],
     notes: Sequence[str],
 ) -> None:
-    """Write a PNG per figure and ``report.html`` into a folder.
+    """Write an SVG per figure and ``report.html`` into a folder.
 
     Parameters
     ----------
@@ -62,8 +62,7 @@ def write_page(
     drawn = {}
     for name, figure in figures.items():
         stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
-        (folder / f"{stem}.png").write_bytes(figure_png(figure))
-        drawn[name] = figure_html(name.replace("_", " "), figure)
+        drawn[name] = figure_html(name.replace("_", " "), figure, folder / f"{stem}.svg")
     ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))
@@ -134,7 +133,7 @@ def _folded(title: str, content: Markup, *, screen: bool = False) -> Markup:
 def _gallery(drawn: Sequence[Markup]) -> Markup:
     if len(drawn) <= MANY:
         return _grid(drawn)
-    return _folded(f"{len(drawn)} figures, also as PNG beside this page", _grid(drawn))
+    return _folded(f"{len(drawn)} figures, also as files beside this page", _grid(drawn))
 
 
 def _grid(drawn: Sequence[Markup]) -> Markup:

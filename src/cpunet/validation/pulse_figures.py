@@ -17,7 +17,18 @@ from matplotlib.transforms import blended_transform_factory
 
 from cpunet.electronics.baseline_methods import fitted_tail_slope, without_decay
 from cpunet.electronics.tails_law import TailsLaw
-from cpunet.plotting import COLOURS, DATA_FILL, GROUP, colours, label, linear_within, styled
+from cpunet.plotting import (
+    COLOURS,
+    DATA_FILL,
+    GROUP,
+    colours,
+    label,
+    legend_height,
+    linear_within,
+    logarithmic,
+    panels,
+    styled,
+)
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.half_maximum import BLOCK, align_half_maximum
 
@@ -50,8 +61,7 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
     width = max(BIN_KEV, (high - low) / MAX_BINS)
     edges = np.arange(np.floor(low / width), np.floor(high / width) + 2) * width
     palette = colours(finite)
-    figure = Figure(figsize=(7.5, 4.0))
-    axes = figure.subplots()
+    figure, ((axes,),) = panels((7.5, 4.2), top=0.85)
     for method, values in finite.items():
         is_data = method == "data"
         counts = np.histogram(values, edges)[0] / max(len(values), 1) / width
@@ -68,6 +78,7 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
             gid=GROUP + method,
         )
     axes.set(yscale="log", xlabel="Energy [keV]", ylabel="Fraction of events per keV")
+    logarithmic(axes.yaxis)
     _mark_peaks(axes, peaks, (float(edges[0]), float(edges[-1])))
     figure.legend(loc="outside upper left", ncols=len(finite))
     return figure
@@ -202,8 +213,17 @@ def single_pulse_figure(
     shown = {"data": data.window} | dict(pulses)
     slope = data.slope_per_ms
     windows = {m: np.asarray(w, np.float32)[np.newaxis] for m, w in shown.items()}
-    figure = Figure(figsize=(9.5, 7.6))
-    grid = figure.subplots(3, 2, sharey="row", sharex="col", height_ratios=(4, 4, 3))
+    figure, grid = panels(
+        (9.5, 7.6),
+        3,
+        2,
+        left=0.95,
+        top=legend_height(1) + 0.25,
+        between=(0.2, 0.4),
+        sharey="row",
+        sharex="col",
+        height_ratios=(4, 4, 3),
+    )
     _draw(list(grid[0]), windows, dt_ns)
     corrected = {
         m: without_decay(w, 0.0 if m == UNDECAYED else slope, dt_ns, samples_before).astype(
@@ -250,8 +270,7 @@ def tails_figure(
     energies_kev
         Quantiles of the energies of earlier pulses in keV.
     """
-    figure = Figure(figsize=(5.2, 3.4))
-    axes = figure.subplots()
+    figure, ((axes,),) = panels((5.2, 3.4))
     kev = np.asarray(sizes["kev"], float)
     # binomial error of a fraction of n traces
     share, n = np.asarray(sizes["percent_above"], float) / 100, max(summary["traces"], 1)
@@ -269,6 +288,8 @@ def tails_figure(
         f"decay {summary['decay_us']:.1f} µs"
     )
     axes.set_ylim(max(30 / n, 0.01), 100)
+    logarithmic(axes.xaxis)
+    logarithmic(axes.yaxis)
     axes.set_xlabel("tail at the first sample (keV)")
     axes.set_ylabel("traces above (%)")
     axes.legend()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -79,7 +81,7 @@ class Report:
 
     @classmethod
     def load(cls, folder: str | Path) -> Report:
-        """Open the folder of a report; its figures are the PNG files beside it.
+        """Open the folder of a report; its figures are the SVG files beside it.
 
         Raises
         ------
@@ -227,7 +229,7 @@ class Report:
             if name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
-        with stage("Drawing", len(self.drawn)) as bar:
+        with stage("Drawing", len(self.drawn)) as bar, _few_collections():
             figures = {name: partial(_drawn, one, bar) for name, one in self.drawn.items()}
             write_page(folder, metrics, WhenAsked(figures), self.notes)
 
@@ -317,6 +319,17 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str
             f"{file}: holds no scores by peak", "give a report of cpunet validate"
         )
     return content
+
+
+@contextmanager
+def _few_collections() -> Iterator[None]:
+    """Collect garbage rarely: each time, all that is loaded is looked through as well."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, 20, 100)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
 
 
 def _drawn(drawing: Callable[[], Figure], bar: Stage) -> Figure:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from cpunet.errors import CpunetError
 from cpunet.plotting import (
@@ -23,8 +24,11 @@ from cpunet.plotting import (
     GROUP,
     colours,
     label,
+    legend_height,
     line_look,
     linear_within,
+    logarithmic,
+    panels,
     styled,
 )
 from cpunet.pulses.container import FloatArray
@@ -80,9 +84,8 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     if CHI_SQUARE in records[0]["losses"]:
         return _chi_square_curve(records)
     iteration = np.array([record["iteration"] for record in records], dtype=float)
-    figure = Figure(figsize=(10.5, 3.4))
-    panels = figure.subplots(1, len(LOSS_PANELS))
-    for axes, (title, losses) in zip(panels, LOSS_PANELS.items(), strict=True):
+    figure, grid = panels((10.5, 3.6), 1, len(LOSS_PANELS), between=(0.5, 0))
+    for axes, (title, losses) in zip(grid[0], LOSS_PANELS.items(), strict=True):
         for name, (text, colour) in losses.items():
             series = np.array([record["losses"].get(name, np.nan) for record in records], float)
             there = ~np.isnan(series)  # discriminators are not updated in every iteration
@@ -96,15 +99,15 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
         axes.set(title=title, xlabel="Iteration")
         if axes.lines:
             axes.legend()
-    panels[0].set(ylabel="Loss", yscale="log")
+    grid[0, 0].set(ylabel="Loss", yscale="log")
+    logarithmic(grid[0, 0].yaxis)
     figure.supxlabel(f"Lines: mean of {AVERAGED} records", fontsize=8, x=0.99, ha="right")
     return figure
 
 
 def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Chi-square of a fitted chain after each step of the fit."""
-    figure = Figure(figsize=(4.6, 3.4))
-    axes = figure.subplots()
+    figure, ((axes,),) = panels((4.6, 3.4))
     axes.plot(
         [record["iteration"] for record in records],
         [record["losses"].get(CHI_SQUARE, np.nan) for record in records],
@@ -112,8 +115,9 @@ def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
         marker="o",
         markersize=3,
     )
-    axes.set(xlabel="Step", ylabel=r"$\chi^2$ of the moments", yscale="log")
+    axes.set(xlabel="Step", ylabel="χ² of the moments", yscale="log")
     axes.set_title("Response matched to data")
+    logarithmic(axes.yaxis)
     return figure
 
 
@@ -137,15 +141,14 @@ def cycle_figure(
     dt_ns
         Sampling period in ns.
     """
-    figure = Figure(figsize=(10.5, 3.2))
-    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    figure, grid = panels((10.5, 3.2), 1, 3, between=(0.2, 0), sharex=True, sharey=True)
     time_us = np.arange(start.shape[1]) * dt_ns * 1e-3
     shades = colormaps["viridis"](np.linspace(0, 0.9, len(start)))
-    for axes, waveforms, title in zip(panels, (start, middle, end), titles, strict=True):
+    for axes, waveforms, title in zip(grid[0], (start, middle, end), titles, strict=True):
         for waveform, shade in zip(waveforms, shades, strict=True):
             axes.plot(time_us, waveform, color=shade, linewidth=1.0, rasterized=True)
         axes.set(title=title, xlabel="Time [µs]")
-    panels[0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
+    grid[0, 0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
     return figure
 
 
@@ -181,8 +184,7 @@ def parameter_histograms(
     bar = max(high - low, np.spacing(high)) / 25
     edges = np.concatenate([[low - bar], axis.edges, [high + bar]])
     fractions = {m: histogram(v, axis)[:-1] / max(len(v), 1) for m, v in values.items()}
-    figure = Figure(figsize=(5.6, 4.2))
-    axes = figure.subplots()
+    figure, ((axes,),) = panels((5.6, 4.2), top=legend_height(len(values)))
     for method, heights in fractions.items():
         name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
         score, missing = comparison["iou"].get(name), int(np.isnan(values[method]).sum())
@@ -219,24 +221,35 @@ def further_histograms(
     peak
         Name of the gamma line, for the title.
     """
-    rows = -(-len(values) // COLUMNS)
-    figure = Figure(figsize=(10.5, 2.1 * rows + 0.5))
-    panels = figure.subplots(rows, COLUMNS, squeeze=False).flat
-    for name, by_method in values.items():
-        axes, axis = next(panels), data_axis(by_method["data"], max_bins)
-        palette = colours(by_method)
-        for method, own in by_method.items():
-            shares = histogram(own, axis)[1:-2] / max(len(own), 1)
-            _steps(axes, shares, axis.edges, method, palette[method], label(method))
-        axes.set(xlabel=SHAPE_PARAMETERS[name].axis_label, yticks=[], ylim=(0, None))
-        axes.locator_params(axis="x", nbins=4)
-        axes.grid(visible=False)
-    for empty in panels:
-        empty.set_axis_off()
+    rows, methods = -(-len(values) // COLUMNS), list(next(iter(values.values())))
+    figure, ((axes,),) = panels(
+        (10.5, 1.9 * rows + 0.6), left=0.25, top=legend_height(1), bottom=0.1
+    )
+    palette = colours(methods)
+    # panels of a figure each take longer to draw than their content, so they share one
+    for number, (name, by_method) in enumerate(values.items()):
+        axis, x, y = data_axis(by_method["data"], max_bins), number % COLUMNS, number // COLUMNS
+        low, width = axis.edges[0], np.ptp(axis.edges)
+        shares = {m: histogram(v, axis)[1:-2] / max(len(v), 1) for m, v in by_method.items()}
+        height = max(max(share.max() for share in shares.values()), 1e-9)
+        for method, share in shares.items():
+            heights, edges = -y + 0.6 * share / height, x + 0.9 * (axis.edges - low) / width
+            text = "" if number else label(method)
+            _steps(axes, heights, edges, method, palette[method], text, baseline=-y)
+        for tick in MaxNLocator(4).tick_values(low, low + width):
+            if low <= tick <= low + width:
+                at = x + 0.9 * (tick - low) / width
+                axes.plot([at, at], [-y - 0.03, -y], "k", lw=0.8)
+                axes.text(
+                    at, -y - 0.05, f"{tick:g}".replace("-", "−"), ha="center", va="top", size=8
+                )
+        axes.plot([x, x + 0.9], [-y, -y], "k", lw=0.8)
+        axes.text(x + 0.45, -y - 0.28, SHAPE_PARAMETERS[name].axis_label, ha="center")
+    axes.set(xlim=(-0.02, COLUMNS), ylim=(-rows + 0.65, 0.65))
+    axes.set_axis_off()
     figure.legend(
-        *axes.get_legend_handles_labels(),
         loc="outside upper left",
-        ncols=len(by_method),
+        ncols=len(methods),
         title=f"{peak}: further parameters, fraction of events per bin, in the data's range",
         alignment="left",
     )
@@ -261,8 +274,9 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     means = {method: averaged.mean for method, averaged in sets.items()}
     data = sets["data"]
     time_ns = (np.arange(len(data.mean)) - BEFORE) * dt_ns
-    figure = Figure(figsize=(5.6, 4.8))
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    figure, ((above,), (below,)) = panels(
+        (5.6, 4.8), 2, left=1.05, between=(0, 0.15), sharex=True, height_ratios=(3, 2)
+    )
     # the translation last, so that it is on top
     for method in sorted(means, key=lambda name: name == "ren"):
         mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
@@ -301,10 +315,10 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     others = [peak for peak in ae if peak != dep]
     methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
     palette = colours(methods)
-    figure = Figure(figsize=(3.4 * max(len(others), 1) + 0.6, 3.8))
-    panels = figure.subplots(1, max(len(others), 1), sharey=True, squeeze=False)[0]
+    size, top = (3.4 * len(others) + 0.6, 3.8), legend_height(len(methods), 3, titled=False)
+    figure, (grid,) = panels(size, 1, len(others), top=top + 0.2, between=(0.3, 0), sharey=True)
     accepted = np.linspace(0.0, 1.0, ROC_POINTS)
-    for axes, peak in zip(panels, others, strict=False):
+    for axes, peak in zip(grid, others, strict=True):
         for method in sorted(methods, key=lambda name: name == "ren"):
             single, other = (
                 ae[name][method][np.isfinite(ae[name][method])] for name in (dep, peak)
@@ -317,9 +331,10 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
             axes.plot(100 * accepted, 100 * left, label=label(method), **look)
         axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
     # useful cuts leave few multi-site events
-    panels[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
-    panels[0].yaxis.set_major_formatter("{x:g}")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    grid[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
+    grid[0].yaxis.set_major_formatter("{x:g}")
+    grid[0].yaxis.set_minor_formatter("")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 
 
@@ -332,32 +347,38 @@ def drift_figure(before_ns: Values, longer: Values, blur_ns2: Values) -> Figure:
     before_ns, longer, blur_ns2
         As `cpunet.networks.learned_response.DriftUNet.effect` returns them, shapes (pulses,).
     """
-    figure = Figure(figsize=(8.4, 3.4))
-    panels = figure.subplots(1, 2)
+    figure, ((left, right),) = panels((8.4, 3.4), 1, 2, between=(0.75, 0))
     edges = np.unique(np.quantile(before_ns, np.linspace(0, 1, DRIFT_BINS + 1)))
     in_bin = np.clip(np.searchsorted(edges, before_ns, "right") - 1, 0, len(edges) - 2)
     blur_ns = np.sign(blur_ns2) * np.sqrt(np.abs(blur_ns2))
     filled = np.unique(in_bin)
-    for axes, values in zip(panels, (100 * longer, blur_ns), strict=True):
+    for axes, values in zip((left, right), (100 * longer, blur_ns), strict=True):
         axes.plot(before_ns, values, ".", color=COLOURS["raw"], markersize=1.5, alpha=0.3)
         middle = [np.median(values[in_bin == number]) for number in filled]
         at = [np.median(before_ns[in_bin == number]) for number in filled]
         axes.plot(at, middle, color=COLOURS["ren"], marker="o", markersize=3, label="median")
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set(xlabel="Simulated time from 2 to 98 % of the charge [ns]")
-    panels[0].set(ylabel="Longer by [%]", title="Clock of the U-Net")
-    panels[1].set(ylabel="Gaussian σ [ns], negative: sharpened", title="Blur of the U-Net")
-    panels[0].legend()
+    left.set(ylabel="Longer by [%]", title="Clock of the U-Net")
+    right.set(ylabel="Gaussian σ [ns], negative: sharpened", title="Blur of the U-Net")
+    left.legend()
     return figure
 
 
 def _steps(
-    axes: Axes, heights: Values, edges: Values, method: str, colour: str, text: str
+    axes: Axes,
+    heights: Values,
+    edges: Values,
+    method: str,
+    colour: str,
+    text: str,
+    baseline: float = 0,
 ) -> None:
     is_data = method == "data"
     axes.stairs(
         heights,
         edges,
+        baseline=baseline,
         fill=is_data,
         facecolor=DATA_FILL if is_data else None,
         edgecolor=colour,

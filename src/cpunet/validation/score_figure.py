@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.plotting import colours, group, label, styled
+from cpunet.plotting import GROUP, colours, label, panels, styled
 from cpunet.tables import NO_VALUE
 
 COLUMNS = 4  # panels in a line; of more than one line, 3
@@ -81,26 +81,37 @@ def score_figure(
     columns = len(rows) if len(rows) <= COLUMNS else COLUMNS - 1
     methods = methods or ["ren"] * len(names)
     lines, palette = -(-len(rows) // columns), colours(methods)
-    figure = Figure(figsize=(1.6 + 2.4 * columns, lines * (0.9 + 0.18 * len(names))))
-    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).flat
-    for row, axes in zip(rows, panels, strict=False):
+    short = [n if len(n) <= LONGEST else f"…{n[1 - LONGEST :]}" for n in names]
+    figure, grid = panels(
+        (1.6 + 2.4 * columns, lines * (0.9 + 0.18 * len(names))),
+        lines,
+        columns,
+        left=0.2 + 0.085 * max(map(len, short)),
+        top=0.15,
+        between=(0.2, 0.6),
+        sharey=True,
+    )
+    places = grid.flat
+    for row, axes in zip(rows, places, strict=False):
         for place, (cell, method) in enumerate(zip(row.cells, methods, strict=True)):
             if cell.value is None:
                 where = axes.get_yaxis_transform()
                 axes.text(0.02, place, "no score", transform=where, va="center", color="0.5")
                 continue
             if cell.expected is not None:
-                low = cell.expected - (cell.expected_std or 0)
-                axes.barh(place, 2 * (cell.expected - low), 0.8, low, color="0.87", zorder=0)
+                spread = cell.expected_std or 0
+                band = cell.expected - spread, cell.expected + spread
+                axes.plot(band, [place] * 2, color="0.87", lw=9, solid_capstyle="butt")
                 axes.plot([cell.expected] * 2, [place - 0.4, place + 0.4], color="0.5", lw=1)
-            look = {"fmt": "o", "markersize": 4, "color": palette[method]}
-            group(axes.errorbar(cell.value, place, xerr=cell.error, **look), method)
+            error = cell.error or 0
+            bar = cell.value - error, cell.value, cell.value + error
+            look = {"marker": "o", "markevery": [1], "markersize": 4, "color": palette[method]}
+            axes.plot(bar, [place] * 3, gid=GROUP + method, **look)
         for start in starts:
             axes.axhline(start - 0.5, color="0.87", lw=0.8)
         axes.set(xlabel=row.score, ylim=(len(names) - 0.5, -0.5))
-    short = [n if len(n) <= LONGEST else f"…{n[1 - LONGEST :]}" for n in names]
     axes.set_yticks(np.arange(len(names)), short, parse_math=False)
-    for empty in panels:
+    for empty in places:
         empty.set_axis_off()
     return figure
 

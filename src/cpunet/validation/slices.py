@@ -23,7 +23,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from cpunet.plotting import GROUP, colours, label, line_look, linear_within, styled
+from cpunet.plotting import (
+    GROUP,
+    colours,
+    label,
+    legend_height,
+    line_look,
+    linear_within,
+    panels,
+    styled,
+)
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.half_maximum import align_half_maximum
 
@@ -233,8 +242,17 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     """
     data = sets["data"]
     n = len(data.pulses)
-    figure = Figure(figsize=(2.0 + 2.7 * n, 4.9))
-    grid = figure.subplots(2, n, sharex=True, sharey="row", height_ratios=(3, 2), squeeze=False)
+    figure, grid = panels(
+        (2.0 + 2.7 * n, 4.9),
+        2,
+        n,
+        left=1.1,
+        top=legend_height(1) + 0.25,
+        between=(0.2, 0.2),
+        sharex=True,
+        sharey="row",
+        height_ratios=(3, 2),
+    )
     time_ns = dt_ns * np.arange(-BEFORE, len(data.pulses[0].mean) - BEFORE, dtype=float)
     palette = colours(sets)
     for i, axes in enumerate(grid[0]):
