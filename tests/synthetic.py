@@ -36,8 +36,8 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
+from cpunet.validation.methods import PairedScores, Responses, pair_squares, scores_of_squares
 from cpunet.validation.report import Report
-from cpunet.validation.truth import PairedScores, Responses, pair_squares, scores_of_squares
 
 Values = npt.NDArray[np.float64]
 DT_NS = 16.0

@@ -158,9 +158,48 @@ def panels(
     return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=places, **how)
 
 
+def stacked(
+    size: tuple[float, float], left: float = 1.05, top: float = 0.35
+) -> tuple[Figure, Any, Any]:
+    """A figure with two panels above each other, the lower one smaller, see `panels`."""
+    how: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
+    figure, ((above,), (below,)) = panels(size, 2, left=left, top=top, between=(0, 0.15), **how)
+    return figure, above, below
+
+
 def legend_height(entries: int, columns: int = 1, *, titled: bool = True) -> float:
-    """Room in inches for a legend above the panels."""
+    """Room in inches for `legend_above`."""
     return 0.16 + 0.178 * -(-entries // columns) + 0.2 * titled
+
+
+def legend_above(
+    figure: Figure, axes: Axes, columns: int = 1, title: str | None = None
+) -> None:
+    """Put the legend of one panel above all."""
+    figure.legend(
+        *axes.get_legend_handles_labels(),
+        loc="outside upper left",
+        ncols=columns,
+        title=title,
+        alignment="left",
+    )
+
+
+def steps(
+    axes: Axes,
+    heights: Any,
+    edges: Any,
+    method: str,
+    colour: str,
+    text: str,
+    baseline: float = 0,
+) -> None:
+    """Draw a histogram of a method: that of the data filled, others as a line."""
+    look: dict[str, Any] = {"fill": False, "edgecolor": colour, "linewidth": 1.5, "zorder": 2}
+    if method == "data":
+        look = {"fill": True, "facecolor": DATA_FILL, "edgecolor": colour, "linewidth": 0.8}
+    gid = GROUP + method
+    axes.stairs(heights, edges, baseline=baseline, label=text, gid=gid, **look)
 
 
 def logarithmic(axis: Axis) -> None:

@@ -23,6 +23,7 @@ from cpunet.training.networks import outside_noise
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
 from cpunet.training.train import train
+from cpunet.translation.file_translation import Counts
 from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
 from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites
@@ -105,7 +106,7 @@ def test_files_are_translated_in_both_directions(
     source = files.data if inverse else files.sim
     out = tmp_path / "out.lh5"
     told = translate(run.folder, source, out, inverse=inverse).counts
-    assert told == {"read": N, "translated": N, "rejections": {}}
+    assert told == Counts(N, N)
     windows = open_pulses(out).read()
     assert windows.waveforms.shape == (N, 800)
     quiet = np.sqrt((windows.waveforms[:, 210:260] ** 2).mean())
@@ -121,9 +122,9 @@ def test_rows_without_energy_are_counted(run: Trained, tmp_path: Path) -> None:
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
     told = translate(run.folder, path, tmp_path / "a.lh5").counts
-    assert told == {"read": 6, "translated": 4, "rejections": {"energy_unknown": 2}}
+    assert told == Counts(6, 4, {"energy_unknown": 2})
     told = translate(run.folder, path, tmp_path / "b.lh5", noise=False).counts
-    assert told == {"read": 6, "translated": 6, "rejections": {}}
+    assert told == Counts(6, 6)
 
 
 @pytest.mark.thorough

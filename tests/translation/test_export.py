@@ -21,8 +21,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.translation.dspeed_processor import ren
-from cpunet.translation.export import export_onnx
-from cpunet.translation.onnx import write_onnx
+from cpunet.translation.export import export_onnx, graph_of, write_onnx
 from cpunet.translation.translator import IREN, REN
 from synthetic import waveform_table, write_chain
 
@@ -113,7 +112,7 @@ def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
     # as where the physics are off
     stretched = written(tmp_path / "stretched", "generator.drift_terms=2")
     for folder, kind in ((run, IREN), (chain, IREN), (stretched, REN)):
-        graph = kind.load(folder).backend.graph(800)
+        graph = graph_of(kind.load(folder).backend.network, 800)
         assert write_onnx(graph, tmp_path / "graph") < 2e-5
 
 
@@ -151,13 +150,13 @@ def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
         export_onnx(chain, tmp_path / "ren.onnx")
-    graph = REN.load(chain).backend.graph(800)
+    graph = graph_of(REN.load(chain).backend.network, 800)
     monkeypatch.undo()
     # a graph that is not the run's is not left behind
     other = REN.load(chain)
     with torch.no_grad():
         other.backend.chain.response.log_decay_us.add_(1)
-    wrong = replace(graph, expected=other.backend.graph(800).expected)
+    wrong = replace(graph, expected=graph_of(other.backend.network, 800).expected)
     with pytest.raises(CpunetError, match="differs from the run"):
         write_onnx(wrong, tmp_path / "x")
     assert [p.name for p in tmp_path.iterdir() if p.name != "x"] == []

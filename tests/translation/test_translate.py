@@ -32,11 +32,10 @@ from cpunet.pulses.reading.opening import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation import file_translation
+from cpunet.translation.file_translation import Counts, noise_seed
 from cpunet.translation.forms import to_adc
-from cpunet.translation.many_files import expanded
-from cpunet.translation.noise_blocks import noise_seed
 from cpunet.translation.options import Adc
-from cpunet.translation.translate import translate
+from cpunet.translation.translate import expanded, translate
 from cpunet.translation.translator import REN
 from synthetic import (
     FACTS,
@@ -200,7 +199,7 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
 def test_realisations_repeat_rows(run, tmp_path):
     source = PulseFile(sim_file(tmp_path / "sim.lh5", **many_columns()))
     told = translate(run, source, tmp_path / "out.lh5", realisations=3, seed=4).counts
-    assert told["translated"] == 3 * N
+    assert told.translated == 3 * N
     table = lh5.read("geds/ren", tmp_path / "out.lh5")
     assert plain(table.realisation) == [0, 1, 2] * N
     before = lh5.read("geds/sim", source.path)
@@ -222,7 +221,7 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
             file.copy("geds/sim", f"{channel}/sim")
         del file["geds"]
     outcome = translate(run, PulseFile(source, "all"), tmp_path / "out")
-    assert {name: made.counts["translated"] for name, made in outcome.done.items()} == {
+    assert {name: made.counts.translated for name, made in outcome.done.items()} == {
         "ch1": N,
         "ch2": N,
     }
@@ -289,7 +288,7 @@ def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
         found = translate(run, pulses, tmp_path / "given.lh5", **how, resume=True)
         np.testing.assert_array_equal(values(tmp_path / f"{name}.lh5"), kept.waveforms)
         assert plain(lh5.read("geds/ren", tmp_path / f"{name}.lh5").realisation) == [0, 1] * N
-    assert found.counts["skipped"]
+    assert found.counts.skipped
     with pytest.raises(CpunetError, match="holds these pulses already"):
         found.save(tmp_path / "again.lh5")
     with pytest.raises(CpunetError, match=r"saved.lh5: exists already"):
@@ -327,7 +326,7 @@ def changed_record(path, change):
 def test_a_file_with_another_record_is_not_kept(run, tmp_path, change, said):
     source, out = PulseFile(sim_file(tmp_path / "sim.lh5")), tmp_path / "out.lh5"
     translate(run, source, out)
-    assert translate(run, source, out, resume=True).counts["skipped"]
+    assert translate(run, source, out, resume=True).counts.skipped
     changed_record(out, change)
     with pytest.raises(CpunetError, match=said):
         translate(run, source, out, resume=True)
@@ -363,7 +362,7 @@ def test_each_output_is_compared_with_few_paths(run, many, tmp_path, monkeypatch
     """And yet none may be another's input."""
     seen = []
     monkeypatch.setattr(
-        "cpunet.translation.many_files.refuse_inputs", lambda *paths: seen.append(len(paths))
+        "cpunet.translation.translate.refuse_inputs", lambda *paths: seen.append(len(paths))
     )
     (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
     with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
@@ -423,7 +422,7 @@ def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
     with pytest.raises(CpunetError, match="exists already"):
         translate(run, many, out)
     told = translate(run, many, out, resume=True).counts
-    assert (told["skipped"], told["translated"]) == (2, 3 * N)
+    assert (told.skipped, told.translated) == (2, 3 * N)
     assert [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)] == before
     for path in sequential[0].iterdir():
         assert (out / path.name).read_bytes() == path.read_bytes()
@@ -479,7 +478,7 @@ def test_the_preparation_is_undone_to_half_a_count():
 def test_traces_in_adc_counts(run, tmp_path, adc):
     source, out = sim_file(tmp_path / "sim.lh5"), tmp_path / "out.lh5"
     told = translate(run, source, out, adc=True, scale=adc).counts
-    assert (told["translated"], told["saturated"]) == (N, 0)
+    assert (told.translated, told.saturated) == (N, 0)
     length, n_pre = adc.length or 800, adc.n_pre or 400
     table = lh5.read("geds/ren", out)
     traces = table.waveform.values.nda
@@ -520,7 +519,7 @@ def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
     told = translate(
         network, source, tmp_path / "unet.lh5", adc=True, scale=given, noise=False
     ).counts
-    assert told["read"] == N
+    assert told.read == N
     assert any("beyond them stand baseline and decay" in note for note in caplog.messages)
     assert (values(tmp_path / "unet.lh5")[:, :100] == 14_000).all()
 
@@ -541,12 +540,7 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
     told = translate(run, path, tmp_path / "out.lh5", adc=True, scale=ADC).counts
-    assert told == {
-        "read": 6,
-        "translated": 4,
-        "rejections": {"constant": 1, "energy_unknown": 1},
-        "saturated": 2,
-    }
+    assert told == Counts(6, 4, {"constant": 1, "energy_unknown": 1}, saturated=2)
     table = lh5.read("geds/ren", tmp_path / "out.lh5")
     traces = table.waveform.values.nda
     assert (traces[[2, 3]] == 0).all()

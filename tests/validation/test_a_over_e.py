@@ -9,13 +9,14 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 from cpunet.validation.a_over_e import (
+    ae_against_drift_time,
+    ae_figure,
     ae_survival,
     peak_survival,
     sideband_survival,
     survival_by_range,
     survival_table,
 )
-from cpunet.validation.ae_drift_time import ae_against_drift_time, ae_figure
 from cpunet.validation.ae_energy import ae_energy_figure, against_energy, site_fit
 from cpunet.validation.page import ae_energy_html
 from cpunet.validation.run_figures import roc_figure

@@ -15,8 +15,7 @@ from cpunet.cli import run
 from cpunet.errors import CpunetError
 from cpunet.validation.compare import compare
 from cpunet.validation.report import Report
-from cpunet.validation.score_figure import score_figure
-from cpunet.validation.side_by_side import comparison_page, side_by_side
+from cpunet.validation.side_by_side import comparison_page, score_figure, side_by_side
 
 
 def scores(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, Any]:

@@ -14,15 +14,18 @@ from hypothesis.extra.numpy import arrays
 
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes import load_recipe
-from cpunet.validation import distances, resampling
+from cpunet.validation import distances
 from cpunet.validation.comparisons import ceiling, compare, histogram, iou, iou_error
 from cpunet.validation.distances import (
+    Draws,
+    Resampled,
     distance_errors,
     kolmogorov_smirnov,
     null_distances,
+    resampled_quantiles,
+    resampled_twice,
     wasserstein,
 )
-from cpunet.validation.resampling import Draws, Resampled, resampled_quantiles, resampled_twice
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 50})
 UNIT = hist.axis.Regular(10, 0.0, 1.0)
@@ -267,12 +270,12 @@ def test_compare_without_usable_data_gives_none(values):
 
 
 DRAWS = 400
-WAYS = {"events": resampling.MAX_EVENTS, "bins": 0}  # what is drawn
+WAYS = {"events": distances.MAX_EVENTS, "bins": 0}  # what is drawn
 
 
 @pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
 def either_way(request, monkeypatch):
-    monkeypatch.setattr(resampling, "MAX_EVENTS", request.param)
+    monkeypatch.setattr(distances, "MAX_EVENTS", request.param)
 
 
 @pytest.mark.parametrize("size", [2, 50])

@@ -13,6 +13,7 @@ from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.validation.methods import Responses
 from cpunet.validation.slices import (
     AFTER,
     BEFORE,
@@ -23,7 +24,6 @@ from cpunet.validation.slices import (
     slice_table,
     sliced,
 )
-from cpunet.validation.truth import Responses
 from synthetic import paired_scores, require_drawn
 
 DT = 16.0

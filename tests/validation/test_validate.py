@@ -21,7 +21,7 @@ from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.validation.drawings import drawings
 from cpunet.validation.evaluation import Evaluation, _compared, evaluate
-from cpunet.validation.truth import pair_squares, scores_of_squares
+from cpunet.validation.methods import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
 from synthetic import after_pole, decay, phased_edges
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_tails import DrawnTails
@@ -22,7 +22,6 @@ from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.network_settings import PunetConfig
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.run import Run
-from cpunet.translation.onnx import ChainGraph, Graph, NetworkGraph, example_windows
 
 Energies = npt.NDArray[np.float64]
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
@@ -109,15 +108,6 @@ class Backend(ABC):
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
 
-    @abstractmethod
-    def graph(self, length: int) -> Graph:
-        """The part that can be exported, for windows of a length.
-
-        Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either
-        zeros for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a
-        network, unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
-        """
-
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
         """Noise-free traces of any length, with 99.9 % at sample `n_pre`; of a chain only."""
         raise NotImplementedError
@@ -137,26 +127,6 @@ class NetworkBackend(Backend):
         out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
         result: FloatArray = out[:, 0].cpu().numpy()
         return result, np.zeros(len(windows), np.uint8)
-
-    def graph(self, length: int) -> Graph:
-        """The network, with its latent draw as a second input."""
-        windows, network = example_windows(length), self.network
-        shape = (network.latent_mean.out_channels, length // 16)
-
-        def with_epsilon(n: int) -> tuple[Tensor, ...]:
-            draw = torch.Generator().manual_seed(n)
-            return windows(n), torch.randn(n, *shape, generator=draw)
-
-        # the draw of a batch is that of its generator
-        return Graph(
-            NetworkGraph(network).cpu().eval(),
-            ("windows", "epsilon"),
-            "translated",
-            with_epsilon,
-            lambda given: network.cpu()(
-                given[0][:, None], generator=torch.Generator().manual_seed(len(given[0]))
-            )[:, 0],
-        )
 
 
 class NoisyNetworkBackend(NetworkBackend):
@@ -257,17 +227,6 @@ class ResponseBackend(Backend):
             added=added,
         )[:2]
 
-    def graph(self, length: int) -> Graph:
-        """The chain as a matrix."""
-        windows, chain = example_windows(length), self.chain.cpu()
-        return Graph(
-            ChainGraph(chain, length).eval(),
-            ("windows",),
-            "records",
-            lambda n: (windows(n),),
-            lambda given: chain(given[0]),
-        )
-
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
         """Noise-free traces of prepared simulated windows, with 99.9 % at sample `n_pre`."""
         before = max(0, n_pre - self.config.samples_before)
@@ -323,13 +282,6 @@ class InverseBackend(Backend):
         result = np.full_like(windows, np.nan)
         result[prepared.index] = prepared.pulses.waveforms
         return result, prepared.codes
-
-    def graph(self, length: int) -> Graph:
-        """The inverse."""
-        windows, inverse = example_windows(length), self.network.cpu()
-        return Graph(
-            inverse, ("windows",), "pulses", lambda n: (windows(n),), lambda g: inverse(*g)
-        )
 
 
 def backend_of(run: Run, part: str, device: str) -> Backend:

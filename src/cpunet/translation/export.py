@@ -1,21 +1,42 @@
-"""Export a run: its graph for other software, its noise, and a card that describes them."""
+"""Export a run as ONNX: its graph for other software, its noise, and a card on both.
+
+Noise is not part of the graph: a network takes its latent draw as a second input, and the
+electronic noise of a readout chain is added to its records.  The preparation is not part of
+the graph either.
+"""
 
 from __future__ import annotations
 
-import json
+import copy
+import importlib
+import logging
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch
+from torch import Tensor, nn
 
-from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE
+from cpunet.errors import CpunetError
+from cpunet.html_pages import rendered
+from cpunet.networks.generators import ResponseGenerator
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE, DriftClock
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
 from cpunet.training.chain_description import describe_chain
-from cpunet.training.run import Run, RunLike, as_run
-from cpunet.translation.onnx import CHECKED, FORMAT, OPSET, TOLERANCE, Graph, write_onnx
+from cpunet.training.run import RunLike, as_run
 from cpunet.translation.translator import IREN, REN, Translator
+
+# Version of the operators, and the lowest version of the file format that holds them: what a
+# runtime older than the exporter reads.
+OPSET, FORMAT = 18, 8
+TOLERANCE = 1e-4  # maximum difference between file and run, for pulses of height 1
+CHECKED = (1, 3)  # batch sizes of the comparison
+TRACED = 2
 
 
 @dataclass(frozen=True)
@@ -79,7 +100,7 @@ def export_onnx(
     kind: type[Translator] = IREN if inverse else REN
     translator = kind.of(run)
     noise = translator.backend.noise
-    graph = translator.backend.graph(run.recipe.preparation.length)
+    graph = graph_of(translator.backend.network, run.recipe.preparation.length)
     with (
         stage("Exporting"),
         written_aside(out) as aside,
@@ -87,7 +108,20 @@ def export_onnx(
     ):
         difference = write_onnx(graph, aside)
         done = Export(out, card, None if noise is None else noise_file, difference)
-        text.write_text(_card(run, translator, graph, done), encoding="utf-8")
+        network, weights = run.recipe.generator.name != "response", translator.backend.network
+        described = rendered(
+            "card.md",
+            run=run,
+            config=run.recipe.preparation,
+            forward=not inverse,
+            graph=graph,
+            done=done,
+            chain=None if network else describe_chain(run),
+            channels=weights.state_dict()["latent_mean.bias"].shape[0] if network else None,
+            **{"opset": OPSET, "format": FORMAT, "checked": CHECKED, "tolerance": TOLERANCE},
+            **{"before": PADDING_BEFORE, "after": PADDING_AFTER},
+        )
+        text.write_text(described.lstrip(), encoding="utf-8")
         if noise is not None:
             spectra: Any = {"continua": noise.kinds, "lines": noise.lines}
             spectra |= {"shares": noise.shares, "samples": noise.samples, "dt_ns": noise.dt_ns}
@@ -98,117 +132,176 @@ def export_onnx(
     return done
 
 
-def _card(run: Run, translator: Translator, graph: Graph, done: Export) -> str:
-    parts = [
-        f"# {done.graph.name}\n",
-        f"{type(translator).__name__} of a cpunet run: "
-        + ("simulated → measured-like" if translator.part == "ren" else "measured → simulated")
-        + f" pulses. ONNX, opset {OPSET}, IR {FORMAT}; any batch size. Largest difference from "
-        f"the run in batches of {' and '.join(map(str, CHECKED))} pulses: "
-        f"{done.difference:.1e} of the pulse height (refused above {TOLERANCE:g}).\n",
-        "## Made from\n",
-        *_origin(run, translator),
-        "## In and out\n",
-        *_interface(translator, graph),
-        "## Noise\n",
-        *_noise(graph, done),
-        "## Valid for\n",
-        f"Pulses sampled every {translator.dt_ns:g} ns, of the detector and readout of the "
-        f"data. It was trained on {run.peak}; what it does at other energies is for a "
-        "validation to say. Pile-up, saturated pulses and other samplings are not covered.\n",
-    ]
-    return "\n".join(parts)
+class NetworkGraph(PositionalUNet):
+    """A Positional U-Net whose latent draw is an input."""
+
+    def __init__(self, network: PositionalUNet) -> None:
+        nn.Module.__init__(self)  # all attributes of the base are taken over
+        self.__dict__.update(copy.deepcopy(network).__dict__)
+
+    def forward(self, windows: Tensor, epsilon: Tensor) -> Tensor:  # type: ignore[override]
+        """Windows (batch, samples) and epsilon (batch, channels, samples / 16) → windows."""
+        # the base passes its generator on to `_latent`; here this argument is the draw itself
+        drawn = cast(torch.Generator, epsilon)
+        return super().forward(windows[:, None], generator=drawn)[:, 0]
+
+    def _latent(self, x: Tensor, generator: Any, mean: bool) -> Tensor:
+        del mean
+        centre: Tensor = self.latent_mean(x)
+        return centre + torch.exp(0.5 * self.latent_log_variance(x)) * cast(Tensor, generator)
 
 
-def _origin(run: Run, translator: Translator) -> list[str]:
-    lines = [f"* recipe {run.recipe.name} (seed {run.seed}), trained on {run.peak}"]
-    for side, what in ((run.sim, "simulation"), (run.data, "data")):
-        if side.sha256 is not None:
-            lines.append(
-                f"* {what}: {Path(str(side.file)).name}, {side.used} of {side.read} pulses "
-                f"used, sha256 {side.sha256[:12]}…"
-            )
-    if run.imported:
-        names = ", ".join(Path(part["file"]).name for part in run.imported.values())
-        lines.append(f"* weights imported from {names}")
-    return [*lines, *_fitted(run, translator), ""]
+class ChainGraph(nn.Module):
+    """A readout chain as a matrix, with a stretch of the drift if there is one.
+
+    The chain is linear.  A product with its responses to single samples gives the same
+    records as its Fourier transforms, which few formats support.
+    """
+
+    matrix: Tensor
+
+    def __init__(self, chain: ResponseGenerator, length: int) -> None:
+        super().__init__()
+        linear = copy.deepcopy(chain.response)
+        self.drift, linear.drift = linear.drift, None
+        self.dt_ns = float(linear.dt_ns)
+        with torch.inference_mode():
+            matrix = linear(torch.eye(length, device=linear.dt_ns.device))
+        self.register_buffer("matrix", matrix.clone().cpu())
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Windows (batch, samples) → noise-free records (batch, 200 + samples + 400)."""
+        if isinstance(self.drift, DriftClock):
+            windows = self.drift(windows, dt_ns=self.dt_ns)
+        elif self.drift is not None:
+            windows = self.drift(windows)
+        return windows @ self.matrix
 
 
-def _fitted(run: Run, translator: Translator) -> list[str]:
-    """Fitted parameters of a readout chain, or settings of a network."""
-    generator = translator.recipe.generator
-    if generator.name != "response":
-        return [f"* generator: `{json.dumps(generator.model_dump(mode='json'))}`"]
-    chain = describe_chain(run)
-    errors = chain.parameter_errors
-    numbers = [
-        f"`{name}` {value:.4g}" + (f" ± {errors[name]:.2g}" if name in errors else "")
-        for name, value in chain.parameters.items()
-    ]
-    lines = [f"* readout chain as fitted: {', '.join(numbers)}"]
-    if rms := chain.values.get("noise_rms_kev"):
-        lines.append(f"* noise of the data: {rms:.3g} keV RMS")
-    return lines
+@dataclass(frozen=True)
+class Graph:
+    """A module to export, with the names of its inputs and output, and inputs for a check."""
+
+    module: nn.Module
+    inputs: tuple[str, ...]
+    output: str
+    example: Callable[[int], tuple[Tensor, ...]]
+    expected: Callable[[tuple[Tensor, ...]], Tensor]
 
 
-def _interface(translator: Translator, graph: Graph) -> list[str]:
-    config = translator.recipe.preparation
-    n = config.length
-    simulated = (
-        f"`windows`, float32 (batch, {n}): simulated pulses, scaled to 0 … 1, sample "
-        f"{config.samples_before} the first after the last one below "
-        f"{config.align_fraction:g} of the maximum, padded with 0 before and with the last "
-        "value after."
-    )
-    measured = (
-        f"float32 (batch, {n}): sample {config.samples_before} aligned in the same way, the "
-        f"mean of the first {config.baseline_samples} samples 0, the mean of the last "
-        f"{config.tail_samples} {config.tail_level:g}"
-    )
-    forward = translator.part == "ren"
-    lines = [f"* in: {simulated if forward else f'`windows`, {measured}: measured pulses.'}"]
-    if "epsilon" in graph.inputs:
-        channels = translator.backend.network.state_dict()["latent_mean.bias"].shape[0]
-        lines.append(f"* in: `epsilon`, float32 (batch, {channels}, {n // 16}), see Noise.")
-        lines.append(
-            "* out: `translated`, "
-            + (f"{measured}.\n" if forward else f"float32 (batch, {n}), as simulated pulses.\n")
+def example_windows(length: int) -> Callable[[int], Tensor]:
+    """Prepared pulses with edges of several widths and positions."""
+
+    def windows(n: int) -> Tensor:
+        rng = np.random.default_rng(n)
+        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
+        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
+        return torch.from_numpy(charge.astype(np.float32))
+
+    return windows
+
+
+def graph_of(network: nn.Module, length: int) -> Graph:
+    """What can be exported of the network, chain or inverse of a run, for windows of a length.
+
+    Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either zeros
+    for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a network,
+    unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
+    """
+    windows, network = example_windows(length), network.cpu()
+    if isinstance(network, PositionalUNet):
+        shape = (network.latent_mean.out_channels, length // 16)
+
+        def with_epsilon(n: int) -> tuple[Tensor, ...]:
+            return windows(n), torch.randn(n, *shape, generator=_seeded(n))
+
+        # the draw of a batch is that of its generator
+        return Graph(
+            NetworkGraph(network).eval(),
+            ("windows", "epsilon"),
+            "translated",
+            with_epsilon,
+            lambda given: network(given[0][:, None], generator=_seeded(len(given[0])))[:, 0],
         )
-    elif forward:
-        lines.append(
-            f"* out: `records`, float32 (batch, {PADDING_BEFORE + n + PADDING_AFTER}): "
-            f"noise-free, per unit of charge; sample {PADDING_BEFORE} belongs to the window's "
-            "first.\n\n"
-            f"Afterwards records are prepared as measured traces: {measured}."
-            "\n"
-        )
-    else:
-        lines.append(
-            f"* out: `pulses`, float32 (batch, {n}), within 0 … 1; afterwards scaled and "
-            "aligned as simulated pulses.\n"
-        )
-    return lines
+    module, output = network, "pulses"
+    if isinstance(network, ResponseGenerator):
+        module, output = ChainGraph(network, length).eval(), "records"
+    return Graph(module, ("windows",), output, lambda n: (windows(n),), lambda g: network(*g))
 
 
-def _noise(graph: Graph, done: Export) -> list[str]:
-    lines = []
-    if "epsilon" in graph.inputs:
-        lines = [
-            "The graph draws nothing. `epsilon` of independent N(0, 1) numbers gives a draw, "
-            "of zeros the latent mean. Electronic noise is not added.\n"
-        ]
-    elif done.noise is None:
-        lines = ["None is added: the inverse removes it.\n"]
-    if done.noise is None:
-        return lines
-    return [
-        *lines,
-        f"The graph adds none. `{done.noise.name}` holds the electronic noise: spectra of "
-        "`continua` and `lines`, shape (kinds, bins), at the frequencies of a real FFT of "
-        "`samples` samples of `dt_ns`, as the mean square of a bin divided by `samples`, in "
-        "(prepared units × keV)², and the `shares` of the kinds. For one pulse: choose a kind "
-        "by its share, draw Gaussian noise of the continuum and sines of random phase for the "
-        "lines, divide by the energy in keV. Prepare the record, add the noise to all of it "
-        "(in the same units), then prepare again, so that alignment and scale suffer from "
-        "noise as those of data do.\n",
-    ]
+def _seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def write_onnx(graph: Graph, path: Path) -> float:
+    """Write a graph of any batch size, and compare the file's output with that of the run.
+
+    Parameters
+    ----------
+    graph
+        Result of `graph_of`.
+    path
+        File to write.
+
+    Returns
+    -------
+    float
+        Largest difference of any sample.
+
+    Raises
+    ------
+    CpunetError
+        If a package is missing or the file differs from the run by more than 1e-4.
+    """
+    with torch.no_grad(), warnings.catch_warnings():
+        # exporters warn of their own deprecations
+        warnings.simplefilter("ignore")
+        path.write_bytes(_program(graph))
+        providers = ["CPUExecutionProvider"]
+        session = _needed("onnxruntime").InferenceSession(str(path), providers=providers)
+        worst = 0.0
+        for n in CHECKED:
+            given = graph.example(n)
+            arrays = [values.numpy() for values in given]
+            (found,) = session.run(None, dict(zip(graph.inputs, arrays, strict=True)))
+            worst = max(worst, float(np.abs(found - graph.expected(given).numpy()).max()))
+    if not worst <= TOLERANCE:
+        raise CpunetError(f"{path}: the exported graph differs from the run by {worst:.1e}")
+    return worst
+
+
+def _program(graph: Graph) -> bytes:
+    for package in ("onnx", "onnxscript"):
+        _needed(package)
+    batch = torch.export.Dim("batch", min=1)
+    shapes = tuple({0: batch} for _ in graph.inputs)
+    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # it reports missing torchvision every time
+    try:
+        program = torch.onnx.export(
+            torch.export.export(graph.module, graph.example(TRACED), dynamic_shapes=shapes),
+            input_names=list(graph.inputs),
+            output_names=[graph.output],
+            opset_version=OPSET,
+            dynamo=True,
+            verbose=False,
+        )
+    except torch.onnx.OnnxExporterError as error:
+        raise CpunetError("ONNX has no operators for this run's U-Net") from error
+    finally:
+        logger.setLevel(level)
+    model = cast(Any, program).model_proto
+    model.ir_version = FORMAT
+    _needed("onnx").checker.check_model(model)
+    content: bytes = model.SerializeToString()
+    return content
+
+
+def _needed(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise CpunetError(
+            f"the package {package} is needed for ONNX; pip install 'cpunet-hpge[onnx]'"
+        ) from error

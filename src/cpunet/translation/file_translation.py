@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
@@ -28,19 +30,12 @@ from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import (
     AdcTraces,
     Formed,
-    OutputForm,
     Windows,
     adc_scale,
-    wanted_pile_up,
-    wanted_tails,
-)
-from cpunet.translation.noise_blocks import (
-    NOISE_ROWS,
-    Counts,
     interleaved,
     joined,
-    noise_seed,
-    regrouped,
+    wanted_pile_up,
+    wanted_tails,
 )
 from cpunet.translation.options import TranslateOptions
 from cpunet.translation.translator import IREN, REN, Translator
@@ -49,10 +44,45 @@ log = logging.getLogger(__name__)
 
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
+NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 OWN_COLUMNS = frozenset(
     {"waveform", "energy", "event_number", "rejection", "realisation", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
 )
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Numbers of rows: read, translated, rejected by reason, and saturated ones in ADC.
+
+    Of several files also their number, and how many were there already; 1 or 0 for a single
+    one.
+    """
+
+    read: int = 0
+    translated: int = 0
+    rejections: dict[str, int] = field(default_factory=dict)
+    saturated: int | None = None
+    files: int | None = None
+    skipped: int = 0
+
+    @classmethod
+    def of(cls, formed: Formed, *, adc: bool) -> Counts:
+        """Count the rows of a block."""
+        codes = np.bincount(formed.codes)
+        rejected = {Rejection(int(c)).label: int(codes[c]) for c in np.flatnonzero(codes) if c}
+        saturated = int(formed.saturated.sum()) if adc else None
+        return cls(len(formed.codes), int(codes[Rejection.ACCEPTED]), rejected, saturated)
+
+    def __add__(self, other: Counts) -> Counts:
+        known = [n for n in (self.saturated, other.saturated) if n is not None]
+        return Counts(
+            self.read + other.read,
+            self.translated + other.translated,
+            dict(Counter(self.rejections) + Counter(other.rejections)),
+            sum(known) if known else None,
+            skipped=self.skipped + other.skipped,
+        )
 
 
 class FileTranslation:
@@ -97,7 +127,7 @@ class FileTranslation:
         noise_key: str | None = None,
         resume: bool = False,
         force: bool = False,
-    ) -> dict[str, Any]:
+    ) -> Counts:
         """Translate a file, block by block, keeping its rows and other columns.
 
         Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
@@ -117,12 +147,6 @@ class FileTranslation:
         force
             Whether to replace an existing file.
 
-        Returns
-        -------
-        dict
-            ``read``, ``translated`` and ``rejections`` (counts of rows by reason); in ADC also
-            ``saturated``, and ``skipped`` for an output that was kept.
-
         Raises
         ------
         CpunetError
@@ -134,24 +158,24 @@ class FileTranslation:
         options = asdict(self.options) | {"noise_key": noise_key}
         provenance = {"source": before, "run": self._print, "options": options}
         if resume and not force and out.exists():
-            return finished(out, provenance) | {"skipped": True}
+            return replace(finished(out, provenance), skipped=1)
         refuse_existing(out, force=force)
         pulses = self.opened(source)
         others = _other_columns(pulses)
         with self.writer(out, force=force) as writer:
             counts = self._written(pulses, noise_key, writer, others)
-            summary = self._summary(source, counts)
+            self._require_some(source, counts)
             if source_print(source) != before:
                 raise CpunetError(
                     f"{source.path}: changed while it was read; translate it once it is "
                     "complete"
                 )
-            record = provenance | {"counts": summary, "cpunet": cpunet.__version__}
+            record = provenance | {"counts": asdict(counts), "cpunet": cpunet.__version__}
             # options given from Python may be numbers of NumPy
             writer.stamp(TRANSLATION, json.dumps(record, default=np.generic.item))
-        return summary
+        return counts
 
-    def in_memory(self, source: PulseFile) -> tuple[Formed, dict[str, Any]]:
+    def in_memory(self, source: PulseFile) -> tuple[Formed, Counts]:
         """Translated pulses of a file, and their counts, as those of `__call__`.
 
         Raises
@@ -159,10 +183,10 @@ class FileTranslation:
         CpunetError
             If the source cannot be used, or no pulse can be translated.
         """
-        counts, blocks = Counts(), list(self._blocks(self.opened(source), None))
-        for block in blocks:
-            counts.add(block)
-        return joined(blocks), self._summary(source, counts)
+        blocks = list(self._blocks(self.opened(source), None))
+        counts = sum((self._counts(block) for block in blocks), Counts())
+        self._require_some(source, counts)
+        return joined(blocks), counts
 
     def opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate.
@@ -193,7 +217,7 @@ class FileTranslation:
             force=force,
         )
 
-    def _form(self) -> OutputForm:
+    def _form(self) -> Windows | AdcTraces:
         adc = self.options.adc
         tails = wanted_tails(self.translator, self.options.tails, raw=adc is not None)
         pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
@@ -209,16 +233,16 @@ class FileTranslation:
             return f"translate the {self.kind.takes} ones that they were made of"
         return f"{'leave out' if self.options.inverse else 'give'} `inverse`"
 
-    def _summary(self, source: PulseFile, counts: Counts) -> dict[str, Any]:
-        """Counts of rows, of which some must be translated."""
-        summary = counts.summary(adc=self.options.adc is not None)
-        if not summary["translated"]:
-            reasons = ", ".join(f"{n} {why}" for why, n in summary["rejections"].items())
+    def _counts(self, formed: Formed) -> Counts:
+        return Counts.of(formed, adc=self.options.adc is not None)
+
+    def _require_some(self, source: PulseFile, counts: Counts) -> None:
+        if not counts.translated:
+            reasons = ", ".join(f"{n} {why}" for why, n in counts.rejections.items())
             raise CpunetError(
-                f"{source.path}: none of {summary['read']} pulses can be translated "
+                f"{source.path}: none of {counts.read} pulses can be translated "
                 f"({reasons}); are these {self.translator.takes} pulses?"
             )
-        return summary
 
     def _written(
         self,
@@ -232,7 +256,7 @@ class FileTranslation:
         for formed in self._blocks(pulses, noise_key):
             given = len(formed.codes) // times
             writer.append(formed.pulses, formed.columns, others.read(start, given, times))
-            counts.add(formed)
+            counts += self._counts(formed)
             start += given
         if pulses.n_pulses not in (None, start):
             raise CpunetError(
@@ -275,10 +299,8 @@ def _other_columns(pulses: PulseSource) -> RowColumns:
     return others
 
 
-def source_print(source: PulseFile) -> dict[str, Any]:
-    """Names, sizes and modification times of the input files, and how they are read.
-
-    Pulses in memory have a digest instead.
+def source_print(source: PulseFile) -> str:
+    """Digest of names, sizes and times of the input files, and of how they are read.
 
     Raises
     ------
@@ -287,29 +309,63 @@ def source_print(source: PulseFile) -> dict[str, Any]:
     """
     if source.pulses is not None:
         content = source.pulses.waveforms, source.pulses.energy_kev
-        digest = hashlib.sha256(b"".join(values.tobytes() for values in content))
-        return {"files": [], "sha256": digest.hexdigest()}
+        return hashlib.sha256(b"".join(values.tobytes() for values in content)).hexdigest()
     paths = [source.path]
     elsewhere = (source.energy or "").rpartition(":")[0]
     if elsewhere and Path(elsewhere).is_file():
         paths.append(Path(elsewhere))
-    prints = []
+    known: list[Any] = [source.table, source.energy, source.kev_per_adc, source.dt_ns]
     for path in paths:
         try:
             stat = path.stat()
         except OSError:
             raise CpunetError(f"{path}: no such file; check the name") from None
-        prints.append({"name": path.name, "bytes": stat.st_size, "changed": stat.st_mtime_ns})
-    return {
-        "files": prints,
-        "table": source.table,
-        "energy": source.energy,
-        "kev_per_adc": source.kev_per_adc,
-        "dt_ns": source.dt_ns,
-    }
+        known.append((path.name, stat.st_size, stat.st_mtime_ns))
+    return hashlib.sha256(repr(known).encode(errors="surrogateescape")).hexdigest()
 
 
-def finished(out: Path, wanted: dict[str, Any]) -> dict[str, Any]:
+def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> int:
+    """Seed of the noise of a block of a file.
+
+    Parameters
+    ----------
+    seed
+        Seed of the translation.
+    key
+        Name of the file or the channel; None for a single file, whose first block then has
+        `seed` itself, as in `cpunet.translation.translator.Translator.translate`.
+    block
+        Number of the block in the file.
+    realisation
+        Number of times that its noise was drawn before.
+    """
+    if key is None and block == realisation == 0:
+        return int(seed)
+    # names of files need not be UTF-8
+    digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
+    words = [seed, block, realisation, int.from_bytes(digest[:16])]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:
+    """The same pulses in blocks of `size`, the last one shorter.
+
+    Examples
+    --------
+    >>> pulses = Pulses.of(np.zeros((7, 2)), dt_ns=16)
+    >>> [len(block) for block in regrouped([pulses[:2], pulses[2:3], pulses[3:]], 3)]
+    [3, 3, 1]
+    """
+    waiting: list[Pulses] = []
+    for block in blocks:
+        waiting = [Pulses.concatenate([*waiting, block])]
+        while len(waiting[0]) >= size:
+            yield waiting[0][:size]
+            waiting = [waiting[0][size:]]
+    yield from (rest for rest in waiting if len(rest))
+
+
+def finished(out: Path, wanted: dict[str, Any]) -> Counts:
     """Counts of an existing output that was made as requested.
 
     Parameters
@@ -341,4 +397,4 @@ def finished(out: Path, wanted: dict[str, Any]) -> dict[str, Any]:
             names = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
             other = f"other options ({', '.join(names)})"
         raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
-    return dict(found["counts"])
+    return Counts(**found["counts"])

@@ -10,7 +10,6 @@ baseline before them and with the decay fitted to their end after them, both wit
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -63,33 +62,11 @@ class Formed:
         return {"rejection": (self.codes, ""), **self.truth}
 
 
-class OutputForm(Protocol):
-    """An output form: translates pulses and defines type and units of the samples.
-
-    Attributes
-    ----------
-    samples : numpy dtype
-        Data type of the stored samples.
-    units : str
-        Units of the samples.
-    t0_ns : float
-        Time of the first sample in ns, counted from where a pulse reaches 99.9 % of its
-        maximum.
-    """
-
-    samples: npt.DTypeLike
-    units: str
-    t0_ns: float
-
-    def __call__(
-        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
-    ) -> Formed:
-        """Translate pulses, keeping their rows."""
-        ...
-
-
 class Windows:
     """Prepared windows: baseline at 0, tail at 0.80; NaN for rejected pulses.
+
+    As `AdcTraces` it tells ``samples`` and ``units``, type and units of the stored samples, and
+    ``t0_ns``, the time of the first one from where a pulse reaches 99.9 % of its maximum.
 
     Parameters
     ----------
@@ -254,6 +231,33 @@ class AdcTraces:
                 levels += other.added(shapes, energies, self.ren.dt_ns, self.length)
             traces[rows] = levels
         return traces, codes
+
+
+def joined(blocks: list[Formed]) -> Formed:
+    """The rows of all blocks."""
+    return Formed(
+        Pulses.concatenate([block.pulses for block in blocks]),
+        np.concatenate([block.codes for block in blocks]),
+        np.concatenate([block.saturated for block in blocks]),
+        {
+            name: (np.concatenate([block.truth[name][0] for block in blocks]), units)
+            for name, (_, units) in blocks[0].truth.items()
+        },
+    )
+
+
+def interleaved(realisations: list[Formed]) -> Formed:
+    """Realisations of the same pulses as numbered rows: all of a pulse, then of the next."""
+    if len(realisations) == 1:
+        return realisations[0]
+    number, given = len(realisations), len(realisations[0].codes)
+    rows, whole = (
+        np.arange(number * given).reshape(number, given).T.ravel(),
+        joined(realisations),
+    )
+    truth = {name: (values[rows], units) for name, (values, units) in whole.truth.items()}
+    truth["realisation"] = (np.tile(np.arange(number), given), "")
+    return Formed(whole.pulses[rows], whole.codes[rows], whole.saturated[rows], truth)
 
 
 def to_adc(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.shape_parameters import MAX_BINS, all_parameters, data_axis, labelled
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
+from cpunet.translation.file_translation import Counts
 from cpunet.translation.forms import Formed
 
 if TYPE_CHECKING:
@@ -41,8 +42,7 @@ class Translation:
     recipe
         Recipe of the run.
     counts
-        Row counts: ``read``, ``translated``, ``rejections`` by reason; ``saturated`` in ADC;
-        of several files also ``files`` and ``skipped``.
+        Numbers of rows read, translated and rejected, and of several files.
     adc
         Whether the pulses are raw traces in ADC counts instead of normalised windows.
     path
@@ -55,7 +55,7 @@ class Translation:
 
     run: str
     recipe: Recipe
-    counts: Mapping[str, Any]
+    counts: Counts
     adc: bool = False
     path: Path | None = None
     kept: Formed | None = None
@@ -87,7 +87,7 @@ class Translation:
     @property
     def rejections(self) -> dict[str, int]:
         """Number of rows without a pulse, by reason."""
-        return dict(self.counts["rejections"])
+        return dict(self.counts.rejections)
 
     @cached_property
     def parameters(self) -> dict[str, npt.NDArray[np.float64]]:
@@ -132,7 +132,7 @@ class Translation:
         axes.plot(time_us, lines, color=COLOURS["ren"], lw=0.6, alpha=0.5)
         axes.set_xlabel("Time [µs]")
         axes.set_ylabel("ADC counts" if self.adc else "Pulse height")
-        axes.set_title(f"{len(rows)} of {self.counts['translated']} translated pulses")
+        axes.set_title(f"{len(rows)} of {self.counts.translated} translated pulses")
         return figure
 
     def to_dataframe(self) -> DataFrame:
@@ -163,37 +163,37 @@ class Translation:
         return self.path
 
     def __len__(self) -> int:
-        return int(self.counts["read"])
+        return self.counts.read
 
     def __str__(self) -> str:
         counts = self.counts
-        text = f"{counts['translated']} of {counts['read']} pulses translated"
-        if "files" in counts:
-            text = f"{counts['files']} files, {text}"
-        if counts.get("skipped"):
-            which = f"{counts['skipped']} files were" if "files" in counts else "it was"
+        text = f"{counts.translated} of {counts.read} pulses translated"
+        if counts.files:
+            text = f"{counts.files} files, {text}"
+        if counts.skipped:
+            which = f"{counts.skipped} files were" if counts.files else "it was"
             text += f" ({which} there already)"
         rejected = ", ".join(f"{n} {reason}" for reason, n in self.rejections.items())
         if rejected:
             text += f"; rows of {'0' if self.adc else 'NaN'} for {rejected}"
-        if counts.get("saturated"):
-            text += f"; {counts['saturated']} saturated"
+        if counts.saturated:
+            text += f"; {counts.saturated} saturated"
         return f"{self.path or 'in memory'}: {text}"
 
     def __repr__(self) -> str:
         where = "in memory" if self.path is None else str(self.path)
-        done = f"{self.counts['translated']} of {self.counts['read']} pulses"
+        done = f"{self.counts.translated} of {self.counts.read} pulses"
         return f"<Translation {where}: {done}>"
 
     def _repr_html_(self) -> str:
         facts: dict[str, object] = {
             "run": self.run,
             "file": self.path,
-            "translated": f"{self.counts['translated']} of {self.counts['read']} pulses",
+            "translated": f"{self.counts.translated} of {self.counts.read} pulses",
             "as": "raw traces in ADC" if self.adc else "normalised windows",
-            "saturated": self.counts.get("saturated"),
+            "saturated": self.counts.saturated,
         }
         facts |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
         small = self.kept is not None  # a file may be large
-        drawn = notebook_picture(self.plot()) if small and self.counts["translated"] else ""
+        drawn = notebook_picture(self.plot()) if small and self.counts.translated else ""
         return part("object", "cpunet translation", facts, picture=drawn)

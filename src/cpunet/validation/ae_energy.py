@@ -17,7 +17,7 @@ import scipy.optimize
 from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.plotting import GROUP, colours, group, label, panels, styled
+from cpunet.plotting import GROUP, colours, group, label, stacked, styled
 from cpunet.validation.a_over_e import DEP
 
 Values = npt.NDArray[np.float64]
@@ -160,9 +160,7 @@ def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
     methods
         ``methods`` of `against_energy`.
     """
-    figure, ((above,), (below,)) = panels(
-        (6.4, 5.6), 2, top=0.15, between=(0, 0.2), sharex=True
-    )
+    figure, above, below = stacked((6.4, 5.6), top=0.15)
     palette = colours(methods)
     for method, found in methods.items():
         points, colour = found["points"], palette[method]

@@ -17,12 +17,15 @@ import numpy.typing as npt
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes.schema import ScoreConfig
 from cpunet.validation.distances import (
+    Bins,
+    Draws,
+    Resampled,
     distance_errors,
     kolmogorov_smirnov,
     null_distances,
+    resampled_twice,
     wasserstein,
 )
-from cpunet.validation.resampling import Bins, Draws, Resampled, resampled_twice
 
 Values = npt.NDArray[np.float64]
 ByMethod = dict[str, float | None]
@@ -113,7 +116,7 @@ def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float,
     axis
         Common binning, see `data_axis`.
     draws
-        Bootstraps of the data, see `cpunet.validation.resampling.resampled_twice`.
+        Bootstraps of the data, see `cpunet.validation.distances.resampled_twice`.
 
     Returns
     -------
@@ -125,7 +128,7 @@ def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float,
     With all data in one bin nothing scatters:
 
     >>> import numpy as np
-    >>> from cpunet.validation.resampling import resampled_twice
+    >>> from cpunet.validation.distances import resampled_twice
     >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
     >>> ceiling(np.full(50, 0.5), hist.axis.Regular(2, 0, 2), draws)
     (100.0, 0.0)

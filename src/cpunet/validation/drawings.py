@@ -14,8 +14,7 @@ from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import data_axis
-from cpunet.validation.a_over_e import DEP
-from cpunet.validation.ae_drift_time import ae_figure
+from cpunet.validation.a_over_e import DEP, ae_figure
 from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise

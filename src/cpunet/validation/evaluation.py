@@ -26,10 +26,15 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import IREN, REN
-from cpunet.validation.a_over_e import DEP, Range, survival_by_range, survival_table
-from cpunet.validation.ae_drift_time import ae_against_drift_time
+from cpunet.validation.a_over_e import (
+    DEP,
+    Range,
+    ae_against_drift_time,
+    survival_by_range,
+    survival_table,
+)
 from cpunet.validation.ae_energy import against_energy
-from cpunet.validation.methods import fit_baseline_methods, translate_all
+from cpunet.validation.methods import Responses, fit_baseline_methods, translate_all
 from cpunet.validation.peaks import (
     ByMethod,
     PeakSets,
@@ -38,7 +43,6 @@ from cpunet.validation.peaks import (
     score_peak,
 )
 from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
-from cpunet.validation.truth import Responses
 from cpunet.validation.verdicts import summaries, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
-from cpunet.plotting import colours, group, label, logarithmic, panels, styled
+from cpunet.plotting import colours, group, label, logarithmic, stacked, styled
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
@@ -108,9 +108,7 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
     palette = colours(methods)
     frequency = np.asarray(found["frequency_mhz"])
-    figure, ((above,), (below,)) = panels(
-        (5.6, 4.4), 2, left=1.0, between=(0, 0.15), sharex=True, height_ratios=(3, 2)
-    )
+    figure, above, below = stacked((5.6, 4.4))
     data = np.asarray(found["data"]["power"])
     for method in methods:
         power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))

@@ -22,7 +22,7 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
-from cpunet.validation.score_figure import peak_figure
+from cpunet.validation.side_by_side import peak_figure
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
 AE_ENERGY = "A over E and energy"  # figure with a section of its own

@@ -19,9 +19,8 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.comparisons import Compared, compare
-from cpunet.validation.methods import Translations
+from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
 from cpunet.validation.noise import baseline_spectra
-from cpunet.validation.truth import PairedScores, scores_of_squares
 from cpunet.validation.two_sample import classifier_auc
 from cpunet.validation.when_asked import WhenAsked
 

@@ -19,14 +19,15 @@ from cpunet.electronics.baseline_methods import fitted_tail_slope, without_decay
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.plotting import (
     COLOURS,
-    DATA_FILL,
     GROUP,
     colours,
     label,
+    legend_above,
     legend_height,
     linear_within,
     logarithmic,
     panels,
+    steps,
     styled,
 )
 from cpunet.pulses.container import FloatArray
@@ -63,24 +64,16 @@ def spectrum_figure(energy_kev: Mapping[str, Values], peaks: Mapping[str, float]
     palette = colours(finite)
     figure, ((axes,),) = panels((7.5, 4.2), top=0.85)
     for method, values in finite.items():
-        is_data = method == "data"
         counts = np.histogram(values, edges)[0] / max(len(values), 1) / width
         unknown = len(energy_kev[method]) - len(values)
-        axes.stairs(
-            counts,
-            edges,
-            fill=is_data,
-            facecolor=DATA_FILL if is_data else None,
-            edgecolor="0.5" if is_data else palette[method],
-            linewidth=0.5 if is_data else 1.0,
-            label=f"{label(method)}, n = {len(values)}"
-            + (f", {unknown} without energy" if unknown else ""),
-            gid=GROUP + method,
-        )
+        text = f"{label(method)}, n = {len(values)}"
+        text += f", {unknown} without energy" if unknown else ""
+        colour = "0.5" if method == "data" else palette[method]
+        steps(axes, counts, edges, method, colour, text)
     axes.set(yscale="log", xlabel="Energy [keV]", ylabel="Fraction of events per keV")
     logarithmic(axes.yaxis)
     _mark_peaks(axes, peaks, (float(edges[0]), float(edges[-1])))
-    figure.legend(loc="outside upper left", ncols=len(finite))
+    legend_above(figure, axes, len(finite))
     return figure
 
 
@@ -186,7 +179,7 @@ def single_pulse_figure(
     data: DataPulse,
     dt_ns: float,
     samples_before: int,
-    title: str = "",
+    title: str,
 ) -> Figure:
     """One simulated pulse by every method beside the nearest measured pulse.
 
@@ -213,17 +206,9 @@ def single_pulse_figure(
     shown = {"data": data.window} | dict(pulses)
     slope = data.slope_per_ms
     windows = {m: np.asarray(w, np.float32)[np.newaxis] for m, w in shown.items()}
-    figure, grid = panels(
-        (9.5, 7.6),
-        3,
-        2,
-        left=0.95,
-        top=legend_height(1) + 0.25,
-        between=(0.2, 0.4),
-        sharey="row",
-        sharex="col",
-        height_ratios=(4, 4, 3),
-    )
+    shared: dict[str, Any] = {"sharey": "row", "sharex": "col", "height_ratios": (4, 4, 3)}
+    top = legend_height(1) + 0.25
+    figure, grid = panels((9.5, 7.6), 3, 2, top=top, between=(0.2, 0.4), **shared)
     _draw(list(grid[0]), windows, dt_ns)
     corrected = {
         m: without_decay(w, 0.0 if m == UNDECAYED else slope, dt_ns, samples_before).astype(
@@ -242,14 +227,8 @@ def single_pulse_figure(
     grid[2, 0].set_ylabel("Corrected: method −\ndata pulse [%]")
     for axes in grid[2]:
         axes.set_xlabel("Time from half maximum [ns]")
-    figure.legend(
-        *grid[0, 0].get_legend_handles_labels(),
-        loc="outside upper left",
-        ncols=len(shown),
-        title=f"{title + ': ' if title else ''}data pulse {data.row} is nearest to "
-        f"“{label(data.target)}”, RMS {data.rms:.4f}",
-        alignment="left",
-    )
+    beside = f"data pulse {data.row} is nearest to “{label(data.target)}”, RMS {data.rms:.4f}"
+    legend_above(figure, grid[0, 0], len(shown), f"{title}: {beside}")
     return figure
 
 

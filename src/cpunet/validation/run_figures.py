@@ -20,15 +20,17 @@ from matplotlib.ticker import MaxNLocator
 from cpunet.errors import CpunetError
 from cpunet.plotting import (
     COLOURS,
-    DATA_FILL,
     GROUP,
     colours,
     label,
+    legend_above,
     legend_height,
     line_look,
     linear_within,
     logarithmic,
     panels,
+    stacked,
+    steps,
     styled,
 )
 from cpunet.pulses.container import FloatArray
@@ -190,7 +192,7 @@ def parameter_histograms(
         score, missing = comparison["iou"].get(name), int(np.isnan(values[method]).sum())
         text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
         text += f", n = {len(values[method])}" + (f", {missing} undefined" if missing else "")
-        _steps(axes, heights, edges, method, palette[method], text)
+        steps(axes, heights, edges, method, palette[method], text)
     # the outermost bars can be as high as 1 and would flatten everything in between
     top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
     axes.set(
@@ -201,7 +203,7 @@ def parameter_histograms(
     )
     _mark_flow(axes, edges, fractions, palette)
     title = f"{peak}: bars beyond the dotted lines hold all events outside"
-    figure.legend(loc="outside upper left", title=title, alignment="left")
+    legend_above(figure, axes, title=title)
     return figure
 
 
@@ -235,7 +237,7 @@ def further_histograms(
         for method, share in shares.items():
             heights, edges = -y + 0.6 * share / height, x + 0.9 * (axis.edges - low) / width
             text = "" if number else label(method)
-            _steps(axes, heights, edges, method, palette[method], text, baseline=-y)
+            steps(axes, heights, edges, method, palette[method], text, baseline=-y)
         for tick in MaxNLocator(4).tick_values(low, low + width):
             if low <= tick <= low + width:
                 at = x + 0.9 * (tick - low) / width
@@ -247,12 +249,8 @@ def further_histograms(
         axes.text(x + 0.45, -y - 0.28, SHAPE_PARAMETERS[name].axis_label, ha="center")
     axes.set(xlim=(-0.02, COLUMNS), ylim=(-rows + 0.65, 0.65))
     axes.set_axis_off()
-    figure.legend(
-        loc="outside upper left",
-        ncols=len(methods),
-        title=f"{peak}: further parameters, fraction of events per bin, in the data's range",
-        alignment="left",
-    )
+    title = f"{peak}: further parameters, fraction of events per bin, in the data's range"
+    legend_above(figure, axes, len(methods), title)
     return figure
 
 
@@ -274,9 +272,7 @@ def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figur
     means = {method: averaged.mean for method, averaged in sets.items()}
     data = sets["data"]
     time_ns = (np.arange(len(data.mean)) - BEFORE) * dt_ns
-    figure, ((above,), (below,)) = panels(
-        (5.6, 4.8), 2, left=1.05, between=(0, 0.15), sharex=True, height_ratios=(3, 2)
-    )
+    figure, above, below = stacked((5.6, 4.8))
     # the translation last, so that it is on top
     for method in sorted(means, key=lambda name: name == "ren"):
         mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
@@ -334,7 +330,7 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     grid[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
     grid[0].yaxis.set_major_formatter("{x:g}")
     grid[0].yaxis.set_minor_formatter("")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    legend_above(figure, grid[0], 3)
     return figure
 
 
@@ -363,30 +359,6 @@ def drift_figure(before_ns: Values, longer: Values, blur_ns2: Values) -> Figure:
     right.set(ylabel="Gaussian σ [ns], negative: sharpened", title="Blur of the U-Net")
     left.legend()
     return figure
-
-
-def _steps(
-    axes: Axes,
-    heights: Values,
-    edges: Values,
-    method: str,
-    colour: str,
-    text: str,
-    baseline: float = 0,
-) -> None:
-    is_data = method == "data"
-    axes.stairs(
-        heights,
-        edges,
-        baseline=baseline,
-        fill=is_data,
-        facecolor=DATA_FILL if is_data else None,
-        edgecolor=colour,
-        linewidth=0.8 if is_data else 1.5,
-        label=text,
-        zorder=1 if is_data else 2,
-        gid=GROUP + method,
-    )
 
 
 def _mark_flow(

@@ -27,6 +27,7 @@ from cpunet.plotting import (
     GROUP,
     colours,
     label,
+    legend_above,
     legend_height,
     line_look,
     linear_within,
@@ -242,17 +243,9 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     """
     data = sets["data"]
     n = len(data.pulses)
-    figure, grid = panels(
-        (2.0 + 2.7 * n, 4.9),
-        2,
-        n,
-        left=1.1,
-        top=legend_height(1) + 0.25,
-        between=(0.2, 0.2),
-        sharex=True,
-        sharey="row",
-        height_ratios=(3, 2),
-    )
+    size, top = (2.0 + 2.7 * n, 4.9), legend_height(1) + 0.25
+    shared: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
+    figure, grid = panels(size, 2, n, left=1.1, top=top, between=(0.2, 0.2), **shared)
     time_ns = dt_ns * np.arange(-BEFORE, len(data.pulses[0].mean) - BEFORE, dtype=float)
     palette = colours(sets)
     for i, axes in enumerate(grid[0]):
@@ -278,15 +271,8 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     linear_within(grid[1, 0], LINEAR)
     grid[1, 0].set_ylabel(f"Method − data\n[% of full charge,\nlinear within ± {LINEAR:g}]")
     grid[0, 0].set_ylabel("Pulse height")
-    handles, names = grid[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        names,
-        loc="outside upper left",
-        ncols=len(names),
-        title=f"{peak}: superpulses in slices of rise time 1–90 %; bands: ±1 standard error",
-        alignment="left",
-    )
+    title = f"{peak}: superpulses in slices of rise time 1–90 %; bands: ±1 standard error"
+    legend_above(figure, grid[0, 0], len(sets), title)
     grid[0, 0].set_xlim(time_ns[0], time_ns[-1])
     return figure
 
