@@ -659,7 +659,7 @@ def test_runs_that_tell_of_no_tails(run, network, tmp_path):
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of pile-up tails"):
             translate(folder, source, tmp_path / "o.lh5", tails="1")
-        with pytest.raises(CpunetError, match="does not tell the energies of other pulses"):
+        with pytest.raises(CpunetError, match=r"tells nothing of .* other pulses"):
             translate(folder, source, tmp_path / "o.lh5", pile_up_khz=1)
 
 

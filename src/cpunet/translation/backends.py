@@ -91,12 +91,8 @@ class Backend(ABC):
     network: nn.Module
     needs_energies: ClassVar[bool] = False
     chain: ResponseGenerator | None = None
+    noise: BaselineNoise | None = None
     tails: DrawnTails | None = None
-
-    @property
-    def noise(self) -> BaselineNoise | None:
-        """Noise that is added to the output of the network, if any."""
-        return None
 
     @property
     def device(self) -> torch.device:
@@ -154,12 +150,8 @@ class NoisyNetworkBackend(NetworkBackend):
         tails: DrawnTails | None = None,
     ) -> None:
         super().__init__(network)
-        self.kept, self.config, self.tails = kept, config, tails
-
-    @property
-    def noise(self) -> BaselineNoise:
-        """Noise of the data's baselines."""
-        return self.kept.noise
+        self.noise, self.dt_ns = kept.noise, kept.noise_dt_ns
+        self.config, self.tails = config, tails
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network, add noise in proportion to 1/energy, and prepare like data."""
@@ -170,7 +162,7 @@ class NoisyNetworkBackend(NetworkBackend):
         if energy_kev is None or not drawn.noise:
             return clean, codes
         seed = drawn.seed(self.device)
-        dt_ns = self.kept.noise_dt_ns
+        dt_ns = self.dt_ns
         records = with_room(clean, self.config, dt_ns)
         added = None
         if drawn.others:
@@ -199,13 +191,8 @@ class ResponseBackend(Backend):
 
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
         self.network = self.chain = generator.eval()
-        self.tails = generator.tails
-        self.config = config
-
-    @property
-    def noise(self) -> BaselineNoise:
-        """Noise of the data's baselines."""
-        return self.chain.noise
+        self.noise, self.tails = generator.noise, generator.tails
+        self.config, self.dt_ns = config, float(generator.response.dt_ns)
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
@@ -220,7 +207,7 @@ class ResponseBackend(Backend):
         return finish(
             records,
             self.config,
-            dt_ns=float(self.chain.response.dt_ns),
+            dt_ns=self.dt_ns,
             noise=self.noise if drawn.noise else None,
             energy_kev=energy_kev if drawn.noise else None,
             seed=seed,
@@ -248,20 +235,19 @@ class ResponseBackend(Backend):
         with torch.inference_mode():
             records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
-        pulses = Pulses.of(records, dt_ns=float(self.chain.response.dt_ns))
+        pulses = Pulses.of(records, dt_ns=self.dt_ns)
         return records, prepare(pulses, config, "measured")
 
     def _piled(
         self, windows: FloatArray, energy_kev: Energies, piled: InTracePileUp, length: int
     ) -> npt.NDArray[np.float64]:
         """Piled-up pulses with shapes of the same batch, at each sample in prepared units."""
-        dt_ns = float(self.chain.response.dt_ns)
         # early piled-up pulses need longer records
-        reach = ((0, 0), (0, piled.reach(dt_ns)))
+        reach = ((0, 0), (0, piled.reach(self.dt_ns)))
         shapes, clean = self._clean(np.pad(windows[piled.partner], reach, mode="edge"))
         scale = np.full(len(shapes), np.median(clean.scale))
         scale[clean.index] = clean.scale
-        return piled.added(shapes / scale[:, np.newaxis], energy_kev, dt_ns, length)
+        return piled.added(shapes / scale[:, np.newaxis], energy_kev, self.dt_ns, length)
 
 
 class InverseBackend(Backend):

@@ -364,7 +364,7 @@ def rng_of(generator: torch.Generator | None) -> np.random.Generator:
 def wanted_tails(
     translator: Translator, wanted: str | float, *, raw: bool = False
 ) -> DrawnTails | None:
-    """Pile-up tails, pile-up tails, to add to translations.
+    """Pile-up tails to add to translations.
 
     Parameters
     ----------
@@ -390,13 +390,7 @@ def wanted_tails(
             rate = np.nan
         if not (np.isfinite(rate) and rate >= 0):
             raise CpunetError(f"`tails` {wanted}: expected learned, none, or a rate in kHz")
-    known = translator.tails
-    if known is None:
-        raise CpunetError(
-            f"`tails` {wanted}: the run tells nothing of pile-up tails (a "
-            "network, trained before they were told, or without raw traces); train a readout "
-            "chain on raw traces, or leave it out"
-        )
+    known = _known_tails(translator, f"`tails` {wanted}")
     if rate is not None:
         known = known.uncut(rate)
     elif raw:
@@ -423,11 +417,15 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
         raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
     if rate_khz == 0:
         return None
-    known = translator.tails
-    if known is None:
-        raise CpunetError(
-            f"`pile_up_khz` {rate_khz:g}: the run does not tell the energies of other pulses "
-            "(a network, trained before they were told, or without raw traces); train a "
-            "readout chain on raw traces, or leave it out"
-        )
+    known = _known_tails(translator, f"`pile_up_khz` {rate_khz:g}")
     return DrawnPileUp(rate_khz, known.law.energies_kev, translator.dt_ns)
+
+
+def _known_tails(translator: Translator, asked: str) -> DrawnTails:
+    if translator.tails is None:
+        raise CpunetError(
+            f"{asked}: the run tells nothing of pile-up tails and of other pulses (a network, "
+            "or trained without raw traces)",
+            "train a readout chain on raw traces, or leave it out",
+        )
+    return translator.tails

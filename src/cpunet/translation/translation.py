@@ -105,9 +105,7 @@ class Translation:
             )
         return all_parameters(self.pulses, self.recipe.preparation, self.recipe.scores)
 
-    def hist(
-        self, parameter: str = "current_amplitude", max_bins: int = MAX_BINS
-    ) -> hist.Hist[Any]:
+    def hist(self, parameter: str = "current_amplitude") -> hist.Hist[Any]:
         """Distribution of a parameter as a `hist.Hist`.
 
         Raises
@@ -116,7 +114,7 @@ class Translation:
             If there is no such parameter.
         """
         values = named(self.parameters, parameter, "parameter")
-        axis = labelled(data_axis(values, max_bins), parameter)
+        axis = labelled(data_axis(values, MAX_BINS), parameter)
         made: hist.Hist[Any] = hist.Hist(axis)
         return made.fill(values[np.isfinite(values)])
 

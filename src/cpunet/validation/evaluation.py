@@ -39,7 +39,6 @@ from cpunet.validation.peaks import (
     ByMethod,
     PeakSets,
     current_amplitudes,
-    peak_sets,
     score_peak,
 )
 from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
@@ -75,7 +74,7 @@ class PeakDetails:
             {m: v[name] for m, v in noisy.items()}
             for name in ("rise_01_90", "current_amplitude", "drift_time")
         )
-        means, slices = aligned_means(peak.by_method(), rise)
+        means, slices = aligned_means(peak.pulses, rise)
         return cls(means, slices, ae_against_drift_time(amplitude, time))
 
 
@@ -143,26 +142,28 @@ def evaluate(
     )
     translations = translate_all(ren, baseline_methods, sim_set, responses, seed)
     amplitudes = current_amplitudes(sim_set, data_set, translations)
-    sets = [
-        peak_sets(name, recipe, sim_set, data_set, translations, amplitudes) for name in names
-    ]
+    simulated, measured = sim_set.prepared.pulses, data_set.prepared.pulses
+    sets = []
+    for name in names:
+        chosen = parse_selection(name, recipe.peaks)
+        in_sim = np.flatnonzero(chosen.select(simulated.energy_kev))
+        in_data = np.flatnonzero(chosen.select(measured.energy_kev))
+        one = PeakSets(name, simulated, measured, in_sim, in_data, translations, amplitudes)
+        sets.append(one)
     values: dict[str, ByMethod] = {}
     peaks: dict[str, Any] = {}
+    details: dict[str, PeakDetails] = {}
     with stage("Scoring", len(sets)) as bar:
         for peak in sets:
             values[peak.name], peaks[peak.name] = score_peak(peak, recipe, seed)
+            if values[peak.name]:
+                details[peak.name] = PeakDetails.of(peak, values[peak.name])
             bar.update(1)
-    scored = [peak for peak in sets if values[peak.name]]
-    if not scored:
+    if not details:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    details: dict[str, PeakDetails] = {}
-    with stage("Comparing in detail", len(scored)) as bar:
-        for peak in scored:
-            details[peak.name] = PeakDetails.of(peak, values[peak.name])
-            bar.update(1)
     kept = survival_table(
         {
             name: {method: v["current_amplitude"] for method, v in values[name].items()}
@@ -170,8 +171,8 @@ def evaluate(
         },
         seed=seed,
     )
-    data_kev, sim_kev = (side.prepared.pulses.energy_kev for side in (data_set, sim_set))
-    energies = {method: data_kev if method == "data" else sim_kev for method in amplitudes}
+    sides = {m: measured if m == "data" else simulated for m in amplitudes}
+    energies = {method: side.energy_kev for method, side in sides.items()}
     known = None if run.fit is None else run.fit.tails
     metrics = {
         "compared": _compared(run, sim_set, data_set),

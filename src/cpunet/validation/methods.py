@@ -85,19 +85,11 @@ class Responses:
         CpunetError
             At the end, if none of them is finite.
         """
-        traces, finite = self._values, False
-        waiting = np.empty((0, traces.shape[1]), np.float32)
-        for first in range(0, len(traces), size):
-            rows = traces[first : first + size]
-            begin, end = np.searchsorted(self._index, [first, first + len(rows)])
-            chosen = rows[self._index[begin:end] - first].astype(np.float32)
-            finite = finite or bool(np.isfinite(chosen).all(axis=1).any())
-            waiting = np.concatenate([waiting, chosen])
-            if len(waiting) >= size:
-                yield waiting[:size]
-                waiting = waiting[size:]
-        if len(waiting):
-            yield waiting
+        finite = False
+        for first in range(0, len(self._index), size):
+            rows = self._values[self._index[first : first + size]].astype(np.float32)
+            finite = finite or bool(np.isfinite(rows).all(axis=1).any())
+            yield rows
         if len(self._index) and not finite:
             raise CpunetError(f"{self._path}: no response is finite; give noise-free traces")
 

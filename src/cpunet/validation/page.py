@@ -37,7 +37,6 @@ PLACES = {
     "further parameters": "further",
     **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
 }
-MANY = 4  # a larger number of figures is collapsed
 
 
 def write_page(
@@ -75,32 +74,16 @@ def write_page(
         "report.html",
         title="CPU-Net validation",
         compared={name: number(v) for name, v in metrics.get("compared", {}).items()},
-        first=_gallery(placed["first"]),
+        placed=placed,
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts", {})),
         methods=[{"name": m, "label": label(m), "colour": c} for m, c in palette.items()],
         scores=scores,
-        distributions=_grid(placed["distributions"]),
-        further=_folded("Further parameters", _grid(placed["further"]), screen=True),
-        slices=_grid(placed["slices"]),
-        pulses=part("grid", "single", placed["pulses"]),
         survival=survival_html(metrics.get("ae_survival", {})),
-        ae=joined(
-            [
-                _gallery(placed["ae"]),
-                _folded("Survival by ranges of energy", ranges_table(ranges), screen=True),
-                _folded("A/E against drift time, as figures", _grid(placed["ae_drift"])),
-            ]
-        ),
+        ranges=ranges_table(ranges),
         ae_energy=ae_energy,
         multi_site=metrics.get("ae_energy", {}).get("multi_site"),
-        noise=joined(
-            [
-                _gallery(placed["noise"]),
-                _folded("Its size", noise_table(metrics.get("noise", {})), screen=True),
-            ]
-        ),
-        figures=_gallery(placed["others"]),
+        noise=noise_table(metrics.get("noise", {})),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
         script=Markup(asset("report.js")),
@@ -124,20 +107,6 @@ def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, li
         names["others"] += [name for name in names[place] if name not in few]
         names[place] = few
     return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
-
-
-def _folded(title: str, content: Markup, *, screen: bool = False) -> Markup:
-    return part("folded", title, content, screen=screen) if content.strip() else Markup()
-
-
-def _gallery(drawn: Sequence[Markup]) -> Markup:
-    if len(drawn) <= MANY:
-        return _grid(drawn)
-    return _folded(f"{len(drawn)} figures, also as files beside this page", _grid(drawn))
-
-
-def _grid(drawn: Sequence[Markup]) -> Markup:
-    return part("grid", "figures", drawn)
 
 
 def verdicts_html(verdicts: Mapping[str, Any]) -> Markup:
@@ -172,7 +141,9 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
         part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses"),
         part("p", f"Not scored: {scores['missing']}.")
         if "missing" in scores
-        else _grid([figure_html(f"{peak} scores", peak_figure(peak, scores))]),
+        else part(
+            "grid", "figures", [figure_html(f"{peak} scores", peak_figure(peak, scores))]
+        ),
     ]
     if chief:
         parts.append(part("folded", "Scores as a table", _parameter_table(chief)))
@@ -289,7 +260,7 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
         )
     head = ["Method", "Slope [% per MeV]", "χ² / degrees", "Width at all energies [%]"]
     head += ["Noise [keV]", f"Width at {REFERENCE_KEV:g} keV [%]"]
-    return joined([_table(head, rows, words={0}), _grid([figure])])
+    return joined([_table(head, rows, words={0}), part("grid", "figures", [figure])])
 
 
 def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:

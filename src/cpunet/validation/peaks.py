@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,12 @@ from cpunet.plotting import NO_NOISE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import PARAMETERS, Values, current_amplitude
-from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.comparisons import Compared, compare
 from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
 from cpunet.validation.noise import baseline_spectra
 from cpunet.validation.two_sample import classifier_auc
-from cpunet.validation.when_asked import WhenAsked
 
 MIN_PULSES = 10  # minimum number of pulses of a distribution
 
@@ -81,19 +78,18 @@ class PeakSets:
             else self._prepared(self.translations.whole[method])
         )
 
-    def by_method(self) -> WhenAsked[Pulses]:
-        """Pulses with noise by method: the data, then from the simplest method to the truth.
+    @property
+    def methods(self) -> list[str]:
+        """The data, then the methods with noise from the simplest to the truth."""
+        translated = self.translations.whole
+        enough = [m for m in translated if len(self.rows(m)) >= MIN_PULSES or m == "ren"]
+        return ["data", "raw", *enough]
 
-        They are copied from the whole dataset on every access.
-        """
-        makers: dict[str, Callable[[], Pulses]] = {
-            "data": lambda: self.data,
-            "raw": lambda: self.raw,
-        }
-        for name in self.translations.whole:
-            if len(self.rows(name)) >= MIN_PULSES or name == "ren":
-                makers[name] = partial(self._noisy, name)
-        return WhenAsked(makers)
+    def pulses(self, method: str) -> Pulses:
+        """Pulses with noise of a method, copied from its whole dataset."""
+        if method in ("data", "raw"):
+            return self.data if method == "data" else self.raw
+        return Pulses.of(self.translations.noisy[method][self.rows(method)], dt_ns=self.dt_ns)
 
     def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
         """Parameters of the noise-free pulses of the baseline methods and of the truth."""
@@ -141,9 +137,6 @@ class PeakSets:
     def _prepared(self, flags: npt.NDArray[np.bool_]) -> Rows:
         return self.sim_rows[flags[self.sim_rows]]
 
-    def _noisy(self, name: str) -> Pulses:
-        return Pulses.of(self.translations.noisy[name][self.rows(name)], dt_ns=self.dt_ns)
-
 
 def current_amplitudes(
     sim_set: InputSet, data_set: InputSet, translations: Translations
@@ -155,35 +148,6 @@ def current_amplitudes(
         "data": data_set.prepared.pulses.waveforms,
     }
     return {method: current_amplitude(of_method) for method, of_method in windows.items()}
-
-
-def peak_sets(
-    name: str,
-    recipe: Recipe,
-    sim_set: InputSet,
-    data_set: InputSet,
-    translations: Translations,
-    amplitudes: Mapping[str, Values],
-) -> PeakSets:
-    """Select the pulses of one peak, or of a range of energies, from both datasets.
-
-    Parameters
-    ----------
-    name
-        Name of a peak of the recipe, or a range in keV.
-    recipe
-        Recipe of the run.
-    sim_set, data_set
-        Prepared pulses of both sides.
-    translations
-        Translations of the simulated pulses by all methods.
-    amplitudes
-        Result of `current_amplitudes`.
-    """
-    selection = parse_selection(name, recipe.peaks)
-    sim, data = sim_set.prepared.pulses, data_set.prepared.pulses
-    rows = [np.flatnonzero(selection.select(side.energy_kev)) for side in (sim, data)]
-    return PeakSets(name, sim, data, rows[0], rows[1], translations, amplitudes)
 
 
 def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:
@@ -214,18 +178,17 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
     missing = peak.missing()
     if missing is not None:
         return {}, scores | {"parameters": {}, "missing": missing}
-    pulses = peak.by_method()
     values = {
         method: all_parameters(
-            of_method,
+            peak.pulses(method),
             recipe.preparation,
             recipe.scores,
             amplitudes=peak.amplitudes[method][peak.rows(method)],
         )
-        for method, of_method in pulses.items()
+        for method in peak.methods
     } | peak.noise_free_parameters()
     chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
-    scores["two_sample"] = classifier_tests(pulses, chief, seed)
+    scores["two_sample"] = classifier_tests(peak, chief, seed)
     scores["parameters"] = _compared(chief, recipe, seed)
     further = {
         method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
@@ -234,13 +197,11 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
     }
     scores["further"] = _compared(further, recipe, seed)
     align, dt_ns = recipe.preparation.samples_before, peak.dt_ns
+    samples = recipe.preparation.baseline_samples
     scores["noise"] = baseline_spectra(
-        {
-            method: of_method.waveforms[:, : recipe.preparation.baseline_samples].copy()
-            for method, of_method in pulses.items()
-        },
-        {method: align + values[method]["t01"] / dt_ns for method in pulses},
-        recipe.preparation.baseline_samples,
+        {method: peak.pulses(method).waveforms[:, :samples].copy() for method in peak.methods},
+        {method: align + values[method]["t01"] / dt_ns for method in peak.methods},
+        samples,
         dt_ns,
     )
     paired = peak.paired_scores()
@@ -254,17 +215,15 @@ def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Compared
     return compare(values["data"], methods, recipe.scores, seed)
 
 
-def classifier_tests(
-    pulses: Mapping[str, Pulses], values: ByMethod, seed: int
-) -> dict[str, Any]:
+def classifier_tests(peak: PeakSets, values: ByMethod, seed: int) -> dict[str, Any]:
     """Classifier test between each method and the data, for one peak.
 
     Parameters
     ----------
-    pulses
-        Prepared pulses with noise by method, including ``"data"``.
+    peak
+        Pulses of the peak.
     values
-        Pulse-shape parameters of the pulses.
+        Pulse-shape parameters of those with noise, by method.
     seed
         Seed of the folds.
 
@@ -275,19 +234,11 @@ def classifier_tests(
         reason.
     """
     tested: dict[str, Any] = {}
-    data = pulses["data"].waveforms
-    for method, others in pulses.items():
-        if method == "data":
-            continue
+    data = peak.data.waveforms
+    for method in peak.methods[1:]:
+        others, features = peak.pulses(method).waveforms, (values["data"], values[method])
         try:
-            result = classifier_auc(
-                data,
-                others.waveforms,
-                seed=seed,
-                features=(values["data"], values[method]),
-            )
+            tested[method] = asdict(classifier_auc(data, others, seed=seed, features=features))
         except CpunetError as error:
             tested[method] = {"missing": str(error)}
-        else:
-            tested[method] = asdict(result)
     return tested

@@ -21,7 +21,6 @@ from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.settings import plain, read_json
 from cpunet.tables import text_table
 from cpunet.validation.verdicts import judged_scores
-from cpunet.validation.when_asked import WhenAsked
 
 if TYPE_CHECKING:
     import hist
@@ -126,23 +125,19 @@ class Report:
     @property
     def figures(self) -> Mapping[str, Figure]:
         """Figures by name, drawn on every access."""
-        return WhenAsked(self.drawn or {})
+        return _Figures(self.drawn or {})
 
     def to_dict(self) -> dict[str, Any]:
         """The metrics, ready for JSON: numbers that are not finite are None."""
         return dict(plain(self.metrics))
 
-    def hist(
-        self, peak: str, parameter: str = "current_amplitude", max_bins: int | None = None
-    ) -> hist.Hist[Any]:
-        """Distributions of a parameter by method.
+    def hist(self, peak: str, parameter: str = "current_amplitude") -> hist.Hist[Any]:
+        """Distributions of a parameter by method, in the bins in which it is scored.
 
         Parameters
         ----------
         peak, parameter
             Names of both.
-        max_bins
-            Maximum number of bins; None for the bins in which the parameter is scored.
 
         Returns
         -------
@@ -164,8 +159,8 @@ class Report:
         scored = self._compared(peak).get(parameter, {}).get("axis", {})
         axis = (
             hist.axis.Regular(int(scored["bins"]), scored["low"], scored["high"])
-            if max_bins is None and scored.get("bins")
-            else data_axis(data, max_bins or MAX_BINS)
+            if scored.get("bins")
+            else data_axis(data, MAX_BINS)
         )
         methods = hist.axis.StrCategory(list(there), name="method")
         made: hist.Hist[Any] = hist.Hist(methods, labelled(axis, parameter))
@@ -231,27 +226,17 @@ class Report:
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         with stage("Drawing", len(self.drawn)) as bar, _few_collections():
             figures = {name: partial(_drawn, one, bar) for name, one in self.drawn.items()}
-            write_page(folder, metrics, WhenAsked(figures), self.notes)
+            write_page(folder, metrics, _Figures(figures), self.notes)
 
     def __str__(self) -> str:
-        return "\n".join(self.lines())
-
-    def lines(self, leave_out: Sequence[str] = ()) -> list[str]:
-        """What is printed: a table of IoU, peaks without scores, the page.
-
-        Parameters
-        ----------
-        leave_out
-            Peaks that are not shown.
-        """
-        head, rows = self._table(_METHODS, leave_out)
+        head, rows = self._table(_METHODS)
         names = [_METHODS.get(name, name) for name in head]
         rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
         lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
         for peak, scores in self.metrics["peaks"].items():
-            if "missing" in scores and peak not in leave_out:
+            if "missing" in scores:
                 lines.append(f"{peak}: not scored, {scores['missing']}")
-        return lines if self.folder is None else [*lines, str(self.folder / PAGE)]
+        return "\n".join(lines if self.folder is None else [*lines, str(self.folder / PAGE)])
 
     def __repr__(self) -> str:
         where = "" if self.folder is None else f" {self.folder}"
@@ -287,14 +272,11 @@ class Report:
             if method != "ceiling"
         ]
 
-    def _table(
-        self, methods: Iterable[str], leave_out: Sequence[str] = ()
-    ) -> tuple[list[str], list[list[str]]]:
+    def _table(self, methods: Iterable[str]) -> tuple[list[str], list[list[str]]]:
         """IoU by peak and parameter, of the methods that have any."""
         of_all = {
             (peak, parameter): compared["iou"]
             for peak in self.metrics["peaks"]
-            if peak not in leave_out
             for parameter, compared in self._compared(peak).items()
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
@@ -319,6 +301,22 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str
             f"{file}: holds no scores by peak", "give a report of cpunet validate"
         )
     return content
+
+
+class _Figures(Mapping[str, "Figure"]):
+    """Figures that exist only while they are used: drawn on every access."""
+
+    def __init__(self, drawn: Mapping[str, Callable[[], Figure]]) -> None:
+        self._drawn = drawn
+
+    def __getitem__(self, name: str) -> Figure:
+        return self._drawn[name]()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._drawn)
+
+    def __len__(self) -> int:
+        return len(self._drawn)
 
 
 @contextmanager

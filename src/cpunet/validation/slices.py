@@ -15,7 +15,7 @@ counts against it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -128,7 +128,7 @@ def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
 
 
 def aligned_means(
-    windows: Mapping[str, Pulses], rise_time: Mapping[str, Values]
+    pulses: Callable[[str], Pulses], rise_time: Mapping[str, Values]
 ) -> tuple[dict[str, MeanPulse], dict[str, Slices]]:
     """Mean pulse of all pulses and of each slice, by method.
 
@@ -136,14 +136,14 @@ def aligned_means(
 
     Parameters
     ----------
-    windows
-        Prepared pulses by method, the measured ones under ``"data"``.
+    pulses
+        Prepared pulses of a method.
     rise_time
-        Their rise times in ns.
+        Their rise times in ns by method, those of the measured pulses under ``"data"``.
     """
     edges, means, slices = slice_edges(rise_time["data"]), {}, {}
     for method, times in rise_time.items():
-        aligned = align_half_maximum(windows[method].waveforms, BEFORE, AFTER)
+        aligned = align_half_maximum(pulses(method).waveforms, BEFORE, AFTER)
         means[method] = MeanPulse.of(aligned)
         slices[method] = sliced(aligned, times, edges)
     return means, slices
