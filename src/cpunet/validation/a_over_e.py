@@ -265,7 +265,21 @@ def peak_survival(
         "scale": scale,
         "undefined": int((~finite & (in_peak | beside)).sum()),
     }
-    return result | _survival(counts, scale, peak, cut)
+    span = f"from {peak[0]:g} to {peak[1]:g} keV"
+    if not np.isfinite(cut):
+        missing = "there is no cut: too few events of the double-escape peak"
+        return result | {"missing": missing}
+    if not counts["peak"]:
+        return result | {"missing": f"no events {span}"}
+    n, passing = counts["peak"], counts["peak_pass"]
+    survival, std = sideband_survival(
+        passing, n, counts["sideband_pass"], counts["sideband"], scale
+    )
+    if not np.isfinite(survival):
+        return result | {"missing": f"the sidebands leave no events of {n} {span}"}
+    if not scale or not std:
+        std = 100 * survival_error(passing, n)
+    return result | {"survival": survival, "survival_std": std}
 
 
 def survival_by_range(
@@ -388,26 +402,6 @@ def _within(energy_kev: Values, ranges: Sequence[Range]) -> npt.NDArray[np.bool_
     for low, high in ranges:
         inside |= (energy_kev >= low) & (energy_kev < high)
     return inside
-
-
-def _survival(
-    counts: Mapping[str, int], scale: float, peak: Range, cut: float
-) -> dict[str, Any]:
-    if not np.isfinite(cut):
-        return {"missing": "there is no cut: too few events of the double-escape peak"}
-    if not counts["peak"]:
-        return {"missing": f"no events from {peak[0]:g} to {peak[1]:g} keV"}
-    survival, std = sideband_survival(
-        counts["peak_pass"], counts["peak"], counts["sideband_pass"], counts["sideband"], scale
-    )
-    if not np.isfinite(survival):
-        return {
-            "missing": f"the sidebands leave no events of {counts['peak']} "
-            f"from {peak[0]:g} to {peak[1]:g} keV"
-        }
-    if not scale or not std:
-        std = 100 * survival_error(counts["peak_pass"], counts["peak"])
-    return {"survival": survival, "survival_std": std}
 
 
 def ae_against_drift_time(

@@ -86,7 +86,16 @@ def baseline_spectra(
         if len(power) < MIN_BASELINES:
             found[method] = {"missing": f"{len(power)} baselines; {MIN_BASELINES} are needed"}
             continue
-        found[method] = {"samples": samples} | _summary(power)
+        n, mean, total = len(power), power.mean(axis=0), power.sum(axis=1)
+        rms = float(np.sqrt(total.mean()))
+        found[method] = {
+            "samples": samples,
+            "n": n,
+            "power": mean.tolist(),
+            "power_std": (power.std(axis=0, ddof=1) / np.sqrt(n)).tolist(),
+            "rms": rms,
+            "rms_std": float(total.std(ddof=1) / np.sqrt(n) / (2 * rms)) if rms else 0.0,
+        }
     data = found["data"]
     for method in windows:
         if method != "data" and "missing" not in data | found[method]:
@@ -157,19 +166,6 @@ def _band_powers(baselines: FloatArray, edges: Values) -> Values:
     return (
         np.asarray(np.add.reduceat(power, starts, axis=1)) if len(known) else power[:, starts]
     )
-
-
-def _summary(power: Values) -> dict[str, Any]:
-    n, mean = len(power), power.mean(axis=0)
-    total = power.sum(axis=1)
-    rms = float(np.sqrt(total.mean()))
-    return {
-        "n": n,
-        "power": mean.tolist(),
-        "power_std": (power.std(axis=0, ddof=1) / np.sqrt(n)).tolist(),
-        "rms": rms,
-        "rms_std": float(total.std(ddof=1) / np.sqrt(n) / (2 * rms)) if rms else 0.0,
-    }
 
 
 def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -268,8 +268,17 @@ def comparison_page(
     )
 
 
-def _overview(name: str, metrics: Metrics, method: str) -> dict[str, Any]:
+class Overview(NamedTuple):
     """Line of one run: how many scores are off, how it was trained, verdicts in words."""
+
+    name: str
+    text: str
+    marked: bool
+    about: str
+    lines: list[str]
+
+
+def _overview(name: str, metrics: Metrics, method: str) -> Overview:
     off, judged = judged_scores(metrics, method)
     training = part(metrics, "training")
     known = [
@@ -277,13 +286,10 @@ def _overview(name: str, metrics: Metrics, method: str) -> dict[str, Any]:
         for key, words in (("recipe", "recipe"), ("peak", "trained on"), ("device", "on"))
         if isinstance(training.get(key), (str, int, float))
     ]
-    return {
-        "name": name,
-        "text": f"{off} of {judged} off" if judged else "not judged",
-        "marked": off > 2 and off > 0.2 * judged,  # one or two can be off by chance
-        "about": ", ".join(known),
-        "lines": [summary(metrics, peak, method) for peak in part(metrics, "peaks")],
-    }
+    text = f"{off} of {judged} off" if judged else "not judged"
+    marked = off > 2 and off > 0.2 * judged  # one or two can be off by chance
+    lines = [summary(metrics, peak, method) for peak in part(metrics, "peaks")]
+    return Overview(name, text, marked, ", ".join(known), lines)
 
 
 def _over_runs(runs: Sequence[Metrics], method: str, rows: Sequence[Row]) -> SideBySide | None:
