@@ -19,11 +19,11 @@ from cpunet.electronics.baseline_methods import fitted_tail_slope, without_decay
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.plotting import (
     COLOURS,
-    GROUP,
     colours,
     label,
     legend_above,
     legend_height,
+    line_look,
     linear_within,
     logarithmic,
     panels,
@@ -204,20 +204,28 @@ def single_pulse_figure(
         Title of the figure, for example ``"SEP, event 12"``.
     """
     shown = {"data": data.window} | dict(pulses)
-    slope = data.slope_per_ms
-    windows = {m: np.asarray(w, np.float32)[np.newaxis] for m, w in shown.items()}
+    slope, length = data.slope_per_ms, len(data.window)
+    aligned, corrected = {}, {}
+    for method, pulse in shown.items():
+        window = np.asarray(pulse, np.float32)[np.newaxis]
+        undecayed = without_decay(
+            window, 0.0 if method == UNDECAYED else slope, dt_ns, samples_before
+        )
+        pair = np.concatenate([window, undecayed.astype(np.float32)])
+        aligned[method], corrected[method] = align_half_maximum(pair, length, length)
+    differences = {
+        m: 100 * (p - corrected["data"]) for m, p in corrected.items() if m != "data"
+    }
+    time_ns = np.arange(-length, length) * float(dt_ns)
     shared: dict[str, Any] = {"sharey": "row", "sharex": "col", "height_ratios": (4, 4, 3)}
     top = legend_height(1) + 0.25
     figure, grid = panels((9.5, 7.6), 3, 2, top=top, between=(0.2, 0.4), **shared)
-    _draw(list(grid[0]), windows, dt_ns)
-    corrected = {
-        m: without_decay(w, 0.0 if m == UNDECAYED else slope, dt_ns, samples_before).astype(
-            np.float32
-        )
-        for m, w in windows.items()
-    }
-    _draw(list(grid[1]), corrected, dt_ns)
-    _draw_differences(list(grid[2]), corrected, dt_ns)
+    for line, drawn in zip(grid, (aligned, corrected, differences), strict=True):
+        for axes in line:
+            _draw(axes, time_ns, drawn)
+    for axes in grid[2]:
+        axes.axhline(0, color="black", linewidth=0.8)
+    linear_within(grid[2, 0], LINEAR)
     grid[0, 0].set(ylabel="Pulse height", title="As prepared")
     grid[0, 1].set(title="Edge", xlim=ZOOM_NS)
     grid[1, 0].set(ylabel="Pulse height,\nplateau = 1")
@@ -287,42 +295,12 @@ def _mark_peaks(axes: Axes, peaks: Mapping[str, float], span: tuple[float, float
         axes.text(energy, 1.01 + 0.05 * level, name, transform=place, ha="center", size=8.5)
 
 
-def _draw(panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float) -> None:
-    palette = colours(windows)
-    for method, window in windows.items():
-        time_ns, pulse = _aligned(window, dt_ns)
-        # a broad grey line, so that a method which agrees does not hide the data
-        look: dict[str, Any] = (
-            {"color": "0.65", "linewidth": 3.5}
-            if method == "data"
-            else {"color": palette[method], "linewidth": 1.2}
-        )
+def _draw(axes: Axes, time_ns: npt.NDArray[Any], pulses: Mapping[str, FloatArray]) -> None:
+    palette = colours(pulses)
+    for method, pulse in pulses.items():
+        look = line_look(method, palette[method])
+        if method != "data":
+            look["linewidth"] = 1.2
         if method == "truth":  # on top of methods that agree with it
             look["linestyle"] = "--"
-        for axes in panels:
-            axes.plot(time_ns, pulse, label=label(method), gid=GROUP + method, **look)
-
-
-def _draw_differences(
-    panels: list[Axes], windows: Mapping[str, FloatArray], dt_ns: float
-) -> None:
-    palette = colours(windows)
-    time_ns, data = _aligned(windows["data"], dt_ns)
-    for method, window in windows.items():
-        if method == "data":
-            continue
-        difference = 100 * (_aligned(window, dt_ns)[1] - data)
-        for axes in panels:
-            axes.plot(
-                time_ns, difference, color=palette[method], linewidth=1.0, gid=GROUP + method
-            )
-    for axes in panels:
-        axes.axhline(0, color="black", linewidth=0.8)
-    linear_within(panels[0], LINEAR)
-
-
-def _aligned(window: FloatArray, dt_ns: float) -> tuple[Values, FloatArray]:
-    """Time from the crossing in ns and the pulse, NaN outside its record."""
-    length = window.shape[1]
-    time_ns = (np.arange(2 * length) - length) * dt_ns
-    return time_ns, align_half_maximum(window, length, length)[0]
+        axes.plot(time_ns, pulse, label=label(method), **look)

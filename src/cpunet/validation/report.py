@@ -111,10 +111,22 @@ class Report:
 
         index = ["peak", "parameter", "method"]
         columns = [*index, "iou", "iou_std", "ceiling", "ks", "wasserstein"]
-        return DataFrame(self._rows(), columns=columns).set_index(index)
+        rows = [
+            [
+                *(peak, parameter, method, iou, compared["iou_std"].get(method)),
+                *(compared["iou"].get("ceiling"), compared["ks"].get(method)),
+                compared["wasserstein"].get(method),
+            ]
+            for peak in self.metrics["peaks"]
+            for parameter, compared in self._compared(peak).items()
+            for method, iou in compared["iou"].items()
+            if method != "ceiling"
+        ]
+        return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
-        found: DataFrame = self.scores.loc[named(self._scored(), peak, "scored peak")]
+        peaks = {name: name for name, one in self.metrics["peaks"].items() if one["parameters"]}
+        found: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
         return found
 
     @property
@@ -254,23 +266,6 @@ class Report:
 
     def _compared(self, peak: str) -> Mapping[str, Any]:
         return dict(self.metrics["peaks"][peak]["parameters"])
-
-    def _scored(self) -> dict[str, str]:
-        peaks = self.metrics["peaks"]
-        return {peak: peak for peak in peaks if peaks[peak]["parameters"]}
-
-    def _rows(self) -> list[list[Any]]:
-        return [
-            [
-                *(peak, parameter, method, iou, compared["iou_std"].get(method)),
-                *(compared["iou"].get("ceiling"), compared["ks"].get(method)),
-                compared["wasserstein"].get(method),
-            ]
-            for peak in self.metrics["peaks"]
-            for parameter, compared in self._compared(peak).items()
-            for method, iou in compared["iou"].items()
-            if method != "ceiling"
-        ]
 
     def _table(self, methods: Iterable[str]) -> tuple[list[str], list[list[str]]]:
         """IoU by peak and parameter, of the methods that have any."""
