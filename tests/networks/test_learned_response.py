@@ -45,8 +45,15 @@ def test_the_prior_is_that_of_a_smooth_edge_at_any_sampling(dt_ns):
     response = StepResponse(CONFIG, dt_ns)
     lags = response.lags * dt_ns
     width = response.basis.square().sum(dim=1).sqrt()
-    at = [int((lags - t).abs().argmin()) for t in (0.0, 600.0, 3000.0)]
-    np.testing.assert_allclose(width[at], [0.15, 0.03, 0.03], rtol=0.05)
+    at = [int((lags - t).abs().argmin()) for t in (40.0, 600.0, 3000.0)]
+    np.testing.assert_allclose(width[at], [0.145, 0.03, 0.03], rtol=0.05)
+    assert width[lags < -40.0].max() < 0.002  # nothing before the charge
+
+
+@pytest.mark.parametrize("pole_ns", [30.0, 50.0, 80.0])
+def test_the_poles_of_a_base_follow_from_its_rise(step, pole_ns):
+    step.set_base(pole_ns, 0.0)
+    assert step.pole_ns() == pytest.approx(pole_ns, rel=0.03)
 
 
 def test_a_record_is_the_step_response_summed_over_the_current(step):

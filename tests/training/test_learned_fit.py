@@ -86,17 +86,6 @@ def test_derivatives_are_those_of_wide_differences(band, number):
     assert np.linalg.norm(slopes[:, number] - wanted) < 0.1 * np.linalg.norm(wanted)
 
 
-def test_a_delay_changes_nothing(band):
-    response = near()
-    basis, wanted = response.basis.numpy(), -np.gradient(response.base.numpy())  # a sample
-    delay = np.linalg.lstsq(basis, wanted, rcond=1e-4)[0]
-    assert np.abs(basis @ delay - wanted).max() < 0.15 * np.abs(wanted).max()
-    compared = ResponseProblem(response, [band])
-    start = np.zeros(len(delay))
-    slopes = compared.derivatives(start, compared.deviations(start), range(len(delay)))
-    assert np.linalg.norm(slopes @ delay) < 0.06 * np.linalg.norm(slopes * delay)
-
-
 @pytest.fixture(scope="module")
 def fitted(problem: Unpaired):
     return fit_learned(problem.sim, problem.data, problem.noise, RECIPE, seed=0)

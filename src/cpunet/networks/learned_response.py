@@ -3,8 +3,10 @@ r"""The recipe ``cpunet``'s REN: a learned step response behind a Positional U-N
 Linear electronics are a step response, whatever their circuit.  It is learned as deviations
 from a smooth step of two poles, which are a Gaussian process: smooth in
 :math:`\operatorname{arsinh}(t / 96\,\mathrm{ns})`, so that details are possible at the edge
-and not later, where they would be noise.  The fit moves in the leading eigenvectors of its
-covariance.  Each of these coordinates has a prior of mean 0 and width 1.
+and not later, where they would be noise, and zero before the charge.  Pulses are aligned and do
+not tell a delay; without this, a fit takes one and makes the edge of waves.  The fit moves in
+the leading eigenvectors of its covariance.  Each of these coordinates has a prior of mean 0 and
+width 1.
 
 What no linear response can do stands in front of it, as in the detector: a Positional U-Net
 changes how fast the clock of a simulated pulse runs, and blurs it; see `DriftUNet`.
@@ -16,6 +18,7 @@ import math
 
 import numpy as np
 import scipy.interpolate
+import scipy.special
 import torch
 from torch import Tensor, nn
 
@@ -33,13 +36,15 @@ from cpunet.recipes.network_settings import LearnedConfig, PunetConfig, Response
 
 # Knots of the step response in ns: at every sample from FIRST to DENSE, then SPARSE logarithmic
 # ones up to LAST, and an exponential beyond.
-FIRST, DENSE, LAST, SPARSE = -256.0, 768.0, 7040.0, 20
+FIRST, DENSE, LAST, SPARSE = -128.0, 768.0, 7040.0, 20
 # The prior: width of the deviations from the base, factor of it about time 0 and how far that
 # reaches in ns, time from which times count logarithmically, and correlation length.
 WIDTH, EDGE, EDGE_NS, LINEAR_NS, LENGTH = 0.03, 5.0, 192.0, 96.0, 0.5
+ONSET_NS = 8.0  # about time 0, in which the deviations begin
 # A ringing: width, time in ns after which it has decayed, and correlation length in ns.
 RINGING, RINGING_NS, RINGING_LENGTH_NS, RINGING_FROM_NS = 0.05, 400.0, 56.0, -128.0
 RINGING_COORDINATES = 24
+POLES_RISE = 1.146  # rise of two equal poles from 10 to 50 % in units of one of them
 LONGEST_US = 1e5  # decay of a base whose data do not decay
 # The U-Net sees this much of a pulse, this part of it before the half maximum; the largest
 # logarithm of the rate, and the time over which it is smoothed; the largest variance of blur.
@@ -86,7 +91,7 @@ class StepResponse(Readout):
         self.coordinates = nn.Parameter(torch.zeros(n, dtype=double))
 
     def set_base(self, pole_ns: float, slope: float) -> None:
-        """Set the base: both its poles in ns, and the slope per sample of its decay.
+        """Begin with a base: both its poles in ns, and the slope per sample of its decay.
 
         It is a chain like any other, since charge is interpolated between its samples there.
         """
@@ -107,6 +112,14 @@ class StepResponse(Readout):
             chain = ElectronicsResponse(config, float(self.dt_ns)).transfer(padded)
             kernel = torch.fft.irfft(chain, padded)
         self.base.copy_(torch.cat([kernel[first:], kernel[: len(self.base) + first]]))
+        self.coordinates.data.zero_()
+
+    @torch.no_grad()
+    def pole_ns(self) -> float:
+        """Poles in ns of a base with the same rise from 10 to 50 %."""
+        step = self.step(int(self.lags[-1]) + 1)[None]
+        early, late = (_crossing(step / step.max(), level) for level in (0.1, 0.5))
+        return float(late - early) * float(self.dt_ns) / POLES_RISE
 
     def step(self, samples: int, coordinates: Tensor | None = None) -> Tensor:
         """Response to a step at sample 0, from `FIRST` on, shape (samples - first,)."""
@@ -266,6 +279,7 @@ def _prior(time_ns: np.ndarray) -> np.ndarray:
     """Covariance of the deviations of a step response from its base."""
     place = np.arcsinh(time_ns / LINEAR_NS)
     width = WIDTH * (1 + (EDGE - 1) * np.exp(-((time_ns / EDGE_NS) ** 2)))
+    width = width * scipy.special.expit(time_ns / ONSET_NS)
     near = np.exp(-0.5 * ((place[:, np.newaxis] - place) / LENGTH) ** 2)
     return np.asarray(width[:, np.newaxis] * width * near)
 

@@ -159,7 +159,7 @@ class _Trained:
         self.mean: Tensor | None = None  # over the last batches
 
     def chi_square(self, drift: DriftUNet, rng: np.random.Generator) -> tuple[Tensor, ...]:
-        """Chi-square per moment, logarithms of the rate, and variances of the blur."""
+        """Chi-square, logarithms of the rate, and variances of the blur."""
         sim = self.band.sim
         rows = np.sort(rng.permutation(len(sim))[:BATCH])
         pulses, log_rate, blur = drift.changed(torch.from_numpy(np.array(sim.sim[rows])))
@@ -175,7 +175,7 @@ class _Trained:
         now = mean.detach()
         self.mean = now if self.mean is None else MEMORY * self.mean + (1 - MEMORY) * now
         apart = self.whiten @ (self.mean + mean - now - self.wanted)
-        return apart.square().mean(), log_rate, blur
+        return apart.square().sum(), log_rate, blur
 
 
 def _train(
@@ -187,6 +187,7 @@ def _train(
 ) -> None:
     """Steps of Adam, with a rate that falls over all rounds."""
     drift.train()
+    moments = sum(len(band.wanted) for band in bands)
     for band in bands:
         band.mean = None  # the step response has moved
     for number in range(STEPS):
@@ -196,7 +197,7 @@ def _train(
         loss = torch.zeros((), dtype=torch.float64)
         for band in bands:
             chi_square, log_rate, blur = band.chi_square(drift, rng)
-            loss = loss + chi_square
+            loss = loss + chi_square / moments
             for values, unit in ((log_rate, TYPICAL), (blur, 1.0)):
                 mean = values.mean(dim=0)
                 loss = loss + OF_MEAN * (mean / unit).square().mean()

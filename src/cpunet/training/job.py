@@ -327,12 +327,17 @@ def match(
             known = with_settings(known, drift_terms=allowed)
         recipe = recipe.model_copy(update={"generator": known.config})
     response: Any  # an `ElectronicsResponse` or a `LearnedResponse`
-    given: dict[str, Any] = {"seed": seed, "known": known, "tails": drawn, "listener": listen}
+    given: dict[str, Any] = {
+        "seed": seed,
+        "known": known,
+        "tails": drawn,
+        "continuum": continuum,
+        "listener": listen,
+    }
     simulated, measured = sim.prepared.pulses, data.prepared.pulses
     if isinstance(recipe.generator, LearnedConfig):
         response, fit = fit_learned(simulated, measured, noise, recipe, **given)
     else:
-        given["continuum"] = continuum
         response, fit = fit_response(simulated, measured, noise, recipe, **given)
     parameters = response.describe()
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]

@@ -3,11 +3,12 @@
 1. A linear discriminator, solved: the moments that separate the two sides best are those of
    `cpunet.training.moments`; the step response moves until they agree (Gauss-Newton with exact
    derivatives).  Far from the data, narrow bins of the current amplitude are blind, so the
-   first bins are wide.
+   first bins are wide.  What they find sets the poles of the base for all that follows.
 2. Optimal weights (`cpunet.training.optimal_weights`), again and again until nothing moves: all
    fits end in the same response, whatever their noise.
 3. If the fit is poor, a ringing is tried, or, if pulses begin differently than simulated, the
-   U-Net in front; see `cpunet.training.drift_training`.
+   U-Net in front; see `cpunet.training.drift_training`.  As a line alone does not tell how
+   charge clouds depend on energy, single sites of the continuum are compared there, too.
 
 No discriminator network is trained.  What these moments do not see, the classifier of a
 validation tells.
@@ -31,7 +32,7 @@ from cpunet.training.fitter import Fitted, Fitter
 from cpunet.training.levenberg_marquardt import FIRST_CLIPS, Listener
 from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
-from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.pulse_sets import Continuum, PulseSets
 from cpunet.training.response_fit import CHECKED, Fit, described
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import RINGS, onset_is_off
@@ -53,6 +54,7 @@ def fit_learned(
     seed: int,
     known: LearnedResponse | None = None,
     tails: DrawnTails | None = None,
+    continuum: Continuum | None = None,
     listener: Listener | None = None,
 ) -> tuple[LearnedResponse, Fit]:
     """Fit a learned readout; parameters as of `cpunet.training.response_fit.fit_response`.
@@ -62,7 +64,7 @@ def fit_learned(
     config, training = recipe.matching
     assert isinstance(config, LearnedConfig)
     config = config.model_copy(update={"drift": False})  # a U-Net is trained first
-    sets = PulseSets(sim, data, noise, recipe, np.random.default_rng(seed), tails)
+    sets = PulseSets(sim, data, noise, recipe, np.random.default_rng(seed), tails, continuum)
     fitter = Fitter(training, listener=listener)
     far = [band.with_wider_bins(FIRST_WIDTH) for band in sets.bands(FIRST_PULSES)]
     near = [band.with_wider_bins(WIDTH) for band in sets.bands(training.search_pulses)]
@@ -75,18 +77,21 @@ def fit_learned(
     if found is None or found.poor:
         response, found = _from_afar(config, noise.dt_ns, far, near, fitter)
     tried = None
+    single: list[Band] = []
     if found.poor and onset_is_off(found.problem):
         if training.drift_terms:
-            tried = fit_drift(response, sets.bands(CHECKED), WIDTH, fitter, seed)
+            single = sets.single_sites()
+            tried = fit_drift(response, [*sets.bands(CHECKED), *single], WIDTH, fitter, seed)
     elif found.poor and training.ringing_mhz and not response.config.ringing:
         rings = response.config.model_copy(update={"ringing": True})
         other, better = _from_afar(rings, noise.dt_ns, far, near, fitter)
         if better.cost < RINGS * found.cost:
             response = other
-    everything = changed(sets.bands(), response.drift)
+    everything = sets.bands()
     if response.drift is None:
         covariance = _determined(response.step, everything, fitter)
     else:
+        everything = changed([*everything, *single], response.drift)
         covariance = fitter.follow(ResponseProblem(response.step, everything, 2)).covariance
     fit = described(ResponseProblem(response.step, everything), covariance, fitter)
     return response, replace(fit, drift=tried)
@@ -108,10 +113,10 @@ def _from_afar(
         problems.append(problem)
     best = min(problems, key=lambda problem: problem.cost)
     fitter.fit(best)
+    best.response.set_base(best.response.pole_ns(), best.slope)
     response = LearnedResponse(config, dt_ns)
     response.step = best.response
-    found = fitter.fit(ResponseProblem(response.step, near, draws=1), coarse=False)
-    return response, found
+    return response, fitter.fit(ResponseProblem(response.step, near, draws=1))
 
 
 def _determined(step: StepResponse, bands: Sequence[Band], fitter: Fitter) -> Values:
