@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 import cpunet
-from cpunet import installation
 
 HOUSE = Path(cpunet.__file__).parent
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
@@ -48,18 +47,18 @@ def test_no_module_imports_from_a_later_room() -> None:
 @pytest.fixture
 def installed(monkeypatch, tmp_path):
     """Pretend that this package lies in a folder, with another distribution beside it."""
-    monkeypatch.setattr(installation, "__file__", str(tmp_path / "cpunet" / "installation.py"))
+    monkeypatch.setattr(cpunet, "__file__", str(tmp_path / "cpunet" / "__init__.py"))
 
     def install(*files: str) -> None:
         information = tmp_path / "cpunet-1.0.0.dist-info"
         information.mkdir()
         (information / "METADATA").write_text("Name: cpunet\nVersion: 1.0.0\n")
         (information / "RECORD").write_text("".join(f"{file},,\n" for file in files))
-        installation.other_package.cache_clear()
+        cpunet.other_package.cache_clear()
 
-    installation.other_package.cache_clear()
+    cpunet.other_package.cache_clear()
     yield install
-    installation.other_package.cache_clear()
+    cpunet.other_package.cache_clear()
 
 
 def test_over_this_one(installed):
@@ -68,7 +67,7 @@ def test_over_this_one(installed):
         "the package cpunet 1.0.0 is installed over cpunet-hpge, of the same import name; "
         "pip uninstall cpunet cpunet-hpge, then install the one you want"
     )
-    assert installation.other_package() == told
+    assert cpunet.other_package() == told
     with pytest.warns(UserWarning, match="installed over cpunet-hpge"):
         assert cpunet.Pulses
 

@@ -3,17 +3,22 @@
 Data flow in one direction through its subpackages: ``pulses`` → ``simulation`` →
 ``electronics`` → ``networks`` → ``training`` → ``calibration`` → ``translation`` →
 ``validation`` → ``legend`` → ``cli``.  See ``docs/design.md``.
+
+The authors of CPU-Net publish their own code as ``cpunet``; this package's distribution is
+called ``cpunet-hpge`` and is also imported as ``cpunet``.  Both install into the same folder,
+so an environment can contain only one of them.
 """
 
 from __future__ import annotations
 
 import warnings
+from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cpunet.installation import other_package
-
 __version__ = "0.1.0"
+DISTRIBUTION, OTHER = "cpunet-hpge", "cpunet"
 
 if TYPE_CHECKING:
     from cpunet.calibration.calibrate import calibrate as calibrate
@@ -99,6 +104,32 @@ _HOMES = {
     "validation.validate": ("validate",),
 }
 __all__ = sorted(["__version__", *(name for names in _HOMES.values() for name in names)])
+
+
+@cache
+def other_package() -> str | None:
+    """One-line message with a remedy if the other package is installed over this one.
+
+    Returns
+    -------
+    str or None
+        None if it is not installed, or in another folder.
+    """
+    here = Path(__file__).resolve().parent
+    found = next(here.parent.glob(f"{OTHER}-*.dist-info"), None)
+    if found is None:
+        return None
+    # Imported only here, since it would make `cpunet --help` wait for tens of milliseconds
+    from importlib.metadata import Distribution
+
+    other = Distribution.at(found)
+    files = (Path(str(other.locate_file(file))) for file in other.files or ())
+    if not any(here == file.parent.resolve() for file in files if file.suffix == ".py"):
+        return None
+    return (
+        f"the package {OTHER} {other.version} is installed over {DISTRIBUTION}, of the same "
+        f"import name; pip uninstall {OTHER} {DISTRIBUTION}, then install the one you want"
+    )
 
 
 def __getattr__(name: str) -> Any:

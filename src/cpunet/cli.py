@@ -30,8 +30,8 @@ from cyclopts import (
 )
 
 import cpunet
+from cpunet import DISTRIBUTION, other_package
 from cpunet.errors import CpunetError
-from cpunet.installation import DISTRIBUTION, other_package
 from cpunet.pulses.reading.files import FileOptions, ReadOptions
 from cpunet.simulation.hits import HitOptions
 from cpunet.translation.options import Adc
