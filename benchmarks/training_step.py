@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 import torch
 
-from cpunet.memory import keep_freed_memory
+from cpunet.processes import keep_freed_memory
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan, Step
 

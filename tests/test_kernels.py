@@ -14,7 +14,7 @@ import scipy.linalg
 from threadpoolctl import threadpool_info
 
 from cpunet import kernels
-from cpunet.memory import one_thread_for_matrices
+from cpunet.processes import one_thread_for_matrices
 
 CALLED = """
 from cpunet.numbers import N

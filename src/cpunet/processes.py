@@ -2,24 +2,33 @@
 
 What is made does not depend on the number of processes: with one, the work is done here, with
 one thread as well, since the last bits of a network depend on the number of threads.
+
+OpenBLAS threads wait for each other in busy loops.  The matrices here are small: a second
+thread brings no gain on idle cores.  On busy cores the other threads wait for one that has no
+core; this made scores take twelve times as long.  Both numbers that the C library is told for
+memory are set each time, so that no choice of an earlier job remains.
 """
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from functools import partial
 from logging.handlers import QueueHandler
 from queue import SimpleQueue
 from types import FrameType
 from typing import Any, TypeVar
+
+from threadpoolctl import ThreadpoolController
 
 from cpunet.errors import CpunetError
 
@@ -152,3 +161,41 @@ def _work(task: Any) -> tuple[Any, list[logging.LogRecord]]:
     except SystemExit:  # which the pool would take for an outcome
         os._exit(1)
     return outcome, [_messages.get() for _ in range(_messages.qsize())]
+
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # constants of glibc's malloc.h
+
+
+def give_back_large_arrays() -> None:
+    """Return arrays of a megabyte or more to the system when they are freed.
+
+    For jobs that process files block by block.  By default the C library eventually keeps
+    such arrays on its heap, which becomes fragmented and grows.
+    """
+    _choose(mmap_bytes=1 << 20, trim_bytes=1 << 17)
+
+
+def keep_freed_memory() -> None:
+    """Let the C library keep all freed memory.
+
+    For trainings.  Every step of a network allocates and frees the same hundreds of megabytes.
+    Fetching them from the system again takes a tenth of the step and more.
+    """
+    _choose(mmap_bytes=2**31 - 1, trim_bytes=2**31 - 1)
+
+
+def _choose(mmap_bytes: int, trim_bytes: int) -> None:
+    with suppress(OSError, AttributeError, TypeError):  # another C library
+        library = ctypes.CDLL(None)
+        library.mallopt(_MMAP_THRESHOLD, mmap_bytes)
+        library.mallopt(_TRIM_THRESHOLD, trim_bytes)
+
+
+@contextmanager
+def one_thread_for_matrices() -> Iterator[None]:
+    """Let matrix products and decompositions use one thread; also a decorator of jobs."""
+    import scipy.linalg  # noqa: F401 - loads its own OpenBLAS, to be limited as well
+
+    # OpenBLAS only: torch can have its own library, and the matrices of networks are large
+    with ThreadpoolController().select(internal_api="openblas").limit(limits=1):
+        yield

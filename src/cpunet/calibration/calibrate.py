@@ -39,8 +39,8 @@ from cpunet.calibration.result import Calibrated, described, doubts, free_parame
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
 from cpunet.errors import CpunetError
-from cpunet.memory import keep_freed_memory, one_thread_for_matrices
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
+from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
 from cpunet.pulses.channels import ALL, CHANNEL, Outcome, Pair, each_channel, paired
 from cpunet.pulses.loading import (

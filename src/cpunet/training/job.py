@@ -20,10 +20,10 @@ from torch import nn
 
 from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
-from cpunet.memory import keep_freed_memory, one_thread_for_matrices
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
 from cpunet.outputs import folder_written_aside
+from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
 from cpunet.pulses.channels import Pair, own_folder
 from cpunet.pulses.container import Pulses

@@ -16,8 +16,8 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.memory import give_back_large_arrays
 from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.processes import give_back_large_arrays
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection

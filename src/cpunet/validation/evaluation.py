@@ -12,8 +12,8 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.memory import one_thread_for_matrices
 from cpunet.plotting import NO_NOISE
+from cpunet.processes import one_thread_for_matrices
 from cpunet.progress import stage
 from cpunet.pulses.loading import (
     InputSet,
