@@ -14,13 +14,16 @@ from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.drawn_tails import SIZES_KEV, DrawnTails, SameNoise, TraceNoise, passing
 from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.electronics.readout import RawTraces, read_out
-from cpunet.electronics.tails_fit import fit_rate
-from cpunet.electronics.tails_law import TailsLaw, characteristic_exponents, energies_at
+from cpunet.electronics.tails_law import (
+    TailsLaw,
+    characteristic_exponents,
+    energies_at,
+    fit_rate,
+)
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.cuts import apply_cuts, fit_cuts
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
 

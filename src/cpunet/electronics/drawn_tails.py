@@ -20,8 +20,7 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import PileUpTails, tail_shape
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.cuts import CutWindows, apply_cuts
-from cpunet.pulses.preparation import prepare
+from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import plain
 

@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.tails_fit import RateFit, fit_rate
-from cpunet.electronics.tails_law import TailsLaw
+from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses

@@ -1,4 +1,4 @@
-r"""Distribution of the tails that earlier pulses leave under a trace.
+r"""Distribution of the tails that earlier pulses leave under a trace, and fit of their rate.
 
 Pulses arrive at random with a rate :math:`R` and energies :math:`E` from a spectrum. Each
 decays with a time constant :math:`\tau`. A single pulse leaves more than :math:`x` if it
@@ -14,18 +14,32 @@ tails is shot noise (Campbell 1909). The logarithm of its characteristic functio
 
 A tail is told by its height at the first sample of a trace, in keV. The only free
 parameter of the law is the rate.
+
+In the likelihood fit of the rate each trace contributes one measured tail with an error,
+relative to the level of an empty baseline. The density of the law, convolved with the error,
+is known. Rate, level and error are therefore fitted together. Real noise is not Gaussian: its
+wings would be mistaken for small tails. They are determined from the side below 0, which tails
+do not affect.
+
+The energies are those of the file. Where these cannot describe the rate (for example, in a file
+with a few gamma lines only), they follow a log-normal spectrum up to the maximum energy, which
+is fitted to the tails.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 # After this many decay times the tail is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
@@ -184,3 +198,241 @@ def energies_at(share: FloatArray, energies_kev: Sequence[float]) -> FloatArray:
 def _some(energies_kev: Sequence[float]) -> FloatArray:
     """Equally probable energies that represent the spectrum."""
     return energies_at((np.arange(_ENERGIES) + 0.5) / _ENERGIES, energies_kev)
+
+
+Function = Callable[[FloatArray], float]
+
+# Range and number of energies of a spectrum; the lowest still leaves a visible tail.
+LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
+QUANTILES = 41  # quantiles of the returned spectrum
+# Points of the density. It is periodic, so the grid must hold all energies, also in steps of
+# small errors: down to 0.15 keV.
+LEAST_GRID, MOST_GRID = 1024, 131_072
+STEPS_OF_SIGMA = 4.0
+NEGLIGIBLE = 8.8  # standard deviations in u: exp(-8.8²/2) is 1.5e-17
+ROOM = 10.0  # standard deviations of room on either side
+OUTLIERS = 2e-3  # fraction of traces that the law need not explain
+# Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
+WORTH = 5.0
+# Maximum fraction of the noise in its wings, and minimum number of traces to determine them.
+MAX_WINGS, MIN_BELOW = 0.5, 100
+# Mean and width of the priors on the logarithms of the median energy and of the spectral width.
+MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
+
+
+@dataclass(frozen=True, eq=False)
+class RateFit:
+    """Result of a fit of the law to a set of tails.
+
+    Parameters
+    ----------
+    law, rate_error_khz
+        The law, and the standard error of its rate in kHz.
+    level_kev, sigma_kev
+        Level of an empty baseline and spread of traces about it, in keV.
+    recorded
+        Whether the law uses the energies of the file rather than a fitted spectrum.
+    gain_of_law
+        Log-likelihood relative to that without any tails.
+    """
+
+    law: TailsLaw
+    rate_error_khz: float
+    level_kev: float
+    sigma_kev: float
+    recorded: bool
+    gain_of_law: float
+
+
+def fit_rate(
+    kev: FloatArray, sigma_kev: float, decay_us: float, energies_kev: FloatArray
+) -> RateFit:
+    r"""Fit rate, level and error to measured tails.
+
+    The log-likelihood of the tails :math:`x_i` is
+
+    .. math:: \ln L = \sum_i \ln\left[(1 - \epsilon)\, p(x_i) + \epsilon u\right],
+
+    where :math:`p` is the density of the law convolved with the noise and :math:`u` a uniform
+    density for a small fraction :math:`\epsilon` of outliers. With the characteristic function
+    :math:`\varphi` of the law, and apart from the wings of the noise,
+
+    .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du .
+
+    Parameters
+    ----------
+    kev
+        Measured tails in keV, near 0 for empty baselines.
+    sigma_kev
+        Initial estimate of their standard deviation in keV.
+    decay_us
+        Decay time of the tails in us.
+    energies_kev
+        Energies of the pulses of the file in keV.
+    """
+    known = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
+    highest = float(np.clip(known.max(initial=0.0), 100.0, HIGHEST_KEV))
+    likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
+    fixed = None
+    vector, gain = likelihood.best()
+    if len(known):
+        own = np.histogram(np.log(known), _edges(likelihood.energies))[0] / len(known)
+        recorded, of_recorded = likelihood.best(own)
+        if gain <= of_recorded + WORTH:
+            fixed, vector, gain = own, recorded, of_recorded
+    curvature = _curvature(lambda v: -likelihood.value(v, fixed), vector, likelihood.sigma)
+    variance = float(np.linalg.pinv(curvature, hermitian=True)[0, 0])
+    expected = float(np.exp(vector[0]))
+    error = expected * float(np.sqrt(max(variance, 0.0)))
+    energies = _quantiles(likelihood.energies, likelihood.weights(vector, fixed))
+    return RateFit(
+        law=TailsLaw(1e3 * expected / decay_us, decay_us, energies),
+        rate_error_khz=1e3 * error / decay_us,
+        level_kev=float(vector[1]),
+        sigma_kev=float(np.exp(vector[2])),
+        recorded=fixed is not None,
+        gain_of_law=gain - likelihood.without(),
+    )
+
+
+class _Likelihood:
+    """Likelihood of the tails as a function of rate, level, error and spectrum."""
+
+    def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
+        self.kev, self.sigma, self.energies = kev, sigma_kev, energies
+        self.step = sigma_kev / STEPS_OF_SIGMA
+        self.points = _points(kev, sigma_kev, float(energies[-1]), self.step)
+        self.u = np.asarray(2 * np.pi * np.fft.rfftfreq(self.points, self.step), float)
+        exponents = np.conj(characteristic_exponents(self.u, energies)).T
+        self.exponents = np.ascontiguousarray(exponents).view(np.float64)  # (energies, 2 of u)
+        self.first = self.points // 4
+        self.grid = (np.arange(self.points) - self.first) * self.step
+        self.wings, self.widths = _wings(kev, sigma_kev)
+        self.floor = OUTLIERS / max(float(np.ptp(kev)), self.step)
+
+    def __call__(
+        self, expected: float, level: float, sigma: float, weights: FloatArray
+    ) -> float:
+        # beyond this the noise term is negligible; shorter arrays are also allocated faster
+        u = self.u[: np.searchsorted(self.u, NEGLIGIBLE / sigma)]
+        parts = weights @ self.exponents[:, : 2 * len(u)]
+        parts *= expected
+        squares = -0.5 * (sigma * u) ** 2
+        parts[::2] += squares
+        parts[1::2] -= u * (level + self.first * self.step)
+        spectrum = parts.view(np.complex128)
+        np.exp(spectrum, out=spectrum)
+        if self.wings:
+            wide = np.exp((self.widths**2 - 1) * squares)
+            spectrum *= 1 - self.wings + self.wings * wide
+        density = np.fft.irfft(spectrum, self.points)
+        density /= self.step
+        np.maximum(density, 0.0, out=density)
+        at = np.interp(self.kev, self.grid, density, left=0.0, right=0.0)
+        return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
+
+    def value(self, vector: FloatArray, fixed: FloatArray | None) -> float:
+        """Log-likelihood, with priors, at a vector of logarithms and the level."""
+        prior = 0.0
+        if fixed is None:
+            for value, (centre, width) in zip(vector[3:], (MEDIAN, WIDTH), strict=True):
+                prior -= 0.5 * ((value - centre) / width) ** 2
+        expected, sigma = np.exp(np.clip(vector[[0, 2]], -20.0, 6.0))
+        weights = self.weights(vector, fixed)
+        return self(float(expected), float(vector[1]), float(sigma), weights) + prior
+
+    def weights(self, vector: FloatArray, fixed: FloatArray | None) -> FloatArray:
+        """Weights of the energies: fixed ones, or those of a log-normal spectrum."""
+        if fixed is not None:
+            return fixed
+        width = np.exp(np.clip(vector[4], -2.0, 2.0))
+        logs = -0.5 * ((np.log(self.energies) - vector[3]) / width) ** 2
+        weights = np.exp(logs - logs.max())
+        return np.asarray(weights / weights.sum(), float)
+
+    def best(self, fixed: FloatArray | None = None) -> tuple[FloatArray, float]:
+        """Vector and log-likelihood of the best fit, with fixed weights or a spectrum."""
+        rest = [0.0, np.log(self.sigma)]
+        if fixed is None:
+            rest += [MEDIAN[0], WIDTH[0]]
+        starts = ((start, *rest) for start in np.log([0.005, 0.1]))
+        fits = [_minimum(lambda v: -self.value(v, fixed), start) for start in starts]
+        found = min(fits, key=lambda one: float(one.fun))
+        return np.asarray(found.x, float), -float(found.fun)
+
+    def without(self) -> float:
+        """Maximum log-likelihood without any tails."""
+        weights = np.zeros(len(self.energies))
+        spread = max(float(self.kev.std()), self.sigma)
+        starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
+        found = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
+        return -min(float(one.fun) for one in found)
+
+
+def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
+    """Number of grid points for tails and their noise; the first quarter is below 0."""
+    above = max(2 * highest_kev, float(kev.max())) + ROOM * sigma_kev
+    below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
+    points = max(4 * above / 3, 4 * below) / step_kev
+    return int(np.clip(2 ** np.ceil(np.log2(points)), LEAST_GRID, MOST_GRID))
+
+
+def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
+    """Fraction and relative width of a second, wider Gaussian fitted to the side below 0."""
+    below = kev[kev < 0]
+
+    def cost(vector: FloatArray) -> float:
+        sigma = np.exp(vector[0])
+        share, width = MAX_WINGS / (1 + np.exp(-vector[1])), 1.5 + np.exp(vector[2])
+        core, wide = below / sigma, below / (width * sigma)
+        density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
+        return -float(np.log(density / sigma + 1e-30).sum())
+
+    if len(below) < MIN_BELOW:
+        return 0.0, 1.0
+    alone = _minimum(lambda v: cost(np.array([v[0], -50.0, 0.0])), (np.log(sigma_kev),))
+    found = _minimum(cost, (np.log(sigma_kev), -1.0, 0.0))
+    if float(found.fun) > float(alone.fun) - WORTH:
+        return 0.0, 1.0
+    _, share, width = found.x
+    return MAX_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
+
+
+def _minimum(function: Function, start: Sequence[float]) -> OptimizeResult:
+    import scipy.optimize  # costs more than all the rest, and few channels come so far
+
+    steps = np.diag([0.5, *[0.4] * (len(start) - 1)])
+    simplex = np.asarray(start, float) + np.concatenate([np.zeros((1, len(start))), steps])
+    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2, "maxfev": 900}
+    return scipy.optimize.minimize(function, start, method="Nelder-Mead", options=options)
+
+
+def _curvature(function: Function, at: FloatArray, sigma_kev: float) -> FloatArray:
+    """Second derivatives by finite differences."""
+    steps = np.array([0.1, 0.2 * sigma_kev, 0.05, 0.1, 0.1])[: len(at)]
+    moves = np.diag(steps)
+    n = len(at)
+    found = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            corners = [function(at + a * moves[i] + b * moves[j]) for a, b in signs]
+            second = corners[0] - corners[1] - corners[2] + corners[3]
+            found[i, j] = found[j, i] = second / (4 * steps[i] * steps[j])
+    return found
+
+
+def _edges(energies: FloatArray) -> FloatArray:
+    """Edges of bins around the logarithms of the energies; the outer bins are open."""
+    logs = np.log(energies)
+    inner = 0.5 * (logs[1:] + logs[:-1])
+    return np.concatenate([[-np.inf], inner, [np.inf]])
+
+
+def _quantiles(energies: FloatArray, weights: npt.NDArray[np.float64]) -> tuple[float, ...]:
+    """Quantiles of a spectrum, evenly spaced in probability."""
+    edges = _edges(energies)
+    edges[[0, -1]] = np.log(energies[[0, -1]])
+    share = np.concatenate([[0.0], np.cumsum(weights)]) / weights.sum()
+    at = np.interp(np.linspace(0, 1, QUANTILES), share, edges)
+    return tuple(float(kev) for kev in np.exp(at))
