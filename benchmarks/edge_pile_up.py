@@ -16,9 +16,8 @@ import numpy.typing as npt
 from rich.console import Console
 
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.half_maximum import align_half_maximum
-from cpunet.pulses.preparation import Prepared, prepare
+from cpunet.pulses.preparation import Prepared, apply_cuts, fit_cuts, prepare
 from cpunet.pulses.reading.opening import open_pulses
 from cpunet.recipes import load_recipe
 

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.cuts import apply_cuts, fit_cuts
 from cpunet.pulses.peaks import label_peaks, parse_selection
-from cpunet.pulses.preparation import Prepared, prepare
+from cpunet.pulses.preparation import Prepared, apply_cuts, fit_cuts, prepare
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import CutConfig, PeakConfig
 from synthetic import PREPARATION

@@ -97,8 +97,7 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> TracesInfo:
         If too few traces contain a pulse.
     """
     # compiled loops, which a look at plain pulses does not need
-    from cpunet.pulses.cuts import apply_cuts, fit_cuts
-    from cpunet.pulses.preparation import Prepared, Rejection, prepare
+    from cpunet.pulses.preparation import Prepared, Rejection, apply_cuts, fit_cuts, prepare
 
     seen = list(islice(blocks, BLOCKS))
     found = [_edges(block) for block in seen]

@@ -21,9 +21,18 @@ from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.cuts import CutWindows, apply_cuts, fit_cuts
 from cpunet.pulses.peaks import EnergySelection, label_peaks
-from cpunet.pulses.preparation import Codes, FloatColumn, Kind, Prepared, Rejection, prepare
+from cpunet.pulses.preparation import (
+    Codes,
+    CutWindows,
+    FloatColumn,
+    Kind,
+    Prepared,
+    Rejection,
+    apply_cuts,
+    fit_cuts,
+    prepare,
+)
 from cpunet.pulses.provenance import recorded_detector
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
