@@ -9,14 +9,16 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.fields import (
+    NOT_IN_PARTS,
     FieldMaps,
+    cache_file,
     compute_fields,
     scaled_to_depletion,
+    solve,
     superposed_fields,
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
-from cpunet.simulation.superposition import NOT_IN_PARTS, cache_file, solve
 
 COARSE = ["grid_mm=0.5"]
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.constants import elementary_charge, epsilon_0
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.fields import electric_field
+from cpunet.simulation.fields import depletion_voltage, electric_field
 from cpunet.simulation.geometry import GERMANIUM, Detector, RegionArray
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.poisson import (
@@ -18,7 +18,6 @@ from cpunet.simulation.poisson import (
     solve_potentials,
     surface_charges,
 )
-from cpunet.simulation.superposition import depletion_voltage
 
 # no multiples of the grid, so that contacts lie between nodes
 INNER, OUTER = 2.04, 8.53

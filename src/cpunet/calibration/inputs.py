@@ -10,7 +10,7 @@ import numpy as np
 
 from cpunet.calibration.nuisances import NUISANCES, Nuisance, Physics, Values, named
 from cpunet.errors import CpunetError
-from cpunet.simulation.superposition import solve
+from cpunet.simulation.fields import solve
 
 DEPLETION = "depletion_voltage"
 _PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")

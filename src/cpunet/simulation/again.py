@@ -12,12 +12,11 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
 from cpunet.simulation.events import EventPulses, simulate_events
-from cpunet.simulation.fields import superposed_fields
+from cpunet.simulation.fields import NOT_IN_PARTS, Superposition, solve, superposed_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import HIT_TABLE, read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.superposition import NOT_IN_PARTS, Superposition, solve
 
 _PULSES = "geds/sim"
 

@@ -1,19 +1,321 @@
-"""Electric field and weighting potential of a detector, on uniform maps in r and z."""
+r"""Electric field and weighting potential of a detector, on uniform maps in r and z.
+
+With space charge everywhere the potential is linear in its sources,
+
+.. math:: V = b\, w + s\, u + t\, v + q,
+
+with the bias :math:`b`, the scale :math:`s` and the tilt :math:`t` of the impurities. The parts
+are :math:`w` (1 on the lithium contact), :math:`u` (impurities as given), :math:`v` (unit
+tilt) and :math:`q` (surface charge). Bias, scale and tilt therefore need no new solution; the
+parts are kept on disk, so that each detector is solved only once.
+
+This is the true potential if it has no pocket in which holes would collect: no local minimum
+apart from the electrodes. At such a minimum, or wherever the potential is below 0, germanium
+is not depleted, and the potential is refused.
+"""
 
 from __future__ import annotations
 
+import heapq
 import logging
+import math
+import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import platformdirs
+from scipy.ndimage import minimum_filter
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.geometry import DITCH, LI_CONTACT, Detector, FloatArray, RegionArray
-from cpunet.simulation.poisson import CONTACT_EDGE, DITCH_EDGE, Grid, point_types
-from cpunet.simulation.superposition import Superposition, solve
+from cpunet.outputs import written_aside
+from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.simulation.geometry import (
+    DITCH,
+    GERMANIUM,
+    LI_CONTACT,
+    Detector,
+    FloatArray,
+    RegionArray,
+)
+from cpunet.simulation.poisson import (
+    CONTACT_EDGE,
+    DITCH_EDGE,
+    Grid,
+    Potentials,
+    make_grid,
+    point_types,
+    solve_potentials,
+)
 
 log = logging.getLogger(__name__)
+
+# V: a pocket this shallow holds no charge (about kT/e at 90 K), and is not resolved by the
+# grid
+POCKET_DEPTH_V = 0.01
+HIGHEST_BIAS_V = 20_000.0
+_RESOLUTION_V = 0.5
+_NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j)
+
+
+def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
+    r"""Smallest bias in V at which the potential has no pocket; infinite if there is none.
+
+    Parameters
+    ----------
+    bias, impurities
+        Potentials of a unit bias, and of the impurities in V, shape (nr, nz).
+    region
+        Region of each node, as from `Detector.region`.
+
+    Examples
+    --------
+    A planar detector of thickness :math:`d` depletes at :math:`e N d^2 / 2 \varepsilon`.
+
+    >>> import numpy as np
+    >>> z = np.tile(np.linspace(0, 10, 401), (3, 1))  # mm
+    >>> impurities = -10 * z * (10 - z) / 2  # e N / epsilon = 10 V / mm2
+    >>> region = np.where(z == 0, 0, np.where(z == 10, 1, 2))
+    >>> bool(abs(depletion_voltage(z / 10, impurities, region) - 500) < 5)
+    True
+    """
+    low, high = 0.0, HIGHEST_BIAS_V
+    if has_pocket(high * bias + impurities, region):
+        return float("inf")
+    if not has_pocket(impurities, region):
+        return 0.0
+    while high - low > _RESOLUTION_V:
+        middle = (low + high) / 2
+        if has_pocket(middle * bias + impurities, region):
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
+    """Whether `potential` (nr, nz), in V, keeps holes from reaching an electrode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> r, z = np.meshgrid(np.arange(9), np.arange(9), indexing="ij")
+    >>> region = np.where(z == 0, 0, 2)
+    >>> has_pocket(z * 10.0, region), has_pocket((z - 4.0) ** 2, region)
+    (False, True)
+    """
+    minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
+        region == GERMANIUM
+    )
+    # deepest first: a true pocket is found early
+    where = np.argwhere(minima)
+    order = np.argsort(potential[minima])
+    return any(_holds(potential, region, *map(int, where[k])) for k in order)
+
+
+def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) -> bool:
+    """Whether leaving a minimum requires a climb of more than `POCKET_DEPTH_V`.
+
+    Floods from the minimum, lowest node first, until a lower node or a contact is reached.
+    """
+    start = potential[row, column]
+    heap = [(float(start), row, column)]
+    seen = {(row, column)}
+    while heap:
+        level, i, j = heapq.heappop(heap)
+        if level > start + POCKET_DEPTH_V:
+            return True
+        if level < start or region[i, j] < GERMANIUM:
+            return False
+        for di, dj in _NEIGHBOURS:
+            node = (i + di, j + dj)
+            inside = 0 <= node[0] < region.shape[0] and 0 <= node[1] < region.shape[1]
+            if inside and node not in seen:
+                seen.add(node)
+                heapq.heappush(heap, (float(potential[node]), *node))
+    return True
+
+
+# part of the file name, so that results of an older solver are not used
+SOLVER_VERSION = 3
+
+
+def cache_file(key: str) -> Path:
+    """Cache file of the potentials of a detector with the fingerprint `key`."""
+    folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
+    return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
+
+
+def kept_parts(key: str) -> tuple[Grid, Potentials, float] | None:
+    """Load grid, potentials and depletion voltage (V) of `key` from the cache.
+
+    Returns None if they are missing or damaged.
+    """
+    try:
+        arrays = read_arrays(cache_file(key))
+        kept: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
+        grid = Grid(**{field.name: kept[field.name] for field in fields(Grid)})
+        parts = Potentials(**{field.name: kept[field.name] for field in fields(Potentials)})
+        return grid, parts, kept["depletion_V"]
+    except (CpunetError, LookupError):
+        return None  # solved again and overwritten
+
+
+def keep_parts(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:
+    """Write to the cache atomically. A cache that cannot be written is ignored."""
+    with suppress(CpunetError), written_aside(cache_file(key)) as aside:
+        arrays = vars(grid) | vars(potentials) | {"depletion_V": depletion_V}
+        np.savez(aside, allow_pickle=False, **arrays)
+
+
+# fields that do not affect the parts of the potential
+NOT_IN_PARTS = (
+    "name",
+    "temperature_K",
+    "bias_V",
+    "impurity_scale",
+    "impurity_tilt_1e10_per_cm4",
+    "measured_depletion_V",
+)
+
+_SCALE_RESOLUTION = 1e-5
+_LARGEST_SCALE = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Superposition:
+    """Contributions of the bias, the impurities and a surface charge to the potential.
+
+    Parameters
+    ----------
+    detector
+        Detector as solved. Its bias is irrelevant, and its impurities are neither scaled nor
+        tilted.
+    grid, potentials
+        Nodes, and the parts of the potential at them.
+    unit_depletion_V
+        Depletion voltage in V for an ``impurity_scale`` of 1; infinite above 20 kV.
+    """
+
+    detector: Detector
+    grid: Grid
+    potentials: Potentials
+    unit_depletion_V: float
+
+    def potential_V(
+        self, bias_V: float, impurity_scale: float = 1.0, impurity_tilt: float = 0.0
+    ) -> FloatArray:
+        r"""Potential (nr, nz) in V for a bias in V and scaled and tilted impurities.
+
+        .. math:: V = b\, w + s\, u + t\, v + q
+
+        The tilt is in 1e10/cm4.
+
+        Raises
+        ------
+        CpunetError
+            If the detector is not depleted, so that the superposition does not hold.
+        """
+        potential = self._sum(bias_V, impurity_scale, impurity_tilt)
+        if has_pocket(potential, self.grid.region):
+            depletion = self.depletion_V(impurity_scale, impurity_tilt)
+            name = self.detector.name
+            if depletion == math.inf:
+                raise CpunetError(
+                    f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
+                    "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
+                )
+            raise CpunetError(
+                f"detector {name}: bias_V = {bias_V:g} does not deplete it; "
+                f"give at least the depletion voltage, {np.ceil(depletion):.0f} V"
+            )
+        return potential
+
+    def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
+        """Smallest bias in V that depletes the detector; infinite if none up to 20 kV does."""
+        alone = not self.detector.surface_charge_1e10_per_cm2 and impurity_tilt == 0
+        if alone and math.isfinite(self.unit_depletion_V):
+            # without another charge, all of V scales together
+            depletion = impurity_scale * self.unit_depletion_V
+            return depletion if depletion <= HIGHEST_BIAS_V else math.inf
+        return depletion_voltage(
+            self.potentials.bias,
+            self._sum(0.0, impurity_scale, impurity_tilt),
+            self.grid.region,
+        )
+
+    def scale_of_depletion(self, depletion_V: float, impurity_tilt: float = 0.0) -> float:
+        """Scale of the impurities at which the detector just depletes at `depletion_V`.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such scale.
+        """
+        low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
+        what = f"detector {self.detector.name}: {depletion_V:g} V"
+        if self._pocket(depletion_V, low, impurity_tilt):
+            raise CpunetError(
+                f"{what} do not deplete it even with {low:g} of its impurities; correct "
+                "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
+            )
+        if not self._pocket(depletion_V, high, impurity_tilt):
+            raise CpunetError(
+                f"{what} deplete it even with {high:g} times its impurities; correct "
+                "measured_depletion_V or impurity_z0_1e10_per_cm3"
+            )
+        while high / low > 1 + _SCALE_RESOLUTION:
+            middle = math.sqrt(low * high)
+            if self._pocket(depletion_V, middle, impurity_tilt):
+                high = middle
+            else:
+                low = middle
+        return low
+
+    def _sum(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
+        parts = self.potentials
+        total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
+        return total + impurity_tilt * parts.tilt if impurity_tilt else total
+
+    def _pocket(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> bool:
+        return has_pocket(self._sum(bias_V, impurity_scale, impurity_tilt), self.grid.region)
+
+
+def solve(detector: Detector, *, cache: bool = True) -> Superposition:
+    """Solve for the parts of a detector's potential, or load them from the cache.
+
+    Parameters
+    ----------
+    detector
+        Geometry and impurities.
+    cache
+        Whether to keep the parts on disk (in ``$CPUNET_CACHE`` or the user's cache folder)
+        and to load them if the same detector was solved before, at any bias and any scale and
+        tilt of its impurities.
+
+    Raises
+    ------
+    CpunetError
+        If the grid is too fine.
+    """
+    key = detector.fingerprint(exclude=NOT_IN_PARTS)
+    unit = detector.model_copy(
+        update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
+    )
+    if cache and (kept := kept_parts(key)) is not None:
+        return Superposition(unit, *kept)
+    grid = make_grid(unit)
+    log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
+    potentials = solve_potentials(unit, grid)
+    fixed = potentials.impurities + potentials.surface
+    depletion = depletion_voltage(potentials.bias, fixed, grid.region)
+    if cache:
+        keep_parts(key, grid, potentials, depletion)
+    return Superposition(unit, grid, potentials, depletion)
+
 
 _V_PER_CM = 10.0  # of 1 V / mm
 
@@ -50,7 +352,7 @@ def compute_fields(detector: Detector, *, cache: bool = True) -> FieldMaps:
     detector
         Geometry, impurities and bias.
     cache
-        See `cpunet.simulation.superposition.solve`.
+        See `solve`.
 
     Raises
     ------
