@@ -16,9 +16,9 @@ import numpy.typing as npt
 from rich.console import Console
 
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.pulses.parameters import align_half_maximum
 from cpunet.pulses.preparation import Prepared, apply_cuts, fit_cuts, prepare
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.recipes import load_recipe
 
 Values = npt.NDArray[np.float64]

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.half_maximum import align_half_maximum
 from cpunet.pulses.parameters import (
     PARAMETERS,
+    align_half_maximum,
     current_amplitude,
     drift_time,
     pulse_parameters,

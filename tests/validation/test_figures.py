@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from scipy.special import ndtr
 
 from cpunet.electronics.tails_law import TailsLaw
-from cpunet.pulses.half_maximum import align_half_maximum
-from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.parameters import PARAMETERS, align_half_maximum
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.recipes import load_recipe
 from cpunet.training.figures import sides_figure

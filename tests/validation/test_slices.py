@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.pulses.parameters import align_half_maximum
 from cpunet.validation.methods import Responses
 from cpunet.validation.slices import (
     AFTER,

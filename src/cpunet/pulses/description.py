@@ -133,7 +133,7 @@ def _edges(block: Pulses) -> tuple[Values, Values, Values]:
 
     NaN where a trace has no pulse; shape ``(n,)`` each.
     """
-    from cpunet.pulses.half_maximum import last_below  # compiled loops
+    from cpunet.pulses.parameters import last_below  # compiled loops
 
     waveforms = np.asarray(block.waveforms, np.float32)
     few = max(MIN_BASELINE, waveforms.shape[1] // 20)

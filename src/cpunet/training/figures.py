@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpunet.plotting import COLOURS, DATA_FILL, SPARE_COLOURS, label, styled
-from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.pulses.parameters import align_half_maximum
 from cpunet.training.closed_forms import Chain, reaches_ns
 
 Floats = npt.NDArray[np.floating]

@@ -11,8 +11,7 @@ import torch
 from matplotlib.figure import Figure
 
 from cpunet.networks.learned_response import DriftUNet
-from cpunet.pulses.half_maximum import align_half_maximum
-from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.validation.a_over_e import DEP, ae_figure
 from cpunet.validation.ae_energy import ae_energy_figure

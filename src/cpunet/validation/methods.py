@@ -31,9 +31,8 @@ from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.half_maximum import BLOCK, aligned_block
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import Values, pulse_parameters
+from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block, pulse_parameters
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
@@ -124,8 +123,8 @@ def pair_squares(
         around the crossing; all 0 where a pulse cannot be aligned.
     """
     found = {method: np.zeros((len(truth), 4)) for method in methods}
-    for first in range(0, len(truth), BLOCK):
-        rows = slice(first, first + BLOCK)
+    for first in range(0, len(truth), ALIGNED_BLOCK):
+        rows = slice(first, first + ALIGNED_BLOCK)
         half = truth.shape[1]
         aligned = aligned_block(truth[rows], half, half)
         edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)

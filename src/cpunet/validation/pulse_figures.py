@@ -31,7 +31,7 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.half_maximum import BLOCK, align_half_maximum
+from cpunet.pulses.parameters import BLOCK, align_half_maximum
 
 Values = npt.NDArray[np.float64]
 

@@ -35,7 +35,7 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.half_maximum import align_half_maximum
+from cpunet.pulses.parameters import align_half_maximum
 
 Values = npt.NDArray[np.float64]
 
