@@ -28,8 +28,7 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import prepare
-from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
 from cpunet.training.job import known_response

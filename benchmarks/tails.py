@@ -20,7 +20,7 @@ from cpunet.electronics.tails_law import TailsLaw
 from cpunet.plotting import COLOURS, DATA_FILL, styled
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.recipes import load_recipe
 
 Values = npt.NDArray[np.float64]

@@ -20,7 +20,7 @@ from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.baselines import Baselines
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 

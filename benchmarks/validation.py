@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.pulses.writing import PulseWriter
 
 EVENTS = "FEP=1200,SEP=800,DEP=800"

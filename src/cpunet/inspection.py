@@ -264,7 +264,7 @@ def _detector(detector: Detector, path: str) -> InfoResult:
 
 
 def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
-    from cpunet.pulses.reading.opening import table_sizes
+    from cpunet.pulses.reading.files import table_sizes
 
     path = str(file.path)
     if file.table == ALL:

@@ -24,7 +24,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.recipes import load_recipe
 
 TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)

@@ -27,8 +27,7 @@ from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.provenance import provenance
-from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation import file_translation

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.pulses.writing import PulseWriter
 
 

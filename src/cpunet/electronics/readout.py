@@ -23,7 +23,7 @@ from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray as PulseArray
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.opening import open_pulses
+from cpunet.pulses.reading.files import open_pulses
 from cpunet.simulation.gammas.sample import with_resolution
 
 # Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than

@@ -15,8 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import MARKER
 from cpunet.processes import outcomes, usable_cores
 from cpunet.progress import stage
-from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.opening import tables_of
+from cpunet.pulses.reading.files import PulseFile, tables_of
 
 log = logging.getLogger(__name__)
 

@@ -1,10 +1,12 @@
-"""A file of pulses and how it is read, or pulses in memory in its place."""
+"""A file of pulses and how it is read: its format is told by its first bytes."""
 
 from __future__ import annotations
 
+import re
+import struct
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -125,8 +127,6 @@ class PulseFile:
 
     def open(self) -> PulseSource:
         """Open the file."""
-        from cpunet.pulses.reading.opening import open_file
-
         return open_file(self)
 
 
@@ -156,3 +156,220 @@ def pulse_file(source: Source, options: FileOptions = FileOptions()) -> PulseFil
         f"{type(source).__name__}: are no pulses",
         "give a path, a cpunet.PulseFile, or cpunet.Pulses.of(array, dt_ns=…, energy_kev=…)",
     )
+
+
+Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "pickle", "text"]
+
+_NAMES: dict[Format, str] = {
+    "hdf5": "HDF5",
+    "fcio": "FlashCam",
+    "spe": "spectrum",
+    "npz": "NumPy",
+    "npy": "NumPy",
+    "pickle": "pickle",
+    "text": "text",
+}
+_SUFFIXES: dict[str, Format] = {
+    ".lh5": "hdf5",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".hdf": "hdf5",
+    ".fcio": "fcio",
+    ".spe": "spe",
+    ".npz": "npz",
+    ".npy": "npy",
+    ".pickle": "pickle",
+    ".pkl": "pickle",
+}
+_HEAD_BYTES = 520
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_PICKLE, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
+_TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
+# signs of any encoding, but no control characters
+_COMMENT = re.compile(rb"#[^\x00-\x1f\x7f]*")
+
+
+def open_pulses(
+    path: str | Path,
+    *,
+    table: str | None = None,
+    energy: str | None = None,
+    kev_per_adc: float | None = None,
+    dt_ns: float | None = None,
+) -> PulseSource:
+    """Open a file of pulses; the format is recognised by its content.
+
+    Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, FlashCam
+    ``.fcio``, NumPy ``.npz`` and ``.npy``, siggen's ``.spe`` and text, the Majorana
+    Demonstrator's data release for machine learning, and CPU-Net's pickled pulses.
+
+    Parameters
+    ----------
+    path
+        The file.
+    table
+        Location of the waveforms, needed only if there are several: a table or waveform
+        column of an LH5 file, a group or dataset of an HDF5 file, an array of an ``.npz``, a
+        channel of an ``.fcio``, a detector of the Majorana release.
+    energy
+        Column of the energies, or ``FILE:path/to/column`` for a column of another
+        HDF5 file of the same events, such as LEGEND's hit tier.
+    kev_per_adc
+        Calibration: keV per unit of the energy column, or of the amplitude (maximum above
+        the baseline) if there is no such column.
+    dt_ns
+        Sampling period in ns, if it is not in the file.
+
+    Returns
+    -------
+    PulseSource
+        Source of blocks of `Pulses`, with energies in keV (NaN if unknown).
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing, of an unknown format, damaged or without pulses, if `table` or
+        `energy` is missing or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
+    """
+    return open_file(PulseFile(Path(path), table, energy, kev_per_adc, dt_ns))
+
+
+def open_file(options: PulseFile) -> PulseSource:
+    """Like `open_pulses`; a file of pulses in memory is a source, too."""
+    if options.pulses is not None:
+        from cpunet.pulses.reading.arrays import MemorySource
+
+        return MemorySource(options, options.pulses)
+    # readers are imported when needed: the LH5 library alone takes seconds to load
+    match recognise(options.path):
+        case "hdf5":
+            from cpunet.pulses.reading.hdf5 import open_hdf5
+
+            return open_hdf5(options)
+        case "fcio":
+            from cpunet.pulses.reading.flashcam import FlashCamSource
+
+            return FlashCamSource(options)
+        case "npz" | "npy":
+            from cpunet.pulses.reading.arrays import ArraySource
+
+            return ArraySource(options)
+        case "pickle":
+            from cpunet.pulses.reading.pickles import PickleSource
+
+            return PickleSource(options)
+        case "spe":
+            from cpunet.pulses.reading.siggen import SpectrumSource
+
+            return SpectrumSource(options)
+        case "text":
+            from cpunet.pulses.reading.siggen import TextSource
+
+            return TextSource(options)
+
+
+def tables_of(path: str | Path) -> list[str]:
+    """List the waveform tables of an LH5 or other HDF5 file; empty for formats without tables.
+
+    For the Majorana release these are the detectors, for FlashCam files the channels with
+    traces.
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing or cannot be read.
+    """
+    return list(table_sizes(path))
+
+
+def table_sizes(path: str | Path) -> dict[str, int | None]:
+    """Tables as in `tables_of`, with the number of pulses if it had to be counted, else None.
+
+    Raises
+    ------
+    CpunetError
+        If the file is missing or cannot be read.
+    """
+    path = Path(path)
+    match recognise(path):
+        case "hdf5":
+            return dict.fromkeys(_hdf5_tables(path))
+        case "fcio":
+            from cpunet.pulses.reading.flashcam import channel_sizes
+
+            return channel_sizes(path)
+    return {}
+
+
+def _hdf5_tables(path: Path) -> list[str]:
+    from cpunet.hdf5_files import opened
+    from cpunet.pulses.reading.hdf5 import waveform_tables
+    from cpunet.pulses.reading.majorana import detectors, is_majorana
+
+    with opened(path) as file:
+        return detectors(file) if is_majorana(file) else waveform_tables(file)
+
+
+def recognise(path: Path) -> Format:
+    """Return the format of a file, from its content.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such file, or it is a folder, empty, of an unknown format, or of another
+        format than its suffix says.
+    """
+    head = _head(path)
+    found = _by_content(head, path)
+    claimed = _SUFFIXES.get(path.suffix.lower())
+    # any text is accepted, unless its suffix is that of another format; pickles of protocol 0
+    # are text
+    if found == "text" and claimed is not None:
+        found = "pickle" if claimed == "pickle" else None
+    if found is not None:
+        return found
+    if claimed is not None:
+        raise CpunetError(
+            f"{path}: not a {_NAMES[claimed]} file, despite its name; "
+            "give a file of pulses or correct its suffix"
+        )
+    raise CpunetError(
+        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
+        "pickled pulses, or siggen's .spe or text"
+    )
+
+
+def _head(path: Path) -> bytes:
+    try:
+        if path.is_dir():
+            raise CpunetError(f"{path}: is a folder; give a file of pulses")
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except FileNotFoundError:
+        raise CpunetError(f"{path}: no such file; check the name") from None
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror}); check it") from error
+    if not head:
+        raise CpunetError(f"{path}: is empty; copy or write it again")
+    return head
+
+
+def _by_content(head: bytes, path: Path) -> Format | None:
+    # MATLAB writes 512 bytes of its own before the HDF5 part
+    if _HDF5 in (head[:8], head[512:520]):
+        return "hdf5"
+    if head.startswith(b"\x93NUMPY"):
+        return "npy"
+    if head.startswith(b"PK\x03\x04"):
+        return "npz"
+    # the FCIO library unpacks these two itself, by their suffix
+    if head[4:12] == b"FlashCam" or path.name.endswith((".fcio.gz", ".fcio.zst")):
+        return "fcio"
+    # Fortran record marks around the 24 bytes of a Radware header
+    if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
+        return "spe"
+    if head[0] == _PICKLE and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
+        return "pickle"
+    if set(_COMMENT.sub(b"", head)) <= _TEXT_BYTES:
+        return "text"
+    return None

@@ -28,7 +28,7 @@ _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of pref
 
 
 def open_hdf5(options: PulseFile) -> PulseSource:
-    """Open the waveforms of an HDF5 file, LH5 or not; see `opening.open_pulses`."""
+    """Open the waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
     with opened(options.path) as file:
         if is_majorana(file):
             return MajoranaSource(options)
