@@ -118,14 +118,8 @@ def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:
     return {name: _column(path, m) for name, m in members.items() if is_column(m)}
 
 
-def columns_beside(path: Path, name: str) -> dict[str, Hdf5Column]:
-    """Columns of the group in which a column of an HDF5 file stands."""
-    with opened(path) as file:
-        return columns_of(path, file[name].parent)
-
-
-def column_of(path: Path, name: str) -> Hdf5Column:
-    """Return a column of an HDF5 file by its path in the file.
+def column_of(path: Path, name: str) -> tuple[Hdf5Column, dict[str, Hdf5Column]]:
+    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
 
     Raises
     ------
@@ -135,7 +129,7 @@ def column_of(path: Path, name: str) -> Hdf5Column:
     with opened(path) as file:
         found = file.get(name)
         if is_column(found):
-            return _column(path, found)
+            return _column(path, found), columns_of(path, found.parent)
         parent = file.get(name.strip("/").rpartition("/")[0] or "/")
         known = list(columns_of(path, parent)) if isinstance(parent, h5py.Group) else list(file)
     raise CpunetError(f"{path}: no column {name}; there are {shortened(known)}")

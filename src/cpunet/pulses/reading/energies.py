@@ -201,10 +201,9 @@ def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Col
             f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
         )
     # Imported late: the LH5 library takes seconds to load, and most files do not need it.
-    from cpunet.hdf5_files import column_of, columns_beside
+    from cpunet.hdf5_files import column_of
 
-    column = column_of(Path(file), inner)
-    return _joined(path, columns, energy, column, columns_beside(Path(file), inner))
+    return _joined(path, columns, energy, *column_of(Path(file), inner))
 
 
 def _joined(

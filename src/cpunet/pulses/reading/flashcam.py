@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -44,17 +45,11 @@ class FlashCamSource(PulseSource):
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
-        waveforms: list[npt.NDArray[np.uint16]] = []
-        numbers: list[int] = []
         with _opened(self.path) as stream:
-            for trace, number in self._events(stream):
-                waveforms.append(trace)
-                numbers.append(number)
-                if len(numbers) == size:
-                    yield Traces(np.stack(waveforms), np.asarray(numbers))
-                    waveforms, numbers = [], []
-        if numbers:
-            yield Traces(np.stack(waveforms), np.asarray(numbers))
+            events = self._events(stream)
+            while some := list(islice(events, size)):
+                waveforms, numbers = zip(*some, strict=True)
+                yield Traces(np.stack(waveforms), np.asarray(numbers))
 
     def _events(self, stream: FCIO) -> Iterator[tuple[npt.NDArray[np.uint16], int]]:
         # The last record of a truncated file looks like an event: yield each event

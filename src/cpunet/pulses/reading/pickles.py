@@ -13,6 +13,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,6 @@ _ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
 }
 _PERIOD_HINT = "CPU-Net's pulses are sampled every 16 ns"
 _OTHERS = "write the pulses of one length without other entries"
-_WHY = {
-    "no_pulse": "no dictionary with wf",
-    "no_numbers": "holds something other than numbers",
-    "no_trace": "its wf is no trace",
-}
 
 
 @dataclass(frozen=True)
@@ -93,8 +89,8 @@ def entries(path: Path) -> Iterator[Any]:
                 yield value
 
 
-def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
-    """Convert an entry to a pulse; None, and the reason, if it is not one.
+def as_pulse(entry: Any, number: int) -> PickledPulse | str:
+    """Convert an entry to a pulse; the reason, if it is not one.
 
     Parameters
     ----------
@@ -104,7 +100,7 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
         Its index in the file, which replaces a missing event number.
     """
     if not isinstance(entry, dict) or "wf" not in entry:
-        return None, "no_pulse"
+        return "no dictionary with wf"
     try:
         with np.errstate(over="ignore"):  # values beyond single precision are counted later
             samples = np.asarray(entry["wf"], np.float32)
@@ -114,10 +110,10 @@ def as_pulse(entry: Any, number: int) -> tuple[PickledPulse | None, str]:
             if name in numbers or name == "dc_label":
                 numbers[name] = float(value)
     except (TypeError, ValueError, OverflowError):
-        return None, "no_numbers"
+        return "holds something other than numbers"
     if samples.ndim != 1 or not len(samples):
-        return None, "no_trace"
-    return PickledPulse(samples, numbers, event), ""
+        return "its wf is no trace"
+    return PickledPulse(samples, numbers, event)
 
 
 @dataclass
@@ -133,10 +129,10 @@ class _Seen:
         length, place = 0, -1
         try:
             for place, entry in enumerate(entries(self.path)):
-                pulse, reason = as_pulse(entry, place)
-                if pulse is None:
+                pulse = as_pulse(entry, place)
+                if isinstance(pulse, str):
                     raise CpunetError(
-                        f"{self.path}: entry {place} is no pulse ({_WHY[reason]}); {_OTHERS}"
+                        f"{self.path}: entry {place} is no pulse ({pulse}); {_OTHERS}"
                     )
                 length = length or len(pulse.samples)
                 if len(pulse.samples) != length:
@@ -206,16 +202,7 @@ class PickleSource(PulseSource):
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
-        waiting: list[PickledPulse] = []
-        for pulse in self._seen.pulses():
-            waiting.append(pulse)
-            if len(waiting) == size:
-                yield _joined(waiting)
-                waiting = []
-        if waiting:
-            yield _joined(waiting)
-
-
-def _joined(pulses: list[PickledPulse]) -> Traces:
-    numbers = np.array([pulse.event for pulse in pulses], np.int64)
-    return Traces(np.stack([pulse.samples for pulse in pulses]), numbers)
+        pulses = self._seen.pulses()
+        while some := list(islice(pulses, size)):
+            numbers = np.array([pulse.event for pulse in some], np.int64)
+            yield Traces(np.stack([pulse.samples for pulse in some]), numbers)

@@ -165,8 +165,6 @@ class PulseSource(ABC):
             If the file is damaged or contains no pulses, or if its events differ in length or
             sampling period.
         """
-        if size < 1:
-            raise ValueError(f"block size is {size}; expected at least 1")
         start = 0
         for traces in self._traces(min(size, max(1, BLOCK_BYTES // (4 * self.length)))):
             yield self._pulses(start, traces)
