@@ -21,8 +21,8 @@ from cpunet.outputs import (
     written_aside,
 )
 
-RUN = FolderKind("run", "cpunet train", "run.json", r"run\.json|log/[ab]")
-REPORT = FolderKind("report", "cpunet validate", "metrics.json", r"metrics\.json")
+RUN = FolderKind("run", "cpunet train", r"run\.json|log/[ab]")
+REPORT = FolderKind("report", "cpunet validate", r"metrics\.json")
 
 
 def tree(folder: Path) -> dict[str, str]:

@@ -37,8 +37,6 @@ class FolderKind:
         Name of the kind; a folder is replaced only by one of the same kind.
     command
         Command that creates the folder.
-    known_by
-        Name of a file in every finished folder.
     own
         Regular expression of names of the program's files, relative to the folder, that may
         come into it later.
@@ -46,7 +44,6 @@ class FolderKind:
 
     name: str
     command: str
-    known_by: str
     own: str
 
 

@@ -30,7 +30,6 @@ DPI = 110
 PLAN = FolderKind(
     name="plan",
     command="cpunet calibrate --plan",
-    known_by="plan.json",
     own=r"plan\.json|plan\.png",
 )
 

@@ -45,7 +45,6 @@ MARKER = "stand.json"
 STAND = FolderKind(
     name="stand",
     command="cpunet stand",
-    known_by=MARKER,
     own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
 )
 # Events per side from which building a library of pulses (20 s on two cores) takes less time

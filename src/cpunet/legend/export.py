@@ -41,7 +41,6 @@ WHOLE = "cpunet.yaml"
 LEGEND_PARS = FolderKind(
     name="legend-pars",
     command="cpunet export legend",
-    known_by=WHOLE,
     own=r"(elecmod|aoemeanmod|aoeresmod|cpunet)\.yaml",
 )
 TEMPLATES = 2000  # approximate number of templates of a library to test the kernel on

@@ -59,7 +59,6 @@ MARKER, CHECKPOINT, ASIDE = "unfinished.json", "checkpoint.pt", ".checkpoint.par
 UNFINISHED = FolderKind(
     name="unfinished run",
     command="cpunet train",
-    known_by=MARKER,
     own=rf"{RUN.own}|unfinished\.json|checkpoint\.pt|\.[^/]*\.partial.*",
 )
 # settings of logs and checkpoints, which do not affect the weights

@@ -38,7 +38,6 @@ MARKER = "response.json"
 RESPONSE = FolderKind(
     name="response",
     command="cpunet response",
-    known_by=MARKER,
     own=r"response\.json|response\.png",
 )
 _DPI = 150

@@ -55,7 +55,6 @@ INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weig
 RUN = FolderKind(
     name="run",
     command="cpunet train",
-    known_by=INFO,
     own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
     r"|calibration\.json|(profiles|pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
 )

@@ -31,7 +31,6 @@ METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
     name="report",
     command="cpunet validate",
-    known_by=METRICS,
     own=r"metrics\.json|report\.html|parameters\.npz",
 )
 # methods of the printed table, in the order of the page; those without noise are in the metrics
