@@ -11,7 +11,13 @@ import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.drawn_tails import SIZES_KEV, DrawnTails, SameNoise, TraceNoise, passing
+from cpunet.electronics.drawn_pile_up import (
+    SIZES_KEV,
+    DrawnTails,
+    SameNoise,
+    TraceNoise,
+    passing,
+)
 from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.tails_law import (

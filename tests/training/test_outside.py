@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import PADDING_BEFORE, with_room
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import KnownDecay
+from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.training import fitter as fitter_module

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails, TraceNoise
-from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp, TraceNoise
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import NOISE_BINS

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 from torch import nn
 
-from cpunet.electronics.drawn_tails import SIZES_KEV
+from cpunet.electronics.drawn_pile_up import SIZES_KEV
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.processes import outcomes

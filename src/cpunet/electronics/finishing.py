@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import SameNoise, TraceNoise
+from cpunet.electronics.drawn_pile_up import SameNoise, TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import tail_slope

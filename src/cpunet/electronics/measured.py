@@ -10,7 +10,7 @@ import numpy as np
 
 import cpunet
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails, passing
+from cpunet.electronics.drawn_pile_up import DrawnTails, passing
 from cpunet.electronics.finishing import PADDING_BEFORE
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.errors import CpunetError

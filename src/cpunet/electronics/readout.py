@@ -16,9 +16,9 @@ from scipy import fft
 from scipy.signal import lfilter
 
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum, Wander
+from cpunet.electronics.drawn_pile_up import DrawnPileUp
 from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.in_trace_pile_up import DrawnPileUp
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray as PulseArray

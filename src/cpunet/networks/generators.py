@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import LearnedConfig, ResponseConfig

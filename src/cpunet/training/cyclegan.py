@@ -29,7 +29,7 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
-from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE
 from cpunet.networks.discriminators import GruDiscriminator
 from cpunet.networks.generators import KeptNoise, stretch

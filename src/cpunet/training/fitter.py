@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpunet.electronics.drawn_tails import KnownDecay
+from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import Readout
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.differentiable import DifferentiableSet

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse, StepResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.network_settings import LearnedConfig

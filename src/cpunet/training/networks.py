@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from cpunet.electronics.drawn_tails import TraceNoise
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.measured import find_tails, measured_noise
 from cpunet.errors import CpunetError
 from cpunet.outputs import (

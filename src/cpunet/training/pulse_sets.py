@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.electronics.drawn_tails import KnownDecay
+from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.network_settings import ResponseConfig
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain

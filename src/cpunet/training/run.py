@@ -31,7 +31,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 import cpunet
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo

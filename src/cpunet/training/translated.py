@@ -17,7 +17,7 @@ import scipy.fft
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.response_layer import (
     PADDING_AFTER,
     PADDING_BEFORE,

@@ -12,9 +12,8 @@ import torch
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.electronics.finishing import PADDING_BEFORE, extended, finish, with_room
-from cpunet.electronics.in_trace_pile_up import InTracePileUp
 from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses

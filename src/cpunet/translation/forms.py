@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_tails import DrawnTails
+from cpunet.electronics.drawn_pile_up import Columns, DrawnPileUp, DrawnTails, InTracePileUp
 from cpunet.electronics.finishing import extended
-from cpunet.electronics.in_trace_pile_up import Columns, DrawnPileUp, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import PADDING_BEFORE, record_length
 from cpunet.pulses.container import FloatArray, Pulses

@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_tails import DrawnTails
-from cpunet.electronics.in_trace_pile_up import InTracePileUp
+from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare

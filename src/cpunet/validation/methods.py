@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_tails import DrawnTails, SameNoise, TraceNoise
+from cpunet.electronics.drawn_pile_up import DrawnTails, SameNoise, TraceNoise
 from cpunet.electronics.finishing import BLOCK as FINISHED
 from cpunet.electronics.finishing import blocks, finish
 from cpunet.electronics.fitted_kernels import BASELINE_METHODS
