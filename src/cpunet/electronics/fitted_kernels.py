@@ -37,6 +37,7 @@ from cpunet.electronics.baseline_methods import (
 from cpunet.electronics.finishing import PADDING_BEFORE, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.parameters import last_below
 
 Groups = list[npt.NDArray[np.int64]]
 
@@ -67,14 +68,11 @@ def crossing(steps: Values, fraction: float) -> Values:
     >>> crossing(np.array([[0.0, 0.0, 0.4, 0.8, 1.0, 1.0]]), 0.5)
     array([2.25])
     """
-    samples = np.arange(steps.shape[1])
-    top = (steps >= RISE_END).argmax(axis=1)[:, np.newaxis]
-    below = (steps < fraction) & (samples < top)
-    last = steps.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    top = (steps >= RISE_END).argmax(axis=1)
+    known, last = last_below(steps, top, np.full(len(steps), fraction))
     last = np.minimum(last, steps.shape[1] - 2)
     rows = np.arange(len(steps))
     low, high = steps[rows, last], steps[rows, last + 1]
-    known = below.any(axis=1)
     rise = np.where(known, high - low, 1.0)
     return np.asarray(np.where(known, last + (fraction - low) / rise, np.nan), float)
 
