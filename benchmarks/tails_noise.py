@@ -21,7 +21,7 @@ from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.files import open_pulses
-from cpunet.pulses.writing import write_pulses
+from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 
 FREQUENCIES_KHZ = (20, 60, 120, 400)
@@ -49,7 +49,8 @@ def main() -> None:
     traces = np.rint(raw.waveforms + gain * left[:, np.newaxis] * decay)
     lifted = replace(raw, waveforms=traces.clip(0, 65535).astype(np.float32))
     arguments.out.mkdir()
-    write_pulses(arguments.out / "data.lh5", lifted, table="geds/raw")
+    with PulseWriter(arguments.out / "data.lh5", table="geds/raw") as writer:
+        writer.append(lifted)
     for name in ("sim.lh5", "truth.npz"):
         shutil.copyfile(arguments.folder / name, arguments.out / name)
 

@@ -19,7 +19,7 @@ from rich.table import Table
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.writing import write_pulses
+from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.training.train import train
 from cpunet.validation.evaluation import evaluate
@@ -40,7 +40,8 @@ def few_of(data: PulseFile, pulses: int, folder: Path) -> PulseFile:
         energy_kev=np.concatenate([part.energy_kev for part in kept])[:pulses],
     )
     path = folder / "few.lh5"
-    write_pulses(path, few, table="geds/raw")
+    with PulseWriter(path, table="geds/raw") as writer:
+        writer.append(few)
     return PulseFile(path)
 
 

@@ -10,7 +10,7 @@ import io
 import resource
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.writing import write_pulses
+from cpunet.pulses.writing import Columns, PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
@@ -78,6 +78,22 @@ LOSS_NAMES = (
     "discriminator_data",
     "discriminator_sim",
 )
+
+
+def write_pulses(
+    path: str | Path,
+    blocks: Pulses | Iterable[Pulses],
+    *,
+    columns: Columns | None = None,
+    **options: Any,
+) -> int:
+    """Write pulses, at once or in blocks, with columns of all blocks together; their number."""
+    extra = {name: (np.asarray(v), units) for name, (v, units) in (columns or {}).items()}
+    with PulseWriter(path, **options) as writer:
+        for block in [blocks] if isinstance(blocks, Pulses) else blocks:
+            rows = slice(writer.n_pulses, writer.n_pulses + len(block))
+            writer.append(block, {name: (v[rows], u) for name, (v, u) in extra.items()})
+    return writer.n_pulses
 
 
 def edges(

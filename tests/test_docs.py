@@ -26,11 +26,10 @@ import cpunet
 from cpunet.cli import app, with_options
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import list_recipes, load_recipe
 from cpunet.training.train import train
 from cpunet.translation.translator import RejectionWarning
-from synthetic import KEV, phased_edges, write_sides
+from synthetic import KEV, phased_edges, write_pulses, write_sides
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]

@@ -15,11 +15,10 @@ from torch import nn
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load, subtract_tails
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.description import trace_properties
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.training import chain_description
-from synthetic import status_of, write_run
+from synthetic import status_of, write_pulses, write_run
 
 RECIPE = load_recipe("fast")
 DT = FileOptions(dt_ns=16)

@@ -31,8 +31,8 @@ from cpunet.electronics.readout import (
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
+from synthetic import write_pulses
 
 PRESETS = ("legend200", "ornl", "ringing")
 T_NS = np.arange(0, 20_000, 0.5)

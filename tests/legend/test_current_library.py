@@ -27,7 +27,6 @@ from cpunet.legend.make_library import make_library
 from cpunet.legend.translate_library import TemplateTranslator, enclosed, translate_library
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.writing import write_pulses
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -38,7 +37,7 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.run import Run, SideInfo
 from cpunet.translation.translator import REN
-from synthetic import after_pole_and_decay, sampled, write_chain
+from synthetic import after_pole_and_decay, sampled, write_chain, write_pulses
 
 R, Z = np.arange(6.0), np.arange(8.0)
 WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")

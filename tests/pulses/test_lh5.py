@@ -19,8 +19,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.row_columns import RowColumns, repeated
-from cpunet.pulses.writing import PulseWriter, write_pulses
-from synthetic import waveform_table
+from cpunet.pulses.writing import PulseWriter
+from synthetic import waveform_table, write_pulses
 
 RNG = np.random.default_rng(1)
 N, LENGTH = 23, 40
@@ -323,9 +323,8 @@ def test_no_pulses_leave_no_file(tmp_path, blocks):
 
 def test_columns_must_fit(tmp_path):
     path = tmp_path / "pulses.lh5"
-    for n in (5, 7):
-        with pytest.raises(CpunetError, match=r"column a has (shape|7)"):
-            write_pulses(path, [some(3), some(3, start=3)], columns={"a": (np.arange(n), "")})
+    with pytest.raises(CpunetError, match="column a has shape"):
+        write_pulses(path, [some(3), some(3, start=3)], columns={"a": (np.arange(5), "")})
     with pytest.raises(CpunetError, match="column energy is the pulses' own"):
         write_pulses(path, some(), columns={"energy": (np.arange(6), "keV")})
     with PulseWriter(path) as writer:

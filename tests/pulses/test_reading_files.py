@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.writing import write_pulses
+from synthetic import write_pulses
 
 VALUES = np.random.default_rng(2).normal(size=(11, 30)).astype(np.float32)
 ENERGY = np.linspace(500, 3000, 11)

@@ -14,13 +14,12 @@ from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.translator import REN
-from synthetic import SMALL_NETWORK, after_pole, decay, phased_edges, write_run
+from synthetic import SMALL_NETWORK, after_pole, decay, phased_edges, write_pulses, write_run
 
 SHORT = (
     "training.components=4",

@@ -28,7 +28,6 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile, open_pulses
-from cpunet.pulses.writing import write_pulses
 from cpunet.recipes import load_recipe
 from cpunet.translation import file_translation
 from cpunet.translation.file_translation import Counts, noise_seed
@@ -44,6 +43,7 @@ from synthetic import (
     nearly_full_disk,
     waveform_table,
     write_chain,
+    write_pulses,
     write_run,
 )
 

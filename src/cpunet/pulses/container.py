@@ -137,9 +137,10 @@ class Pulses:
         CpunetError
             If the file exists, unless `force`.
         """
-        from cpunet.pulses.writing import write_pulses
+        from cpunet.pulses.writing import PulseWriter
 
-        write_pulses(Path(path), self, force=force)
+        with PulseWriter(path, force=force) as writer:
+            writer.append(self)
         return Path(path)
 
     def with_waveforms(self, waveforms: FloatArray) -> Pulses:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -196,51 +196,6 @@ class PulseWriter:
 
 def _column(values: npt.ArrayLike, units: str) -> Array:
     return Array(np.asarray(values), attrs={"units": units} if units else {})
-
-
-def write_pulses(
-    path: str | Path,
-    blocks: Pulses | Iterable[Pulses],
-    *,
-    columns: Columns | None = None,
-    **options: Any,
-) -> int:
-    """Write pulses to an LH5 file (see `PulseWriter`), at once or in blocks.
-
-    Parameters
-    ----------
-    path
-        The file to write.
-    blocks
-        Pulses, at once or in blocks; only one block is in memory at a time.
-    columns
-        Further values per event for all blocks together: name → (array of shape
-        ``(total,)``, units).
-    **options
-        See `PulseWriter`.
-
-    Returns
-    -------
-    int
-        Number of pulses written.
-
-    Raises
-    ------
-    CpunetError
-        As for `PulseWriter`, and if a column does not have one value per pulse.
-    """
-    extra = {name: (np.asarray(v), units) for name, (v, units) in (columns or {}).items()}
-    with PulseWriter(path, **options) as writer:
-        for block in [blocks] if isinstance(blocks, Pulses) else blocks:
-            rows = slice(writer.n_pulses, writer.n_pulses + len(block))
-            writer.append(block, {name: (v[rows], u) for name, (v, u) in extra.items()})
-        for name, (values, _) in extra.items():
-            if len(values) != writer.n_pulses:
-                raise CpunetError(
-                    f"{path}: column {name} has {len(values)} values beside "
-                    f"{writer.n_pulses} pulses; give one value per pulse"
-                )
-    return writer.n_pulses
 
 
 def _in_words(shape: tuple[int, float, tuple[str, ...]]) -> str:
