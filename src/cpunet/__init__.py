@@ -23,8 +23,8 @@ DISTRIBUTION, OTHER = "cpunet-hpge", "cpunet"
 
 # torch takes seconds to import: `import cpunet` and `cpunet --help` must not wait for it
 _STUB = Path(__file__).with_suffix(".pyi").read_text("utf-8")
-_HOMES = {n: home for home, n in re.findall(r"^from (\S+) import (\w+)", _STUB, re.MULTILINE)}
-__all__ = sorted(["__version__", *_HOMES])
+HOMES = {n: home for home, n in re.findall(r"^from (\S+) import (\w+)", _STUB, re.MULTILINE)}
+__all__ = sorted(["__version__", *HOMES])
 
 
 @cache
@@ -54,11 +54,11 @@ def other_package() -> str | None:
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in HOMES:
         raise AttributeError(f"module 'cpunet' has no attribute {name!r}")
     if clash := other_package():
         warnings.warn(clash, stacklevel=2)
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(HOMES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -48,6 +48,7 @@ from cpunet.validation.validate import validate as validate
 
 __version__: str
 __all__: list[str]
+HOMES: dict[str, str]
 DISTRIBUTION: str
 OTHER: str
 

@@ -38,69 +38,48 @@ from cpunet.translation.options import Adc
 
 log = logging.getLogger(__name__)
 
-# Where the function of a command is, and what it does.
+# The public function of a command, and what it does.
 COMMANDS = {
     "demo": (
-        "cpunet.demonstration:demo",
+        "demo",
         "Simulate, digitise, train, translate and validate on a stand with a known answer.",
     ),
     "check": (
-        "cpunet.training.check:check",
+        "check",
         "Say whether simulated and measured pulses can be compared, and what to do if not.",
     ),
     "export legend": (
-        "cpunet.legend.export:export_legend",
+        "export_legend",
         "Export a readout chain as parameters for LEGEND's simulation chain.",
     ),
-    "export onnx": (
-        "cpunet.translation.export:export_onnx",
-        "Export the deterministic part of a run as ONNX.",
-    ),
-    "import": (
-        "cpunet.training.published:import_weights",
-        "Make a run of the weights that the authors published.",
-    ),
-    "info": ("cpunet.inspection:info", "Say what is in a file, detector, run or report."),
+    "export onnx": ("export_onnx", "Export the deterministic part of a run as ONNX."),
+    "import": ("import_weights", "Make a run of the weights that the authors published."),
+    "info": ("info", "Say what is in a file, detector, run or report."),
     "response": (
-        "cpunet.training.response:response",
+        "response",
         "Say in terms of physics what readout was learned, beside the truth if it is known.",
     ),
-    "library make": (
-        "cpunet.legend.make_library:make_library",
-        "Simulate the charge pulse of every place in a detector.",
-    ),
+    "library make": ("make_library", "Simulate the charge pulse of every place in a detector."),
     "library translate": (
-        "cpunet.legend.translate_library:translate_library",
+        "translate_library",
         "Translate a library of charge pulses with a trained run, without noise.",
     ),
     "simulate": (
-        "cpunet.simulation.simulate:simulate",
+        "simulate",
         "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
     ),
     "stand": (
-        "cpunet.electronics.stand:make_stand",
+        "make_stand",
         "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
     ),
-    "train": (
-        "cpunet.training.train:train",
-        "Train REN and IREN on simulated and measured pulses, unpaired.",
-    ),
+    "train": ("train", "Train REN and IREN on simulated and measured pulses, unpaired."),
     "translate": (
-        "cpunet.translation.translate:translate",
+        "translate",
         "Translate pulses with a trained run, keeping the rows and columns of their files.",
     ),
-    "calibrate": (
-        "cpunet.calibration.calibrate:calibrate",
-        "Calibrate the detector and its electronics together.",
-    ),
-    "validate": (
-        "cpunet.validation.validate:validate",
-        "Score a run per peak and write a report.",
-    ),
-    "compare": (
-        "cpunet.validation.compare:compare",
-        "Put the scores of several validations beside each other.",
-    ),
+    "calibrate": ("calibrate", "Calibrate the detector and its electronics together."),
+    "validate": ("validate", "Score a run per peak and write a report."),
+    "compare": ("compare", "Put the scores of several validations beside each other."),
 }
 
 GROUPS = {
@@ -151,7 +130,7 @@ def _made() -> App:
     for name, (function, told) in COMMANDS.items():
         *group_of, word = name.split()
         place = GROUPS[group_of[0]] if group_of else made
-        place.command(function, name=word, help=told)
+        place.command(f"{cpunet.HOMES[function]}:{function}", name=word, help=told)
     return made
 
 
