@@ -11,6 +11,7 @@ Neither the notes' table nor the files give the sampling period.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 
 import h5py
 import numpy as np
@@ -66,27 +67,22 @@ class MajoranaSource(PulseSource):
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
+        rows = self._single()
+        while some := list(islice(rows, size)):
+            yield Traces(np.stack(some))
+
+    def _single(self) -> Iterator[npt.NDArray[np.float32]]:
         # whole slabs: row by row, the chunks of a compressed file would be unpacked repeatedly
         with opened(self.path) as file:
             dataset = file[WAVEFORMS]
             slab = max(1, _SLAB_BYTES // (dataset.dtype.itemsize * self.length))
-            waiting: list[npt.NDArray[np.float32]] = []
-            held = 0
             for start in range(0, dataset.shape[0], slab):
                 chosen = self._rows[np.searchsorted(self._rows, start) :]
                 chosen = chosen[chosen < start + slab] - start
-                if not len(chosen):
-                    continue
-                with np.errstate(over="ignore"):  # overflows become infinite
-                    found = dataset[start : start + slab][chosen].astype(np.float32)
-                waiting.append(found)
-                held += len(found)
-                while held >= size:
-                    whole = np.concatenate(waiting)
-                    yield Traces(whole[:size])
-                    waiting, held = [whole[size:]], held - size
-            if held:
-                yield Traces(np.concatenate(waiting))
+                if len(chosen):
+                    with np.errstate(over="ignore"):  # overflows become infinite
+                        found = dataset[start : start + slab][chosen].astype(np.float32)
+                    yield from found
 
 
 def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
