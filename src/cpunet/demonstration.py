@@ -5,12 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cpunet.electronics.stand import make_stand
+import cpunet
 from cpunet.outputs import refuse_existing
-from cpunet.training.run import Run
-from cpunet.training.train import train
-from cpunet.validation.report import Report
-from cpunet.validation.validate import validate
 
 EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
 GLANCE = ("SEP mean pulse", "SEP current_amplitude", "SEP single pulse")
@@ -22,7 +18,7 @@ QUICK_LOOK = (
 
 def demo(
     out: str | Path = "demo", *, quick: bool = False, seed: int = 0, force: bool = False
-) -> Report:
+) -> cpunet.Report:
     """Simulate, digitise, train, translate and validate on a stand with a known answer.
 
     Parameters
@@ -51,11 +47,11 @@ def demo(
     for part in parts:
         refuse_existing(part, force=force)
     in_stand, in_run, in_report = parts
-    stand = make_stand(in_stand, events=FEW if quick else EVENTS, seed=seed, force=force)
-    run = train(stand.sim, stand.data, in_run, seed=seed, force=force)
-    assert isinstance(run, Run)  # the stand has one channel
-    report = validate(run, stand.sim, stand.data, truth=stand.truth, seed=seed)
-    assert isinstance(report, Report)
+    stand = cpunet.make_stand(in_stand, events=FEW if quick else EVENTS, seed=seed, force=force)
+    run = cpunet.train(stand.sim, stand.data, in_run, seed=seed, force=force)
+    assert isinstance(run, cpunet.Run)  # the stand has one channel
+    report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth, seed=seed)
+    assert isinstance(report, cpunet.Report)
     if quick:
         drawn = {name: draw for name, draw in (report.drawn or {}).items() if name in GLANCE}
         report = replace(report, drawn=drawn, notes=(QUICK_LOOK, *report.notes))

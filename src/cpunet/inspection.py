@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
 from cpunet.pulses.channels import ALL, channels_of
@@ -24,12 +25,9 @@ from cpunet.tables import Lines, aligned, text_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from cpunet.electronics.stand import Stand
     from cpunet.recipes.schema import Recipe
-    from cpunet.training.run import Run
-    from cpunet.validation.report import Report
 
-    Loaded: TypeAlias = Run | Report | Stand | PulseFile
+    Loaded: TypeAlias = cpunet.Run | cpunet.Report | cpunet.Stand | PulseFile
 
 _DPI = 150
 _FIRST_PULSES, _TAILS_BLOCK = 256, 4096  # traces read at a time
@@ -184,21 +182,15 @@ def load(path: str | Path) -> Loaded:
         file = PulseFile(path)
         file.open()
         return file
-    from cpunet.training.run import INFO, Run
-
-    if (path / INFO).is_file():
-        return Run.load(path)
+    if (path / "run.json").is_file():
+        return cpunet.Run.load(path)
     if (path / "metrics.json").is_file():
-        from cpunet.validation.report import Report
-
-        return Report.load(path)
+        return cpunet.Report.load(path)
     if (path / "stand.json").is_file():
-        from cpunet.electronics.stand import Stand
-
-        return Stand.load(path)
+        return cpunet.Stand.load(path)
     raise CpunetError(
         f"{path}: no folder of this program",
-        f"give the folder of a run, which holds {INFO}, of a report or stand, or a file",
+        "give the folder of a run, which holds run.json, of a report or stand, or a file",
     )
 
 
@@ -233,10 +225,8 @@ def _look(
 
 
 def _folder(path: str | Path) -> InfoResult:
-    from cpunet.training.run import Run
-
     found = load(path)
-    if isinstance(found, Run):
+    if isinstance(found, cpunet.Run):
         return InfoResult(str(path), found.summary())
     if verdicts := getattr(found, "verdicts", None):
         return InfoResult(str(path), [("report", str(path)), *(("", v) for v in verdicts)])
@@ -280,20 +270,18 @@ def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
     if len(tables) < 2:
         return _pulses(file, recipe)
     values: dict[str, Any] = {}
+    rows = []
     for name, number in tables.items():
         try:
             source = replace(file, table=name).open()
         except CpunetError as error:
             values[name] = str(error).removeprefix(f"{path}: ")
+            rows.append([name, "", "", "", values[name]])
         else:
-            told = {"n_pulses": number or source.n_pulses, "length": source.length}
-            values[name] = told | {"dt_ns": source.dt_ns, "energy": source.energies.description}
-    rows = [
-        [name, "", "", "", known]
-        if isinstance(known, str)
-        else [name, known["n_pulses"], known["length"], f"{known['dt_ns']:g}", known["energy"]]
-        for name, known in values.items()
-    ]
+            n, energy = number or source.n_pulses, source.energies.description
+            values[name] = {"n_pulses": n, "length": source.length}
+            values[name] |= {"dt_ns": source.dt_ns, "energy": energy}
+            rows.append([name, n, source.length, f"{source.dt_ns:g}", energy])
     text = text_table(["table", "traces", "samples", "ns", "energies"], rows)
     lines = [("", text), ("", "one of them: `table` NAME; each in full: `table` all")]
     return InfoResult(path, lines, values)
