@@ -382,7 +382,9 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     """
     energy, n = required_energy_kev(pulses), len(pulses)
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
-    shift_ns = _shift_ns(electronics, n, clock)
+    # a uniform clock phase plus trigger jitter
+    shift_ns = clock.uniform(0, electronics.dt_ns, size=n)
+    shift_ns += clock.normal(0, electronics.trigger_jitter_ns, size=n)
     linear = linear_response(pulses, electronics, shift_ns)
     own_kev = energy[:, None] * linear
     other = draw_other_pulses(pulses, electronics, others)
@@ -422,9 +424,3 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         piled_kev=other.piled_kev,
         piled_ns=other.piled_ns - shift_ns,
     )
-
-
-def _shift_ns(electronics: Electronics, n: int, rng: np.random.Generator) -> FloatArray:
-    """Start of the pulses after `n_pre` samples: a uniform clock phase plus trigger jitter."""
-    phase = rng.uniform(0, electronics.dt_ns, size=n)
-    return phase + rng.normal(0, electronics.trigger_jitter_ns, size=n)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
@@ -190,8 +189,6 @@ def _nothing_left(source: PulseSource, sets: list[Prepared]) -> CpunetError:
 
 log = logging.getLogger(__name__)
 
-Energies = npt.NDArray[np.float64]
-
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
@@ -254,7 +251,7 @@ class InputSet:
     prepared: Prepared
     dt_ns: float
     path: Path
-    energies_kev: Energies
+    energies_kev: FloatColumn
     cuts: CutWindows | None = None
     read_as: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None

@@ -255,11 +255,7 @@ def _by_blocks(
     function: Callable[[FloatArray], Values], waveforms: FloatArray, shortest: int
 ) -> Values:
     """Apply `function` to blocks of pulses of at least `shortest` samples."""
-    if waveforms.ndim != 2 or waveforms.shape[1] < shortest:
-        raise CpunetError(
-            f"waveforms have shape {waveforms.shape}; "
-            f"expected (pulses, samples) with {shortest} samples or more"
-        )
+    require_pulses(waveforms, shortest)
     values = np.empty(len(waveforms))
     for first in range(0, len(waveforms), BLOCK):
         rows = slice(first, first + BLOCK)
@@ -450,7 +446,7 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
     array([[0.339, 0.417, 0.5  , 0.583, 0.661],
            [0.339, 0.417, 0.5  , 0.583, 0.661]], dtype=float32)
     """
-    require_pulses(waveforms)
+    require_pulses(waveforms, 2)
     aligned = np.empty((len(waveforms), n_before + n_after), np.float32)
     for first in range(0, len(waveforms), ALIGNED_BLOCK):
         rows = slice(first, first + ALIGNED_BLOCK)
@@ -458,12 +454,12 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
     return aligned
 
 
-def require_pulses(waveforms: FloatArray) -> None:
+def require_pulses(waveforms: FloatArray, shortest: int) -> None:
     """Raise a `CpunetError` unless an array has the shape (pulses, samples)."""
-    if waveforms.ndim != 2 or waveforms.shape[1] < 2:
+    if waveforms.ndim != 2 or waveforms.shape[1] < shortest:
         raise CpunetError(
             f"waveforms have shape {waveforms.shape}; "
-            "expected (pulses, samples) with 2 samples or more"
+            f"expected (pulses, samples) with {shortest} samples or more"
         )
 
 

@@ -121,7 +121,6 @@ def second_rate(traces: Traces) -> SecondRate | None:
 
 log = logging.getLogger(__name__)
 
-Energies = npt.NDArray[np.float64]
 
 MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
@@ -153,7 +152,7 @@ class Seen:
     ) -> None:
         self._path, self._side, self._config, self._insist = source.path, side, config, insist
         self._recorded = require_recorded_side(source, side, SWAPPED)
-        self._kev, self._amplitudes = list[Energies](), list[Energies]()
+        self._kev, self._amplitudes = list[Values](), list[Values]()
         self._first: npt.NDArray[np.float32] | None = None
         self._baselines = list[Baselines]()
         self._whole, self._rows = list[Pulses](), list[npt.NDArray[np.int64]]()
@@ -181,9 +180,9 @@ class Seen:
         return Baselines.concatenate(self._baselines, Pulses.concatenate(self._whole)[stay])
 
     @property
-    def energies_kev(self) -> Energies:
+    def energies_kev(self) -> Values:
         """The known energies."""
-        kev: Energies = np.concatenate([np.empty(0), *self._kev])
+        kev: Values = np.concatenate([np.empty(0), *self._kev])
         return kev[np.isfinite(kev)]
 
     def explained(self, error: CpunetError, selection: EnergySelection) -> CpunetError:
@@ -221,7 +220,7 @@ class Seen:
             log.warning(f"{self._path}: {found}; cut the traces there, or resample them")
 
 
-def _where_energies_are(energies: Energies) -> str:
+def _where_energies_are(energies: Values) -> str:
     """Hint on the range of energies in a file of which none is selected."""
     low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
     there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"

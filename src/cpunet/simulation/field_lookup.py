@@ -84,7 +84,8 @@ def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
         for _ in range(_SPLINE_GHOSTS):
             values, known = with_ghost_nodes(values, known)
         values = _refined(values, parts, mirror=not stacked[:, 0, E_Z].any())
-        ditch = _nodes_of(np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_)))
+        cells = np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_))
+        ditch = ~_all_corners(~np.pad(cells, 1))  # nodes at the corners of these cells
         usable = np.kron(usable, np.ones((parts, parts), np.bool_))
     table = velocity_table(fields.temperature_K, settings.velocity_factors)
     return DriftMaps(
@@ -102,12 +103,6 @@ def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
 def _all_corners(nodes: BoolArray) -> BoolArray:
     """Cells (nr - 1, nz - 1) with all four corners in `nodes` (nr, nz)."""
     return np.asarray(nodes[:-1, :-1] & nodes[1:, :-1] & nodes[:-1, 1:] & nodes[1:, 1:])
-
-
-def _nodes_of(cells: BoolArray) -> BoolArray:
-    """Nodes (nr, nz) at the corners of `cells` (nr - 1, nz - 1)."""
-    padded = np.pad(cells, 1)
-    return np.asarray(padded[1:, 1:] | padded[:-1, 1:] | padded[1:, :-1] | padded[:-1, :-1])
 
 
 def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
