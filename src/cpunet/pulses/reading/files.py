@@ -255,7 +255,7 @@ def open_file(options: PulseFile) -> PulseSource:
 
             return ArraySource(options)
         case "pickle":
-            from cpunet.pulses.reading.pickles import PickleSource
+            from cpunet.pulses.reading.published import PickleSource
 
             return PickleSource(options)
         case "spe":
@@ -304,7 +304,7 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
 def _hdf5_tables(path: Path) -> list[str]:
     from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import waveform_tables
-    from cpunet.pulses.reading.majorana import detectors, is_majorana
+    from cpunet.pulses.reading.published import detectors, is_majorana
 
     with opened(path) as file:
         return detectors(file) if is_majorana(file) else waveform_tables(file)

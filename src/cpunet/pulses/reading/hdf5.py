@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import Hdf5Column, columns_of, lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.majorana import MajoranaSource, is_majorana
+from cpunet.pulses.reading.published import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 from cpunet.tables import shortened
 
