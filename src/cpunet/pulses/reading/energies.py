@@ -7,13 +7,17 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.tables import shortened
+
+if TYPE_CHECKING:
+    from cpunet.pulses.reading.files import PulseFile
+    from cpunet.pulses.reading.source import Layout
 
 log = logging.getLogger(__name__)
 
@@ -132,28 +136,23 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         return np.asarray(waveforms.max(axis=1) - baseline)
 
 
-def resolve_energies(
-    path: Path,
-    columns: Mapping[str, Column],
-    *,
-    energy: str | None,
-    kev_per_adc: float | None,
-    n_pulses: int | None,
-) -> Energies:
+def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
     """Choose where the energies of a file's pulses come from.
 
-    Without `energy`, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
-    is in energy units or `kev_per_adc` is given.  Otherwise the energy is the amplitude
-    times `kev_per_adc`, or unknown without it.  `energy` names another column, or
+    Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
+    is in energy units or ``kev_per_adc`` is given.  Otherwise the energy is the amplitude
+    times ``kev_per_adc``, or unknown without it.  ``energy`` names another column, or
     ``FILE:path/to/column``.
 
     Raises
     ------
     CpunetError
         If the column is missing, differs in length from the waveforms, was requested but is
-        neither in energy units nor calibrated, or is in energy units although `kev_per_adc`
+        neither in energy units nor calibrated, or is in energy units although ``kev_per_adc``
         is given.
     """
+    path, energy, kev_per_adc = options.path, options.energy, options.kev_per_adc
+    columns, n_pulses = layout.columns, layout.n_pulses
     if energy is None:
         usual = next((name for name in _USUAL if name in columns), None)
         if usual is not None:
@@ -262,25 +261,19 @@ class Sampling:
             )
 
 
-def resolve_sampling(
-    path: Path,
-    name: str,
-    column: Column | None,
-    *,
-    dt_ns: float | None,
-    n_pulses: int | None = None,
-    hint: str = "",
-) -> Sampling:
-    """Take the period from `column` (called `name`) or from the user's `dt_ns`.
+def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
+    """Take the period from the column of the file or from the user's ``dt_ns``.
 
     A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
-    and `dt_ns` is required; the error message contains `hint`.
+    and ``dt_ns`` is required; the error message contains the hint of the format.
 
     Raises
     ------
     CpunetError
         If neither gives the period, if they disagree, or if it is not a positive number.
     """
+    path, dt_ns = options.path, options.dt_ns
+    name, column, hint = layout.period_name, layout.period, layout.period_hint
     ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
     if column is None or ns_per_unit is None:
         if dt_ns is None:
@@ -290,7 +283,7 @@ def resolve_sampling(
             )
         return Sampling(path, dt_ns)
     if len(column) != 1:
-        require_length(path, name, column, n_pulses)
+        require_length(path, name, column, layout.n_pulses)
     found = float(column.read(0, 1)[0]) * ns_per_unit
     if not (np.isfinite(found) and found > 0):
         raise CpunetError(

@@ -129,22 +129,9 @@ class PulseSource(ABC):
         self.n_pulses = layout.n_pulses
         self.length = layout.length
         self.layout = layout
-        self._sampling = resolve_sampling(
-            options.path,
-            layout.period_name,
-            layout.period,
-            dt_ns=options.dt_ns,
-            n_pulses=layout.n_pulses,
-            hint=layout.period_hint,
-        )
+        self._sampling = resolve_sampling(options, layout)
         self.dt_ns = self._sampling.dt_ns
-        self.energies = resolve_energies(
-            options.path,
-            layout.columns,
-            energy=options.energy,
-            kev_per_adc=options.kev_per_adc,
-            n_pulses=layout.n_pulses,
-        )
+        self.energies = resolve_energies(options, layout)
         self._number_column = next((n for n in _EVENT_NUMBERS if n in layout.columns), None)
         if self._number_column is not None:
             column = layout.columns[self._number_column]
