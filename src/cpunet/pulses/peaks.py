@@ -346,7 +346,7 @@ def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, 
 
 
 BINS = 1000
-HIGHEST = 0.999  # quantile of the values; the axis ends a little above it
+SHOWN = 0.999  # quantile of the values; the axis ends a little above it
 
 
 @styled
@@ -360,7 +360,7 @@ def spectrum_figure(spectrum: Spectrum) -> Figure:
     figure = Figure(figsize=(9.0, 4.2))
     axes = figure.subplots()
     values = spectrum.values[np.isfinite(spectrum.values)]
-    top = 1.05 * float(np.quantile(values, HIGHEST)) if len(values) else 1.0
+    top = 1.05 * float(np.quantile(values, SHOWN)) if len(values) else 1.0
     bins = min(BINS, max(200, len(values) // 10))
     counts, edges = np.histogram(values, bins, (0.0, max(top, 1e-9)))
     axes.stairs(counts, edges, fill=True, color=DATA_FILL)
