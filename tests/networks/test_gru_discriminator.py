@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cpunet.networks.discriminators import GruDiscriminator, InterpolatedEmbedding
 from cpunet.recipes import load_recipe
-from cpunet.recipes.network_settings import GruConfig
+from cpunet.recipes.schema import GruConfig
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")
 

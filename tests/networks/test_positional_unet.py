@@ -9,7 +9,7 @@ import torch
 
 from cpunet.networks.positional_unet import PositionalUNet, positional_map
 from cpunet.recipes import load_recipe
-from cpunet.recipes.network_settings import PunetConfig
+from cpunet.recipes.schema import PunetConfig
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")
 

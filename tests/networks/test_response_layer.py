@@ -17,7 +17,7 @@ from cpunet.networks.response_layer import (
     fast_length,
 )
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import ResponseConfig
 
 DT_NS, FINE_PER_SAMPLE, SAMPLES = 16.0, 16, 800
 RINGING = {"frequency_MHz": 5.0, "fraction": 0.1, "damping_ns": 160.0}

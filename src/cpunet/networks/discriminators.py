@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.network_settings import GruConfig
+from cpunet.recipes.schema import GruConfig
 
 # Cycles of the initial sines over the whole table.  Slow ones are nearly monotonic, so
 # that the slope at one value points towards distant ones; with 1 to 16 cycles the

@@ -12,8 +12,7 @@ from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.network_settings import LearnedConfig, ResponseConfig
-from cpunet.recipes.schema import MatchingConfig
+from cpunet.recipes.schema import LearnedConfig, MatchingConfig, ResponseConfig
 
 NOISE_BINS = 4097  # in a spectrum as measured by `BaselineNoise`
 

@@ -32,7 +32,7 @@ from cpunet.networks.response_layer import (
     fast_length,
     padded_length,
 )
-from cpunet.recipes.network_settings import LearnedConfig, PunetConfig, ResponseConfig
+from cpunet.recipes.schema import LearnedConfig, PunetConfig, ResponseConfig
 
 # Knots of the step response in ns: at every sample from FIRST to DENSE, then SPARSE logarithmic
 # ones up to LAST, and an exponential beyond.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes.network_settings import PunetConfig
+from cpunet.recipes.schema import PunetConfig
 
 FIRST_KERNEL, SECOND_KERNEL, SLOPE = 11, 7, 0.01
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from cpunet.electronics.finishing import PADDING_AFTER as PADDING_AFTER
 from cpunet.electronics.finishing import PADDING_BEFORE as PADDING_BEFORE
 from cpunet.electronics.finishing import record_length as record_length
-from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import ResponseConfig
 
 # Fractions of the final charge at which collection begins and, as pulses are aligned, ends.
 BEGIN, END = 1e-6, 0.999

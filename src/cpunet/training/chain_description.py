@@ -23,7 +23,7 @@ from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import SideInfo
-from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import ResponseConfig
 from cpunet.tables import counted, percent, with_std
 from cpunet.training.closed_forms import (
     Chain,

@@ -34,8 +34,7 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.recipes.network_settings import LearnedConfig, PunetConfig
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.inverse import fit_inverse

@@ -25,8 +25,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse, StepResponse
 from cpunet.pulses.container import Pulses
-from cpunet.recipes.network_settings import LearnedConfig
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import LearnedConfig, Recipe
 from cpunet.training.drift_training import changed, fit_drift
 from cpunet.training.fitter import Fitted, Fitter
 from cpunet.training.levenberg_marquardt import FIRST_CLIPS, Listener

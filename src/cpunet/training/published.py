@@ -16,7 +16,7 @@ from cpunet.outputs import refuse_existing
 from cpunet.pulses.loading import SideInfo
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
-from cpunet.recipes.network_settings import PunetConfig
+from cpunet.recipes.schema import PunetConfig
 from cpunet.training.run import Run, differing, versions
 
 # Published layer names → names here.

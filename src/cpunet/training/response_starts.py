@@ -17,7 +17,7 @@ import numpy as np
 
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.network_settings import ResponseConfig
+from cpunet.recipes.schema import ResponseConfig
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
 from cpunet.training.response_problem import STRETCH, ResponseProblem
 

@@ -18,8 +18,7 @@ from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerat
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, prepare
-from cpunet.recipes.network_settings import PunetConfig
-from cpunet.recipes.schema import PreparationConfig
+from cpunet.recipes.schema import PreparationConfig, PunetConfig
 from cpunet.training.run import Run
 
 Energies = npt.NDArray[np.float64]
