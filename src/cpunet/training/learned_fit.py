@@ -7,33 +7,44 @@
 2. Optimal weights (`cpunet.training.optimal_weights`), again and again until nothing moves: all
    fits end in the same response, whatever their noise.
 3. If the fit is poor, a ringing is tried, or, if pulses begin differently than simulated, the
-   U-Net in front; see `cpunet.training.drift_training`.  As a line alone does not tell how
-   charge clouds depend on energy, single sites of the continuum are compared there, too.
+   U-Net in front, of which as much is kept as held-out pulses gain.  As a line alone does not
+   tell how charge clouds depend on energy, single sites of the continuum are compared, too.
 
 No discriminator network is trained.  What these moments do not see, the classifier of a
 validation tells.
+
+What the U-Net does (`cpunet.networks.learned_response.DriftUNet`) changes the simulated pulses
+so that the moments of both sides agree.  It is trained by Adam on batches of pulses, in rounds;
+after each, the step response follows by Gauss-Newton.  A penalty keeps it near the simulation,
+a stronger one alike for all pulses.  A fifth of the pulses of both sides is held out of all
+that.  Their moments decide whether the whole, half or nothing of what the network does is kept:
+nothing unless the gain is beyond two errors by bootstrap.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
-from cpunet.networks.learned_response import LearnedResponse, StepResponse
+from cpunet.networks.learned_response import DriftUNet, LearnedResponse, StepResponse
+from cpunet.networks.response_layer import current_spectrum
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import LearnedConfig, Recipe
-from cpunet.training.drift_training import changed, fit_drift
-from cpunet.training.fitter import Fitted, Fitter
+from cpunet.training.differentiable import DifferentiableSet
+from cpunet.training.fitter import Fitted, Fitter, HeldOutPulses, compared, split
 from cpunet.training.levenberg_marquardt import FIRST_CLIPS, Listener
-from cpunet.training.moments import Values
+from cpunet.training.moments import BLOCK, Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import Continuum, PulseSets
-from cpunet.training.response_fit import CHECKED, Fit, described
-from cpunet.training.response_problem import Band, ResponseProblem
+from cpunet.training.response_fit import CHECKED, DriftFit, Fit, described
+from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
 from cpunet.training.response_starts import RINGS, onset_is_off
 
 # Width of the bins of the current amplitude and pulses of each side in the first fit from afar,
@@ -130,3 +141,142 @@ def _determined(step: StepResponse, bands: Sequence[Band], fitter: Fitter) -> Va
         if np.linalg.norm(after - before) < STILL:
             break
     return covariance
+
+
+HELD_OUT = 0.2  # fraction of the pulses
+DRIFT_ROUNDS, STEPS, BATCH, RATE = 4, 40, 192, 1e-3
+BETAS, WEIGHT_DECAY, MEMORY, WARM_UP = (0.5, 0.99), 1e-2, 0.9, 10
+# Penalties of the mean of rates and blurs, and of their deviations from it between pulses, in
+# units of a typical logarithm of the rate, and of a variance of one sample.
+OF_MEAN, OF_PULSES, TYPICAL = 0.05, 1.0, 0.05
+SHARES = (0.0, 0.5, 1.0)
+SHOWN = 2048  # pulses that show what it does
+
+
+def changed(bands: Sequence[Band], drift: DriftUNet | None) -> list[Band]:
+    """Bands whose simulated pulses are those that enter the readout."""
+    if drift is None:
+        return list(bands)
+    out = []
+    for band in bands:
+        sim = band.sim
+        with torch.no_grad():
+            parts = [
+                drift.eval()(torch.from_numpy(np.array(sim.sim[first : first + BLOCK])))
+                for first in range(0, len(sim), BLOCK)
+            ]
+        out.append(replace(band, sim=replace(sim, sim=torch.cat(parts).numpy())))
+    return out
+
+
+def fit_drift(
+    response: LearnedResponse, bands: Sequence[Band], wide: float, fitter: Fitter, seed: int
+) -> DriftFit:
+    """Train the U-Net in front of a fitted readout, which gets as much of it as is kept.
+
+    Parameters
+    ----------
+    response
+        Readout fitted without it.
+    bands
+        Pulses to train on.
+    wide
+        Width of bins of the current amplitude by which the step response follows at first.
+    fitter
+        Fitter of the step response.
+    seed
+        Seed of the network, its batches and the held-out pulses.
+    """
+    rng = np.random.default_rng(seed)
+    known, held = split(bands, HELD_OUT, rng)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        drift = DriftUNet(response.config.width, float(response.dt_ns))
+    step, without = response.step, response.step.coordinates.detach().clone()
+    trained = [_Trained(band, response) for band in known]
+    optimiser = torch.optim.AdamW(drift.parameters(), RATE, BETAS, weight_decay=WEIGHT_DECAY)
+    for number in range(DRIFT_ROUNDS):
+        _train(drift, trained, optimiser, number * STEPS, rng)
+        for some in ([band.with_wider_bins(wide) for band in known], known):
+            fitter.follow(ResponseProblem(step, changed(some, drift), draws=1))
+    whole = step.coordinates.detach().clone()
+    results = []
+    for share in SHARES:
+        drift.share.fill_(share)
+        step.coordinates.data.copy_(torch.lerp(without, whole, share))
+        if 0 < share < 1:
+            fitter.follow(ResponseProblem(step, changed(known, drift), draws=1))
+        results.append([HeldOutPulses(changed(held, drift), known, response)])
+    gain = compared(results, seed)
+    chosen = gain.best
+    drift.share.fill_(1.0)
+    shown = torch.from_numpy(np.array(bands[0].sim.sim[:SHOWN]))
+    before_ns, longer, blur_ns2 = drift.effect(shown)
+    quarters = [float(longer[rows].mean()) for rows in before_ns.argsort().tensor_split(4)]
+    variance = float(blur_ns2.mean())
+    blur_ns = math.copysign(math.sqrt(abs(variance)), variance)
+    drift.share.fill_(SHARES[chosen])
+    step.coordinates.data.copy_(torch.lerp(without, whole, SHARES[chosen]))
+    if chosen:
+        response.drift = drift
+        response.config = response.config.model_copy(update={"drift": True})
+    return DriftFit(SHARES[chosen], gain.mismatch, gain.error, quarters, blur_ns)
+
+
+class _Trained:
+    """A band that the U-Net is trained on."""
+
+    def __init__(self, band: Band, response: LearnedResponse) -> None:
+        self.band, self.response = band, response
+        comparison = BandComparison(band)
+        self.whiten = torch.from_numpy(comparison.whiten / comparison.sigma)
+        self.wanted = torch.from_numpy(comparison.wanted)
+        self.mean: Tensor | None = None  # over the last batches
+
+    def chi_square(self, drift: DriftUNet, rng: np.random.Generator) -> tuple[Tensor, ...]:
+        """Chi-square, logarithms of the rate, and variances of the blur."""
+        sim = self.band.sim
+        rows = np.sort(rng.permutation(len(sim))[:BATCH])
+        pulses, log_rate, blur = drift.changed(torch.from_numpy(np.array(sim.sim[rows])))
+        batch = DifferentiableSet(sim.of(rows))
+        with torch.no_grad():
+            transfer = self.response.step.transfer(batch.padded).to(torch.complex64)
+        spectra = current_spectrum(pulses, batch.padded)
+        clean = batch.scaled(batch.records(spectra, transfer))
+        draw = int(rng.integers(len(sim.noise.factor)))
+        noisy = clean + batch.noise(draw, 0, len(rows))
+        values = batch.readings.functions(*batch.readings(noisy))
+        mean = (batch.weights @ values / batch.weights.sum()).double()
+        now = mean.detach()
+        self.mean = now if self.mean is None else MEMORY * self.mean + (1 - MEMORY) * now
+        apart = self.whiten @ (self.mean + mean - now - self.wanted)
+        return apart.square().sum(), log_rate, blur
+
+
+def _train(
+    drift: DriftUNet,
+    bands: Sequence[_Trained],
+    optimiser: torch.optim.Optimizer,
+    first: int,
+    rng: np.random.Generator,
+) -> None:
+    """Steps of Adam, with a rate that falls over all rounds."""
+    drift.train()
+    moments = sum(len(band.wanted) for band in bands)
+    for band in bands:
+        band.mean = None  # the step response has moved
+    for number in range(STEPS):
+        falling = 0.5 * (1 + math.cos(math.pi * (first + number) / (DRIFT_ROUNDS * STEPS)))
+        for group in optimiser.param_groups:
+            group["lr"] = RATE * falling * min(1.0, (number + 1) / WARM_UP)
+        loss = torch.zeros((), dtype=torch.float64)
+        for band in bands:
+            chi_square, log_rate, blur = band.chi_square(drift, rng)
+            loss = loss + chi_square / moments
+            for values, unit in ((log_rate, TYPICAL), (blur, 1.0)):
+                mean = values.mean(dim=0)
+                loss = loss + OF_MEAN * (mean / unit).square().mean()
+                loss = loss + OF_PULSES * ((values - mean) / unit).square().mean()
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()

@@ -20,7 +20,6 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import amplitude_shift
-from cpunet.training.drift_training import DriftFit
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
 from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.moments import Values
@@ -47,6 +46,44 @@ CHECKED = 4096
 HIDDEN = 1.2
 # Rounds of optimal weights; those of the second are evaluated at the result of the first.
 ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class DriftFit:
+    """What the U-Net gains on held-out pulses.
+
+    Parameters
+    ----------
+    share
+        How much of it is kept.
+    mismatch
+        Chi-square per moment of the held-out pulses for shares of 0, 1/2 and 1.
+    error
+        Errors of the differences from the first of these.
+    longer
+        Mean relative change of the time from 2 to 98 % of the charge by all of the network, for
+        the quarters of the pulses from the shortest to the longest.
+    blur_ns
+        Root of the mean variance of the blur in ns, negative for pulses that are sharpened.
+    """
+
+    share: float
+    mismatch: list[float]
+    error: list[float]
+    longer: list[float]
+    blur_ns: float
+
+    def __str__(self) -> str:
+        found = ", ".join(f"{value:.2f}" for value in self.mismatch)
+        errors = ", ".join(f"{error:.2f}" for error in self.error[1:])
+        longer = ", ".join(f"{100 * value:+.1f}" for value in self.longer)
+        kept = f"{100 * self.share:.0f} % of it is kept" if self.share else "it is left out"
+        return (
+            f"U-Net before the readout: {kept}; chi-square per moment of held-out pulses is "
+            f"{found} with none, half and all of it (gains ± {errors}); all of it makes the "
+            f"charge of short to long pulses arrive over times longer by {longer} % and blurs "
+            f"by {self.blur_ns:+.0f} ns"
+        )
 
 
 @dataclass(frozen=True)
