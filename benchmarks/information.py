@@ -31,8 +31,8 @@ from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
+from cpunet.training.fitter import levenberg_marquardt
 from cpunet.training.job import known_response
-from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem

@@ -37,9 +37,9 @@ from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
+from cpunet.training.fitter import Listener
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
-from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name

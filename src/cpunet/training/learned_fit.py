@@ -38,8 +38,15 @@ from cpunet.networks.response_layer import current_spectrum
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import LearnedConfig, Recipe
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.fitter import Fitted, Fitter, HeldOutPulses, compared, split
-from cpunet.training.levenberg_marquardt import FIRST_CLIPS, Listener
+from cpunet.training.fitter import (
+    FIRST_CLIPS,
+    Fitted,
+    Fitter,
+    HeldOutPulses,
+    Listener,
+    compared,
+    split,
+)
 from cpunet.training.moments import BLOCK, Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import Continuum, PulseSets

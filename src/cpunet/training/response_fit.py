@@ -20,8 +20,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import amplitude_shift
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
-from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, Listener, held_out_gain
 from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets
