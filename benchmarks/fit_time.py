@@ -23,6 +23,8 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
+from cpunet.training.fitter import Fitter
+from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
 
 
@@ -43,7 +45,8 @@ def one(stand: Path, n: int) -> dict[str, float]:
     sides = first(sim, n), first(data.prepared.pulses, n)
     loaded = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     wall, cpu = time.perf_counter(), time.process_time()
-    _, fit = fit_response(*sides, noise, recipe, seed=0)
+    sets = PulseSets(*sides, noise, recipe, np.random.default_rng(0))
+    _, fit = fit_response(sets, Fitter(recipe.matching.training))
     return {
         "pulses": n,
         "wall_s": time.perf_counter() - wall,

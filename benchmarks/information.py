@@ -31,10 +31,11 @@ from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
-from cpunet.training.fitter import levenberg_marquardt
+from cpunet.training.fitter import Fitter, levenberg_marquardt
 from cpunet.training.job import known_response
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
+from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 from cpunet.training.translated import Noise, SimulatedSide
 from cpunet.translation.translator import REN
@@ -192,7 +193,8 @@ def main() -> None:
     data, (noise, _) = measured.prepared.pulses, measured_noise(measured, RECIPE.preparation)
     if arguments.chain is not None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)
-    start, _ = response_fit.fit_response(sim[:2000], data[:2000], noise, RECIPE, seed=0)
+    sets = PulseSets(sim[:2000], data[:2000], noise, RECIPE, np.random.default_rng(0))
+    start, _ = response_fit.fit_response(sets, Fitter(RECIPE.matching.training))
     state = {name: value.clone() for name, value in start.state_dict().items()}
     shifts: dict[str, list[float]] = {"moments": [], "weighted": []}
     n = arguments.pulses

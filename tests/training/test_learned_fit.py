@@ -8,7 +8,9 @@ import torch
 
 from cpunet.networks.learned_response import StepResponse
 from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
 from cpunet.training.differentiable import DifferentiableReadings, DifferentiableSet
+from cpunet.training.fitter import Fitter
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.pulse_sets import PulseSets
@@ -86,9 +88,14 @@ def test_derivatives_are_those_of_wide_differences(band, number):
     assert np.linalg.norm(slopes[:, number] - wanted) < 0.1 * np.linalg.norm(wanted)
 
 
+def learned(problem: Unpaired, recipe: Recipe = RECIPE):
+    sets = PulseSets(*problem, recipe, np.random.default_rng(0))
+    return fit_learned(sets, Fitter(recipe.matching.training))
+
+
 @pytest.fixture(scope="module")
 def fitted(problem: Unpaired):
-    return fit_learned(problem.sim, problem.data, problem.noise, RECIPE, seed=0)
+    return learned(problem)
 
 
 def test_pulses_are_those_of_the_true_chain(problem, fitted):
@@ -106,12 +113,12 @@ def test_the_unet_makes_up_for_a_drift_simulated_too_short():
     """Charge then arrives over longer times, and held-out pulses are closer to the data."""
     true = measured_with(CHAIN)
     short = simulated(faster(charge(N, seed=1), 1.25))
-    response, fit = fit_learned(short, true.data, true.noise, RECIPE, seed=0)
+    response, fit = learned(true._replace(sim=short))
     tried = fit.drift
     assert tried is not None
     assert tried.mismatch[-1] < tried.mismatch[0]
     assert np.mean(tried.longer) > 0.02
     assert (response.drift is not None) == (tried.share > 0) == response.config.drift
     alone = load_recipe("cpunet", ["training.noise_sets=2", "training.drift_terms=0"])
-    _, fit = fit_learned(short, true.data, true.noise, alone, seed=0)
+    _, fit = learned(true._replace(sim=short), alone)
     assert fit.drift is None

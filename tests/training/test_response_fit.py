@@ -18,8 +18,9 @@ from cpunet.networks.response_layer import (
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, Listener
 from cpunet.training.moments import Moments, Readings
+from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
 from cpunet.training.response_starts import drift_if_needed, with_settings
@@ -44,16 +45,17 @@ RECIPE = load_recipe("fast", FEW)
 class Problem(Unpaired):
     """Unpaired sets that a chain of few parameters is fitted to."""
 
-    def fit(self, seed: int, *overrides: str, sim: Pulses | None = None, **options):
-        sim = self.sim if sim is None else sim
-        return fit_response(
-            sim,
-            self.data,
-            self.noise,
-            load_recipe("fast", [*FEW, *overrides]),
-            seed=seed,
-            **options,
-        )
+    def fit(
+        self,
+        seed: int,
+        *overrides: str,
+        sim: Pulses | None = None,
+        listener: Listener | None = None,
+    ):
+        recipe, rng = load_recipe("fast", [*FEW, *overrides]), np.random.default_rng(seed)
+        sides = self.sim if sim is None else sim, self.data
+        fitter = Fitter(recipe.matching.training, listener=listener, seed=seed)
+        return fit_response(PulseSets(*sides, self.noise, recipe, rng), fitter)
 
 
 @pytest.fixture(scope="module")

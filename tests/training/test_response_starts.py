@@ -58,7 +58,6 @@ def test_nothing_else_is_tried_for_another_detector(
     for name in (PHYSICS, "_determined"):
         replace(name, name)
     asked = {
-        "PulseSets": SimpleNamespace(bands=lambda _most=None: []),
         "ElectronicsResponse": None,
         "ResponseProblem": None,
         "best_start": found,
@@ -66,8 +65,10 @@ def test_nothing_else_is_tried_for_another_detector(
     }
     for name, answer in asked.items():
         monkeypatch.setattr(response_fit, name, lambda *_, answer=answer, **__: answer)
-    noise = SimpleNamespace(dt_ns=16.0)
-    _, fit = response_fit.fit_response(None, None, noise, load_recipe("fast"), seed=0)
+    recipe, noise = load_recipe("fast"), SimpleNamespace(dt_ns=16.0)
+    sets = SimpleNamespace(bands=lambda _most=None: [], recipe=recipe, noise=noise)
+    fitter = Fitter(recipe.matching.training)
+    _, fit = response_fit.fit_response(cast(PulseSets, sets), fitter)
     assert called == expected
     assert fit == expected[-1]
 

@@ -37,13 +37,13 @@ from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, diagnosis, stretched
-from cpunet.training.fitter import Listener
+from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
 from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
-from cpunet.training.pulse_sets import SINGLE, Continuum, continuum
+from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import DRIFT, with_settings
 from cpunet.training.run import (
@@ -325,19 +325,13 @@ def match(
         if known.config.drift_terms > allowed:
             known = with_settings(known, drift_terms=allowed)
         recipe = recipe.model_copy(update={"generator": known.config})
-    response: Any  # an `ElectronicsResponse` or a `LearnedResponse`
-    given: dict[str, Any] = {
-        "seed": seed,
-        "known": known,
-        "tails": drawn,
-        "continuum": continuum,
-        "listener": listen,
-    }
     simulated, measured = sim.prepared.pulses, data.prepared.pulses
-    if isinstance(recipe.generator, LearnedConfig):
-        response, fit = fit_learned(simulated, measured, noise, recipe, **given)
-    else:
-        response, fit = fit_response(simulated, measured, noise, recipe, **given)
+    rng = np.random.default_rng(seed)
+    sets = PulseSets(simulated, measured, noise, recipe, rng, drawn, continuum)
+    decay = None if drawn is None else drawn.known_decay
+    fitter = Fitter(recipe.matching.training, decay, listen, seed)
+    fit_of: Any = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
+    response, fit = fit_of(sets, fitter, known)
     parameters = response.describe()
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     told = asdict(fit) | {

@@ -31,25 +31,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.learned_response import DriftUNet, LearnedResponse, StepResponse
 from cpunet.networks.response_layer import current_spectrum
-from cpunet.pulses.container import Pulses
-from cpunet.recipes.schema import LearnedConfig, Recipe
+from cpunet.recipes.schema import LearnedConfig
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.fitter import (
     FIRST_CLIPS,
     Fitted,
     Fitter,
     HeldOutPulses,
-    Listener,
     compared,
     split,
 )
 from cpunet.training.moments import BLOCK, Values
 from cpunet.training.optimal_weights import refine
-from cpunet.training.pulse_sets import Continuum, PulseSets
+from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import CHECKED, DriftFit, Fit, described
 from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
 from cpunet.training.response_starts import RINGS, onset_is_off
@@ -63,45 +59,35 @@ ROUNDS, STILL = 8, 0.15
 
 
 def fit_learned(
-    sim: Pulses,
-    data: Pulses,
-    noise: BaselineNoise,
-    recipe: Recipe,
-    *,
-    seed: int,
-    known: LearnedResponse | None = None,
-    tails: DrawnTails | None = None,
-    continuum: Continuum | None = None,
-    listener: Listener | None = None,
+    sets: PulseSets, fitter: Fitter, known: LearnedResponse | None = None
 ) -> tuple[LearnedResponse, Fit]:
     """Fit a learned readout; parameters as of `cpunet.training.response_fit.fit_response`.
 
     Of a known readout only the step response is a start: the U-Net is that of other pulses.
     """
-    config, training = recipe.matching
+    config, training = sets.recipe.matching
     assert isinstance(config, LearnedConfig)
     config = config.model_copy(update={"drift": False})  # a U-Net is trained first
-    sets = PulseSets(sim, data, noise, recipe, np.random.default_rng(seed), tails, continuum)
-    fitter = Fitter(training, listener=listener)
+    dt_ns = sets.noise.dt_ns
     far = [band.with_wider_bins(FIRST_WIDTH) for band in sets.bands(FIRST_PULSES)]
     near = [band.with_wider_bins(WIDTH) for band in sets.bands(training.search_pulses)]
     found = None
     if known is not None:
         plain = known.config.model_copy(update={"drift": False})
-        response = LearnedResponse(plain, noise.dt_ns)
+        response = LearnedResponse(plain, dt_ns)
         response.step.load_state_dict(known.step.state_dict())
         found = fitter.fit(ResponseProblem(response.step, near, draws=1), coarse=False)
     if found is None or found.poor:
-        response, found = _from_afar(config, noise.dt_ns, far, near, fitter)
+        response, found = _from_afar(config, dt_ns, far, near, fitter)
     tried = None
     single: list[Band] = []
     if found.poor and onset_is_off(found.problem):
         if training.drift_terms:
             single = sets.single_sites()
-            tried = fit_drift(response, [*sets.bands(CHECKED), *single], WIDTH, fitter, seed)
+            tried = fit_drift(response, [*sets.bands(CHECKED), *single], fitter)
     elif found.poor and training.ringing_mhz and not response.config.ringing:
         rings = response.config.model_copy(update={"ringing": True})
-        other, better = _from_afar(rings, noise.dt_ns, far, near, fitter)
+        other, better = _from_afar(rings, dt_ns, far, near, fitter)
         if better.cost < RINGS * found.cost:
             response = other
     everything = sets.bands()
@@ -176,9 +162,7 @@ def changed(bands: Sequence[Band], drift: DriftUNet | None) -> list[Band]:
     return out
 
 
-def fit_drift(
-    response: LearnedResponse, bands: Sequence[Band], wide: float, fitter: Fitter, seed: int
-) -> DriftFit:
+def fit_drift(response: LearnedResponse, bands: Sequence[Band], fitter: Fitter) -> DriftFit:
     """Train the U-Net in front of a fitted readout, which gets as much of it as is kept.
 
     Parameters
@@ -187,24 +171,20 @@ def fit_drift(
         Readout fitted without it.
     bands
         Pulses to train on.
-    wide
-        Width of bins of the current amplitude by which the step response follows at first.
     fitter
-        Fitter of the step response.
-    seed
-        Seed of the network, its batches and the held-out pulses.
+        Fitter of the step response; its seed is that of the network, too.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(fitter.seed)
     known, held = split(bands, HELD_OUT, rng)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(fitter.seed)
         drift = DriftUNet(response.config.width, float(response.dt_ns))
     step, without = response.step, response.step.coordinates.detach().clone()
     trained = [_Trained(band, response) for band in known]
     optimiser = torch.optim.AdamW(drift.parameters(), RATE, BETAS, weight_decay=WEIGHT_DECAY)
     for number in range(DRIFT_ROUNDS):
         _train(drift, trained, optimiser, number * STEPS, rng)
-        for some in ([band.with_wider_bins(wide) for band in known], known):
+        for some in ([band.with_wider_bins(WIDTH) for band in known], known):
             fitter.follow(ResponseProblem(step, changed(some, drift), draws=1))
     whole = step.coordinates.detach().clone()
     results = []
@@ -214,7 +194,7 @@ def fit_drift(
         if 0 < share < 1:
             fitter.follow(ResponseProblem(step, changed(known, drift), draws=1))
         results.append([HeldOutPulses(changed(held, drift), known, response)])
-    gain = compared(results, seed)
+    gain = compared(results, fitter.seed)
     chosen = gain.best
     drift.share.fill_(1.0)
     shown = torch.from_numpy(np.array(bands[0].sim.sim[:SHOWN]))

@@ -14,16 +14,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.pulses.container import Pulses
-from cpunet.recipes.schema import Recipe
 from cpunet.training.diagnosis import amplitude_shift
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, Listener, held_out_gain
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
 from cpunet.training.moments import Values
 from cpunet.training.optimal_weights import refine
-from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets
+from cpunet.training.pulse_sets import SINGLE, PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import (
     HOPELESS_FIT,
@@ -167,53 +163,29 @@ class Fit:
 
 
 def fit_response(
-    sim: Pulses,
-    data: Pulses,
-    noise: BaselineNoise,
-    recipe: Recipe,
-    *,
-    seed: int,
-    known: ElectronicsResponse | None = None,
-    tails: DrawnTails | None = None,
-    continuum: Continuum | None = None,
-    listener: Listener | None = None,
+    sets: PulseSets, fitter: Fitter, known: ElectronicsResponse | None = None
 ) -> tuple[ElectronicsResponse, Fit]:
     """Fit a response to unpaired prepared pulses.
 
     Parameters
     ----------
-    sim, data
-        Prepared pulses with their energies: noise scales as 1/energy, and pulses are compared
-        in bands of energy, see `cpunet.training.pulse_sets`.
-    noise
-        Noise of the data's baselines.
-    recipe
-        Recipe that matches a response.
-    seed
-        Seed of the noise, and of the pulses used to search for the valley.
+    sets
+        Pulses of both sides.  Single sites of the continuum are compared, too, if the drift was
+        stretched.
+    fitter
+        Settings of the fits; counts their steps.
     known
         Response of a similar readout, with the recipe's configuration, to start from.  The
         recipe's own starts are tried only if that fails.
-    tails
-        Pile-up tails in the data, which are added to the translations.
-    continuum
-        Reads the pulses of both sides away from all lines, whose single sites are compared,
-        too, if the drift was stretched.
-    listener
-        Called with step and chi-square.
 
     Raises
     ------
     CpunetError
         If there are too few pulses, or the fit does not find a finite chi-square.
     """
-    config, training = recipe.chain, recipe.matching.training
-    rng = np.random.default_rng(seed)
-    sets = PulseSets(sim, data, noise, recipe, rng, tails, continuum)
-    some = sets.bands(training.search_pulses)
-    first = ResponseProblem(ElectronicsResponse(config, noise.dt_ns), some, draws=1)
-    decay = None if tails is None else tails.known_decay
-    fitter = Fitter(training, decay, listener, seed)
+    config = sets.recipe.chain
+    some = sets.bands(fitter.training.search_pulses)
+    first = ResponseProblem(ElectronicsResponse(config, sets.noise.dt_ns), some, draws=1)
     near = None if known is None else from_known(first, known, fitter)
     found = near or best_start(first, config, fitter)
     everything = sets.bands()
