@@ -21,12 +21,12 @@ from cpunet.errors import CpunetError
 from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
-from cpunet.training.chain_description import propagated
+from cpunet.training.chain_description import beyond, diagnosis, parts_off
 from cpunet.training.closed_forms import (
     learned_chain,
+    propagated,
     true_chain_of,
 )
-from cpunet.training.diagnosis import beyond, diagnosis, parts_off
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run

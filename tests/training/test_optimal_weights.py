@@ -14,7 +14,6 @@ from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
-from cpunet.training.diagnosis import amplitude_shift
 from cpunet.training.moments import Moments, Values
 from cpunet.training.optimal_weights import (
     Parts,
@@ -23,6 +22,7 @@ from cpunet.training.optimal_weights import (
     jackknife_bias,
     refine,
 )
+from cpunet.training.response_fit import amplitude_shift
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem, SmoothParameters
 from cpunet.training.translated import Noise, SimulatedSide
 from synthetic import drifting, two_sites

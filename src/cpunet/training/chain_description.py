@@ -1,16 +1,14 @@
 """A trained run in physical quantities with their errors, and in words.
 
-Parameters of a fit can be degenerate: two nearly equal poles are individually unconstrained, as
-is a long decay beside a fast one, while their rise time and common decay are well known.
-Errors of derived numbers are therefore propagated with the full covariance of the parameters,
-along each of its axes.
+Words tell the parts of a pulse that a poor fit does not describe, and the likely causes.  A
+readout is the same for all pulses and does not shape the onset.  The parts that are off
+therefore distinguish physics, slow components, pile-up tails, and energies.
 """
 
 from __future__ import annotations
 
-import copy
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,95 +27,15 @@ from cpunet.training.closed_forms import (
     Chain,
     Numbers,
     chain_numbers,
+    fitted_errors,
     learned_chain,
     noise_numbers,
+    propagated,
     reaches_ns,
     slow_numbers,
     with_noise,
 )
-from cpunet.training.diagnosis import beyond, stretched
-from cpunet.training.response_problem import STRETCH, Parameters
 from cpunet.training.run import FitInfo, Run
-
-
-def propagated(
-    response: ElectronicsResponse,
-    covariance: Sequence[Sequence[float]],
-    numbers: Callable[[ElectronicsResponse], Numbers],
-) -> Numbers:
-    r"""Standard deviations of derived numbers of a response.
-
-    .. math:: \sigma_f^2 = \sum_k \left[ \tfrac{1}{2} \left(
-        f(p + \sigma_k e_k) - f(p - \sigma_k e_k) \right) \right]^2
-
-    with the axes :math:`\sigma_k e_k` of the error ellipsoid of the parameters :math:`p`.
-
-    Parameters
-    ----------
-    response
-        Fitted response.
-    covariance
-        Covariance of its parameters, in the order of its vector.
-    numbers
-        Function that returns the derived numbers of a response by name.
-
-    Returns
-    -------
-    dict
-        Standard deviation by name, of numbers that are defined at both ends of every axis;
-        empty if the covariance does not match the parameters.
-    """
-    moved = copy.deepcopy(response)
-    parameters = Parameters(moved)
-    centre = parameters.vector()
-    matrix = np.asarray(covariance, float)
-    if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
-        return {}
-    variances, axes = np.linalg.eigh(matrix)
-    ends = []
-    for axis in (np.sqrt(np.maximum(variances, 0)) * axes).T:
-        for end in (centre + axis, centre - axis):
-            parameters.set(end)
-            ends.append(numbers(moved))
-    errors: Numbers = {}
-    for name in ends[0]:
-        if all(name in end for end in ends):
-            values = np.array([end[name] for end in ends])
-            half = 0.5 * (values[::2] - values[1::2])
-            errors[name] = float(np.sqrt(sum(half**2)))
-    return errors
-
-
-def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
-    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
-    poles, decay = response.log_poles_ns.detach().exp(), response.log_decay_us.exp().item()
-    order = poles.argsort(descending=True).tolist()
-    sources = {
-        f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
-        for i, k in enumerate(order)
-    }
-    sources["decay_us"] = ("log_decay_us.1", decay)
-    if len(response.ringing):
-        for i, value in enumerate(response.log_ringing.detach().exp().tolist()):
-            name = ("ringing_mhz", "ringing_damping_ns")[i]
-            sources[name] = (f"log_ringing.{i + 1}", value)
-    for i, tau in enumerate(response.slow_ns.tolist()):
-        sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
-    if response.drift is not None:
-        for i, name in enumerate(response.drift.describe()):
-            sources[name] = (f"{STRETCH}.{i + 1}", 1.0)
-    free = response.config.free_decays
-    for i, tau in enumerate(response.fast_times_us.tolist()):
-        name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"
-        sources[name] = (f"decay_weights.{i + 1}", 1.0)
-        if free:
-            sources[f"fast_decay_{i + 1}_us"] = (f"log_fast_decays_us.{i + 1}", tau)
-    return {
-        name: scale * float(errors[source])
-        for name, (source, scale) in sources.items()
-        if source in errors
-    }
-
 
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
@@ -214,9 +132,9 @@ def _noise_error(run: Run, chain: Chain) -> Numbers:
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
 
 
-PARTS = 8  # maximum number of deviating parts of a fit
+WORST = 8  # maximum number of deviating moments of a fit
 UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
-_OFF = 3.0  # standard deviations
+_FAR = 3.0  # standard deviations
 
 
 def summary(run: Run) -> list[tuple[str, str]]:
@@ -268,8 +186,8 @@ def _side(side: SideInfo) -> str:
 
 def _deviations(pulls: Mapping[str, float]) -> str:
     """Parts of the pulses that deviate, worst first."""
-    worst = sorted(pulls, key=lambda name: -abs(pulls[name]))[:PARTS]
-    return ", ".join(f"{n} {pulls[n]:+.1f} σ" for n in worst if abs(pulls[n]) > _OFF)
+    worst = sorted(pulls, key=lambda name: -abs(pulls[name]))[:WORST]
+    return ", ".join(f"{n} {pulls[n]:+.1f} σ" for n in worst if abs(pulls[n]) > _FAR)
 
 
 def _parameters(values: Mapping[str, float]) -> str:
@@ -284,3 +202,166 @@ def _parameters(values: Mapping[str, float]) -> str:
         else:
             words.append(f"{called} {value:.4g}{shown}")
     return ", ".join(words)
+
+
+OFF = 4.0  # minimum root mean square pull of the moments of a part
+AS_MUCH = 0.3  # other parts are reported from this fraction of the worst one
+# An onset that is off by more than this is not just the result of fitting what follows it.
+PHYSICS = 8.0
+# Limits of the fraction of charge that arrives late; an overshoot makes it a few percent
+# negative.
+MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
+ONSET, TOP, TAIL = -8, 15, 84  # limits of the parts in samples from the half maximum
+_SAMPLES = re.compile(r"samples (-?\d+) to (-?\d+)")
+
+
+# Name of each part, likely cause of a deviation, and a test of it.
+PARTS = {
+    "onset": (
+        "the onset",
+        "no readout shapes it: the physics simulated are not those of the detector",
+        "cpunet calibrate finds temperature and impurities",
+    ),
+    "edge": (
+        "the edge",
+        "the bandwidth is of another kind, or the physics differ",
+        "cpunet calibrate; cpunet response tells what was fitted",
+    ),
+    "top": (
+        "the top",
+        "charge that arrives late with times that the recipe does not have, or a ringing",
+        "--set generator.slow_ns=[…]",
+    ),
+    "tail": (
+        "the tail",
+        "in-trace pile-up, pile-up tails too few to be sure of, or a decay that the "
+        "recipe does not have",
+        "cpunet info tells of pile-up tails; --set generator.fast_decays_us=[…]",
+    ),
+    "amplitude": (
+        "the current amplitude",
+        "another detector, or other energies than simulated",
+        "cpunet check compares both sides",
+    ),
+}
+
+
+def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
+    """Root mean square pulls of the parts that are off: a clearly wrong onset, then the worst.
+
+    Parameters
+    ----------
+    pulls
+        Pulls of the moments by name, from a fit.
+
+    Examples
+    --------
+    >>> parts_off({"samples -40 to -25": 9.0, "samples 140 to 180": -1.0, "tail slope": 30.0})
+    {'onset': 9.0, 'tail': 21.2}
+    """
+    squares: dict[str, list[float]] = {}
+    for name, pull in pulls.items():
+        part = _part(name.split(": ")[-1])
+        if part:
+            squares.setdefault(part, []).append(pull**2)
+    sizes = {part: round(float(np.sqrt(np.mean(s))), 1) for part, s in squares.items()}
+    worst = max(sizes.values(), default=0.0)
+    off = {part: size for part, size in sizes.items() if size > OFF and size > AS_MUCH * worst}
+
+    def order(part: str) -> tuple[bool, float]:
+        return part == "onset" and off[part] > PHYSICS, off[part]
+
+    return {part: off[part] for part in sorted(off, key=order, reverse=True)}
+
+
+def diagnosis(pulls: Mapping[str, float]) -> list[str]:
+    """One line for each part that is off: by how much, why, and what to try.
+
+    Parameters
+    ----------
+    pulls
+        Pulls of the moments by name, from a fit.
+    """
+    lines = []
+    for part, size in parts_off(pulls).items():
+        name, cause, remedy = PARTS[part]
+        lines.append(f"{name} is off by {size:.0f} σ: {cause}; try: {remedy}")
+    return lines
+
+
+def beyond(parameters: Mapping[str, float]) -> list[str]:
+    """Properties of a fitted chain that no readout has, in words.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+
+    Examples
+    --------
+    >>> beyond({"pole_1_ns": 40.0, "slow_100_ns": -0.5, "slow_400_ns": -0.2})
+    ['70 % of the charge would arrive too early, which no readout does; see the fit']
+    """
+    slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
+    if slow < MAX_NEGATIVE:
+        return [
+            f"{-100 * slow:.0f} % of the charge would arrive too early, which no readout does; "
+            "see the fit"
+        ]
+    if slow > MAX_SLOW:
+        return [
+            f"{100 * slow:.0f} % of the charge would arrive late, as of slower pulses than "
+            "simulated; see the fit"
+        ]
+    return []
+
+
+def stretched(parameters: Mapping[str, float], gains: Mapping[str, str] = {}) -> list[str]:
+    """Say in words that the simulated drift was stretched, if it was, and what that may mean.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+    gains
+        What held-out pulses say of each part that was tried.
+
+    Examples
+    --------
+    >>> print(stretched({"drift_stretch": 0.052})[0])
+    charges drift for 5.2 % longer than simulated, as in a warmer detector, at a lower bias or \
+with other impurities: cpunet calibrate tells which
+    """
+    stretch = parameters.get("drift_stretch")
+    if stretch is None:
+        return []
+    change = parameters.get("drift_stretch_per_us", 0.0)
+    size = f"charges drift for {_longer(stretch + change)} than simulated"
+    if change:
+        size += f" in the last microsecond, {_longer(stretch)} near its end"
+    if (gain := gains.get("a stretch of the drift", "").partition("; ")[2]) != "":
+        size += f" ({gain})"
+    cause = (
+        "warmer detector, at a lower bias" if stretch > 0 else "colder one, at a higher bias"
+    )
+    return [f"{size}, as in a {cause} or with other impurities: cpunet calibrate tells which"]
+
+
+def _longer(stretch: float) -> str:
+    return f"{100 * abs(stretch):.1f} % {'longer' if stretch > 0 else 'shorter'}"
+
+
+def _part(name: str) -> str:
+    if name.startswith("current amplitude"):
+        return "amplitude"
+    if name == "tail slope":
+        return "tail"
+    match = _SAMPLES.fullmatch(name)
+    if match is None:
+        return ""
+    first, stop = map(int, match.groups())
+    if stop <= ONSET:
+        return "onset"
+    if first < TOP:
+        return "edge"
+    return "top" if first < TAIL else "tail"
