@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cpunet.networks.discriminators import GruDiscriminator, InterpolatedEmbedding
+from cpunet.networks.positional_unet import GruDiscriminator, InterpolatedEmbedding
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import GruConfig
 

@@ -244,5 +244,4 @@ class ResponseGenerator(KeptNoise):
 
     def forward(self, windows: Tensor) -> Tensor:
         """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""
-        records: Tensor = self.response(windows)
-        return records
+        return self.response(windows)  # type: ignore[no-any-return]

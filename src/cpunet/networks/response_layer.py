@@ -9,6 +9,7 @@ may be stretched in time.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import scipy.fft
 import torch
@@ -233,27 +234,24 @@ class ElectronicsResponse(Readout):
         super().__init__(dt_ns)
         self.config = config
 
-        def log(values: list[float]) -> nn.Parameter:
+        def log(values: Sequence[float]) -> nn.Parameter:
             return nn.Parameter(torch.tensor(values, dtype=torch.float64).log())
 
-        def plain(value: float) -> nn.Parameter:
-            return nn.Parameter(torch.tensor(value, dtype=torch.float64))
+        def weights(values: Sequence[float]) -> nn.Parameter:
+            return nn.Parameter(torch.zeros(len(values), dtype=torch.float64))
 
-        self.log_poles_ns = log(list(config.poles_ns))
+        self.log_poles_ns = log(config.poles_ns)
         self.log_decay_us = log([config.decay_us])
-        self.slow_weights = nn.Parameter(torch.zeros(len(config.slow_ns), dtype=torch.float64))
-        self.decay_weights = nn.Parameter(
-            torch.zeros(len(config.fast_decays_us), dtype=torch.float64)
-        )
-        self.register_buffer("slow_ns", torch.tensor(config.slow_ns, dtype=torch.float64))
-        self.register_buffer(
-            "fast_decays_us", torch.tensor(config.fast_decays_us, dtype=torch.float64)
-        )
+        self.slow_weights = weights(config.slow_ns)
+        self.decay_weights = weights(config.fast_decays_us)
+        for name in ("slow_ns", "fast_decays_us"):
+            times = torch.tensor(getattr(config, name), dtype=torch.float64)
+            self.register_buffer(name, times)
         if config.free_decays:
-            self.log_fast_decays_us = log(list(config.fast_decays_us))
+            self.log_fast_decays_us = log(config.fast_decays_us)
         rings = [] if config.ringing_mhz is None else [config.ringing_mhz, config.ringing_ns]
         # weights of sine and cosine; frequency in MHz and damping in ns
-        self.ringing = nn.Parameter(torch.zeros(len(rings), dtype=torch.float64))
+        self.ringing = weights(rings)
         self.log_ringing = log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
 
@@ -316,36 +314,21 @@ class ElectronicsResponse(Readout):
     def describe(self) -> dict[str, float]:
         """Fitted parameters by name, with the unit at the end of the name."""
         poles = sorted(self.log_poles_ns.exp().tolist(), reverse=True)
-        return (
-            {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
-            | {
-                f"slow_{tau:g}_ns": float(weight)
-                for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True)
-            }
-            | {"decay_us": float(self.log_decay_us.exp())}
-            | self._fast_decays()
-            | self._ringing()
-            | ({} if self.drift is None else self.drift.describe())
-        )
-
-    def _fast_decays(self) -> dict[str, float]:
+        told = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
+        slow = zip(self.slow_ns.tolist(), self.slow_weights.tolist(), strict=True)
+        told |= {f"slow_{tau:g}_ns": weight for tau, weight in slow}
+        told["decay_us"] = float(self.log_decay_us.exp())
         times, weights = self.fast_times_us.tolist(), self.decay_weights.tolist()
-        if not self.config.free_decays:
-            return {f"decay_{tau:g}_us": w for tau, w in zip(times, weights, strict=True)}
-        return {f"fast_decay_{i + 1}_us": tau for i, tau in enumerate(times)} | {
-            f"fast_decay_{i + 1}_share": weight for i, weight in enumerate(weights)
-        }
-
-    def _ringing(self) -> dict[str, float]:
-        if not len(self.ringing):
-            return {}
-        frequency_mhz, damping_ns = self.log_ringing.exp().tolist()
-        return {
-            "ringing_mhz": frequency_mhz,
-            "ringing_damping_ns": damping_ns,
-            "ringing_sine": float(self.ringing[0]),
-            "ringing_cosine": float(self.ringing[1]),
-        }
+        if self.config.free_decays:
+            told |= {f"fast_decay_{i + 1}_us": tau for i, tau in enumerate(times)}
+            told |= {f"fast_decay_{i + 1}_share": weight for i, weight in enumerate(weights)}
+        else:
+            told |= {f"decay_{tau:g}_us": w for tau, w in zip(times, weights, strict=True)}
+        if len(self.ringing):
+            names = ("ringing_mhz", "ringing_damping_ns", "ringing_sine", "ringing_cosine")
+            values = [*self.log_ringing.exp().tolist(), *self.ringing.tolist()]
+            told |= dict(zip(names, values, strict=True))
+        return told if self.drift is None else told | self.drift.describe()
 
 
 def _spline(frequency: Tensor) -> Tensor:

@@ -31,9 +31,8 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE
-from cpunet.networks.discriminators import GruDiscriminator
 from cpunet.networks.generators import KeptNoise, stretch
-from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import LossConfig, PreparationConfig, Recipe, TrainingConfig
