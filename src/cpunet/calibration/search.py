@@ -31,7 +31,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.fitter import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
-from cpunet.training.response_starts import start_response
+from cpunet.training.response_starts import set_decay
 
 log = logging.getLogger(__name__)
 
@@ -149,8 +149,10 @@ class Search:
         config, training = self.recipe.chain, self.recipe.matching.training
         bands = self.sets.bands(training.search_pulses)
         dt_ns = self.simulator.physics.settings.dt_ns
-        blank = ResponseProblem(ElectronicsResponse(config, dt_ns), bands, draws=1)
-        problem = blank.of(start_response(config, dt_ns, 1.0, blank.slope))
+        start = ElectronicsResponse(config, dt_ns)
+        problem = ResponseProblem(start, bands, draws=1)
+        set_decay(start, problem.slope)
+        problem = problem.of(start)
         levenberg_marquardt(problem, FIRST_STEPS, None)
         chain: ElectronicsResponse = problem.response
         return chain

@@ -65,27 +65,17 @@ def sides_figure(
     whole.set(xlabel="Time [µs]", ylabel="Charge / its maximum")
     edge.set(xlabel="Time [ns]", ylabel="Charge / its maximum")
     for axes, (name, values) in zip(below, parameters.items(), strict=True):
-        _histograms(axes, name, values)
+        everything = np.concatenate([v[np.isfinite(v)] for v in values.values()])
+        low, high = np.quantile(everything, (0.002, 0.998))
+        edges = np.linspace(low, high, SIDE_BINS + 1)
+        for side, own in values.items():
+            counted, data = np.histogram(own, edges)[0] / max(len(own), 1), side == "data"
+            colour = DATA_FILL if data else COLOURS[side]
+            axes.stairs(counted, edges, fill=data, color=colour, label=label(side))
+        axes.set(xlabel=name, ylabel="Fraction of pulses")
+        axes.legend()
     figure.legend(*whole.get_legend_handles_labels(), loc="outside upper left", ncols=2)
     return figure
-
-
-def _histograms(axes: Axes, name: str, values: Mapping[str, Floats]) -> None:
-    everything = np.concatenate([v[np.isfinite(v)] for v in values.values()])
-    low, high = np.quantile(everything, (0.002, 0.998))
-    edges = np.linspace(low, high, SIDE_BINS + 1)
-    for side, own in values.items():
-        counts = np.histogram(own, edges)[0] / max(len(own), 1)
-        data = side == "data"
-        axes.stairs(
-            counts,
-            edges,
-            fill=data,
-            color=DATA_FILL if data else COLOURS[side],
-            label=label(side),
-        )
-    axes.set(xlabel=name, ylabel="Fraction of pulses")
-    axes.legend()
 
 
 @styled
@@ -128,7 +118,16 @@ def response_figure(
         panels["step"].plot(long_ns, steps[-1], label=chain.name, **look)
         panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
         panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
-        _noise_spectrum(panels["noise"], chain, look)
+        if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
+            continue
+        # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
+        stop = len(chain.frequency_mhz) - 1
+        edges = np.unique(np.geomspace(1, stop, NOISE_BINS).astype(int))
+        frequency, density = (
+            np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
+            for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
+        )
+        panels["noise"].loglog(frequency, density, **look)
     if compared:
         axes, name = panels["residual"], "mean" if truth is None else "truth"
         reference = np.mean(steps, axis=0) if truth is None else steps.pop(0)
@@ -138,19 +137,6 @@ def response_figure(
         axes.set(ylabel=f"Run − {name}\n[10⁻³ of full charge]")
     _annotate(panels)
     return figure
-
-
-def _noise_spectrum(axes: Axes, chain: Chain, look: dict[str, Any]) -> None:
-    if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
-        return
-    # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
-    stop = len(chain.frequency_mhz) - 1
-    edges = np.unique(np.geomspace(1, stop, NOISE_BINS).astype(int))
-    frequency, density = (
-        np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
-        for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
-    )
-    axes.loglog(frequency, density, **look)
 
 
 def _annotate(panels: dict[str, Axes]) -> None:

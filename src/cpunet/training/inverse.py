@@ -87,9 +87,15 @@ def fit_inverse(
     charge = torch.from_numpy(sim[rows[used]])
     wanted = stretch(charge, sample + delay, -before, after).double().numpy()
     _, level = inverse.base_and_level(windows, sample)
-    noise = _noise_covariance(generator.noise, inverse.sizes, measured.mean(axis=0))
+    mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
+    noise = _noise_covariance(generator.noise, inverse.sizes, mean_in)
     noise *= float(np.mean(energy_kev[rows] ** -2.0)) / float(level.mean()) ** 2
-    _regress(inverse, measured, wanted, noise)
+    measured, wanted = measured - mean_in, wanted - mean_out
+    own = measured.T @ measured / len(measured) + noise
+    own[np.diag_indices(len(own))] += FLOOR**2
+    weights = scipy.linalg.solve(own, measured.T @ wanted / len(measured), assume_a="pos").T
+    for name, values in (("mean_in", mean_in), ("mean_out", mean_out), ("weights", weights)):
+        getattr(inverse, name).copy_(torch.from_numpy(np.ascontiguousarray(values)))
     return inverse
 
 
@@ -140,18 +146,3 @@ def _noise_covariance(noise: BaselineNoise, sizes: Sizes, pulse: Values) -> Valu
     taken = np.eye(sizes.before + sizes.after, samples, -sizes.before - first)
     taken = taken - base - np.outer(pulse, level - base)
     return np.asarray(taken @ scipy.linalg.toeplitz(correlation) @ taken.T, float)
-
-
-def _regress(inverse: LinearInverse, measured: Values, wanted: Values, noise: Values) -> None:
-    """Store the means and the least-squares weights in `inverse`."""
-    mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
-    measured, wanted = measured - mean_in, wanted - mean_out
-    own = measured.T @ measured / len(measured) + noise
-    own[np.diag_indices(len(own))] += FLOOR**2
-    weights = scipy.linalg.solve(own, measured.T @ wanted / len(measured), assume_a="pos").T
-    for buffer, values in (
-        (inverse.mean_in, mean_in),
-        (inverse.mean_out, mean_out),
-        (inverse.weights, weights),
-    ):
-        buffer.copy_(torch.from_numpy(np.ascontiguousarray(values)))

@@ -10,8 +10,7 @@ import logging
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any, Self
 
@@ -87,7 +86,9 @@ def train(
         If a loss becomes NaN or infinite.
     """
     config = recipe.cyclegan.training
-    with _seeded(seed, device):
+    cuda = [torch.device(device)] if device.startswith("cuda") else []
+    with torch.random.fork_rng(devices=cuda):  # which restores the random state
+        torch.manual_seed(seed)
         model = CycleGan(recipe, outside).to(device).train()
         # far apart, so that neighbouring seeds share no sampler
         seeds = 2 * seed + 1_000_003, 2 * seed + 2_000_004
@@ -317,12 +318,3 @@ def _finite(record: dict[str, Any], seed: int) -> Record:
 def _diverged(told: str, seed: int) -> CpunetError:
     remedy = "lower the learning rates or change the seed, and begin again"
     return CpunetError(f"training diverged: {told} (seed {seed}); {remedy}")
-
-
-@contextmanager
-def _seeded(seed: int, device: str) -> Iterator[None]:
-    """Seed torch inside the context, and restore its random state afterwards."""
-    cuda = [torch.device(device)] if device.startswith("cuda") else []
-    with torch.random.fork_rng(devices=cuda):
-        torch.manual_seed(seed)
-        yield

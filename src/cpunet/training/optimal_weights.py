@@ -279,7 +279,7 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     smooth = near.parameters
     place = smooth.vector()
     weighted = [_Weighted(band, smooth, near.response, bins) for band in bands]
-    slopes = np.concatenate([w.slopes for w in weighted])
+    slopes = np.concatenate([w.whole.slopes for w in weighted])
 
     def residuals(place: Values) -> Values:
         smooth.set(place)
@@ -288,23 +288,15 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
 
     columns = np.concatenate([slopes, np.diag(1 / smooth.widths)])
     end = _descend(residuals, smooth, columns)
-    smooth.set(np.maximum(end - _bias(weighted, smooth, place, end), smooth.low))
-    return smooth.covariance(slopes.T @ slopes)
-
-
-def _bias(
-    weighted: Sequence[_Weighted], smooth: SmoothParameters, place: Values, end: Values
-) -> Values:
-    """Bias of the end of the steps, with weights evaluated at `place`.
-
-    Coordinates that end at their bound are held there: jumps to and from it are not a bias.
-    """
+    # coordinates that end at their bound are held there: jumps to and from it are not a bias
     held = np.where(end > smooth.low + AT_BOUND, np.nan, end - place)
     prior = (place - smooth.centre) / smooth.widths
     bias = jackknife_bias([w.parts for w in weighted], prior, smooth.widths, held)
     # if there are many pulses, the weights come from only some of those that are compared
     pairs = sum(w.pairs for w in weighted), sum(w.band.pairs for w in weighted)
-    return np.asarray(min(1.0, pairs[0] / pairs[1]) * bias)
+    bias *= min(1.0, pairs[0] / pairs[1])
+    smooth.set(np.maximum(end - bias, smooth.low))
+    return smooth.covariance(slopes.T @ slopes)
 
 
 def _descend(
@@ -362,21 +354,17 @@ class _Weighted:
         self.pairs = 1 / sum(1 / n for n in counts)
         ridge = RIDGE if isinstance(response, StepResponse) else 0.0
         self.parts = Parts(simulated, measured, band.pairs, ridge)
-        self.weights, self.whiten = self.parts.whole.weights, self.parts.whole.whiten
-        self.slopes = self.parts.whole.slopes
-        total = sum(self.functions.sum(data[rows]) for rows in _blocks(len(data)))
-        self.wanted = total / len(data) @ self.weights
+        self.whole = self.parts.whole
+        rows = (slice(first, first + BLOCK) for first in range(0, len(data), BLOCK))
+        total = sum(self.functions.sum(data[some]) for some in rows)
+        self.wanted = total / len(data) @ self.whole.weights
 
     def deviations(self, response: Readout) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
             return (self.functions.sum(readings),)
 
         (total,), n = self.band.sim.sums(response, of)
-        return np.asarray(self.whiten @ (total / n @ self.weights - self.wanted))
-
-
-def _blocks(n: int) -> list[slice]:
-    return [slice(first, first + BLOCK) for first in range(0, n, BLOCK)]
+        return np.asarray(self.whole.whiten @ (total / n @ self.whole.weights - self.wanted))
 
 
 def _simulated(

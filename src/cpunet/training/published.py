@@ -163,7 +163,16 @@ def _generator(path: Path, length: int) -> PositionalUNet:
     config = PunetConfig(name="punet", width=width, dropout=0.1)
     with torch.device("meta"):
         expected = PositionalUNet(config, length).state_dict()
-    named = _renamed({n: v for n, v in state.items() if n not in MAPS}, LAYERS)
+    named: State = {}
+    for name, value in state.items():
+        if name in MAPS:
+            continue
+        layer, _, rest = name.rpartition(".")
+        # batch norms and convolutions are numbered within their block
+        block, _, number = layer.rpartition(".")
+        if block in LAYERS and number.isdecimal():
+            layer, rest = block, f"{number}.{rest}"
+        named[f"{LAYERS.get(layer, layer)}.{rest}" if layer else name] = value
     if wrong := differing(named, expected):
         raise CpunetError(
             f"{path}: weights of another architecture: {len(wrong)} tensors differ, first "
@@ -172,19 +181,3 @@ def _generator(path: Path, length: int) -> PositionalUNet:
     network = PositionalUNet(config, length)
     network.load_state_dict(named)
     return network.eval()
-
-
-def _renamed(state: State, layers: dict[str, str]) -> State:
-    """State dict with the names of this package for known layers, others unchanged."""
-    named: State = {}
-    for name, value in state.items():
-        layer, _, rest = name.rpartition(".")
-        # batch norms and convolutions are numbered within their block
-        block, _, number = layer.rpartition(".")
-        if layer in layers:
-            named[f"{layers[layer]}.{rest}"] = value
-        elif block in layers and number.isdecimal():
-            named[f"{layers[block]}.{number}.{rest}"] = value
-        else:
-            named[name] = value
-    return named

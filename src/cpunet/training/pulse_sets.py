@@ -18,7 +18,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import record_length
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.moments import MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
@@ -251,7 +251,9 @@ class PulseSets:
 
     def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
         _, training = self.recipe.matching
-        measured = _taken(self.data.waveforms, band.data[data])
+        measured, taken = self.data.waveforms, band.data[data]
+        if len(taken) < len(measured):  # else without a copy, which may take gigabytes
+            measured = measured[taken]
         moments = Moments.of_data(measured, training, self.recipe.preparation)
         rows = band.sim[sim]
         pulses = self.sim if len(rows) == len(self.sim) else self.sim[rows]
@@ -264,8 +266,3 @@ class PulseSets:
         length = record_length(sim.waveforms.shape[1])
         drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
         return SimulatedSide(sim.waveforms, drawn, moments, weights)
-
-
-def _taken(waveforms: FloatArray, rows: Rows) -> FloatArray:
-    """Rows in their order; without a copy, which may take gigabytes, if all are taken."""
-    return waveforms if len(rows) == len(waveforms) else waveforms[rows]

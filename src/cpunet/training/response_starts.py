@@ -76,7 +76,9 @@ def best_start(first: ResponseProblem, config: ResponseConfig, fitter: Fitter) -
     best: Fitted | None = None
     dt_ns = float(first.response.dt_ns)
     for factor in fitter.training.start_factors:
-        start = start_response(config, dt_ns, factor, first.slope)
+        start = ElectronicsResponse(config, dt_ns)
+        start.log_poles_ns.data.add_(math.log(factor))
+        set_decay(start, first.slope)
         found = fitter.fit(first.of(start))
         if best is None and found.poor and onset_is_off(found.problem):
             found = drift_if_better(found, fitter)
@@ -183,7 +185,8 @@ def _free_decay_start(
     dt_ns, slope = float(problem.response.dt_ns), problem.slope
     if decay is None:
         slope += 1e-3 * dt_ns * share * _fast_slope(problem, fast_us)
-    response = start_response(config, dt_ns, 1.0, slope, decay)
+    response = ElectronicsResponse(config, dt_ns)
+    set_decay(response, slope, decay)
     response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
     if with_slow:
         kept = [tau in config.slow_ns for tau in problem.response.config.slow_ns]
@@ -296,23 +299,6 @@ def with_settings(response: ElectronicsResponse, **settings: Any) -> Electronics
             values.view(-1)[: len(old)] = old
     copied.decay_known = response.decay_known
     return copied
-
-
-def start_response(
-    config: ResponseConfig,
-    dt_ns: float,
-    factor: float,
-    slope: float,
-    decay: KnownDecay | None = None,
-) -> ElectronicsResponse:
-    """A response with the recipe's poles times a factor, and the data's own decay.
-
-    The decay is known, or it follows from the slope of the tails.
-    """
-    response = ElectronicsResponse(config, dt_ns)
-    response.log_poles_ns.data.add_(math.log(factor))
-    set_decay(response, slope, decay)
-    return response
 
 
 def set_decay(

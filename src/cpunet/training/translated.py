@@ -7,7 +7,7 @@ are kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -209,9 +209,9 @@ class SimulatedSide:
         draws: int | None = None,
     ) -> list[Total]:
         """Same as `sums`, for each block of `size` pulses in their order."""
+        padded = padded_length(self.length)
         with torch.no_grad():
-            transfer = response.transfer(padded_length(self.length)).numpy()
-        transfer = np.asarray(transfer, np.complex64)
+            transfer = np.asarray(response.transfer(padded).numpy(), np.complex64)
         drift = response.drift
         stretch = drift.stretch.tolist() if isinstance(drift, DriftClock) else []
         if stretch != self._stretch:
@@ -222,7 +222,14 @@ class SimulatedSide:
         def one(first: int) -> tuple[list[Total], list[Total], int]:
             """Totals of each draw, within the data's range and beyond it, and pulses beyond."""
             within, outside, n = [], [], 0
-            for readings, beyond in self._block(response, transfer, first, size, draws):
+            spectrum = self.spectrum(response, first, size) * transfer
+            records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
+            top = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER]
+            records *= self.moments.preparation.tail_level / top.mean(axis=1, keepdims=True)
+            weights = self.weights[first : first + size]
+            for draw in range(len(self.noise.factor))[:draws]:
+                noisy = self.noise.add(records, draw, first)
+                readings, beyond = self.moments.read(noisy, self.last, weights)
                 if cut and beyond.any():
                     others, readings = readings[beyond], readings[~beyond]
                     outside.append((of(others), float(others.weights.sum())))
@@ -243,28 +250,6 @@ class SimulatedSide:
         return [
             _added(within if exclude else within + outside) for within, outside, _ in blocks
         ]
-
-    def _block(
-        self,
-        response: Readout,
-        transfer: npt.NDArray[np.complex64],
-        first: int,
-        size: int,
-        draws: int | None,
-    ) -> Iterator[tuple[Readings, npt.NDArray[np.bool_]]]:
-        """Result of `Moments.read` for one block of pulses, draw by draw."""
-        preparation = self.moments.preparation
-        spectrum = self.spectrum(response, first, size) * transfer
-        padded = padded_length(self.length)
-        records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
-        plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(
-            axis=1, keepdims=True
-        )
-        records *= preparation.tail_level / plateau
-        for draw in range(len(self.noise.factor))[:draws]:
-            noisy = self.noise.add(records, draw, first)
-            weights = self.weights[first : first + size]
-            yield self.moments.read(noisy, self.last, weights)
 
     def spectrum(self, response: Readout, first: int, size: int) -> npt.NDArray[np.complex64]:
         """Fourier transform of the currents of one block, cached up to `SPECTRA_BYTES`."""
