@@ -274,6 +274,12 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
     return findings
 
 
+def _judged(what: str, text: str, remedy: str, fine: bool) -> Finding:
+    if fine:
+        return Finding(what, Level.FINE, text)
+    return Finding(what, Level.WARNING, text, remedy)
+
+
 def _refusal(what: str, error: CpunetError) -> Finding:
     return Finding(what, Level.ERROR, error.text, error.remedy)
 
@@ -344,16 +350,11 @@ def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Fin
             continue
         off = found - line.energy_kev
         text = f"{one.path.name}: line {name} of the {side} pulses at {found:.1f} keV"
-        if abs(off) <= OFF_LINE:
-            yield Finding("calibration", Level.FINE, text)
-        else:
-            factor = line.energy_kev / found
-            yield Finding(
-                "calibration",
-                Level.WARNING,
-                f"{text}, {off:+.1f} keV from where it should be",
-                f"energies times {factor:.5f}, as by `kev_per_adc`, would put it right",
-            )
+        fine = abs(off) <= OFF_LINE
+        text += "" if fine else f", {off:+.1f} keV from where it should be"
+        factor = line.energy_kev / found
+        remedy = f"energies times {factor:.5f}, as by `kev_per_adc`, would put it right"
+        yield _judged("calibration", text, remedy, fine)
 
 
 def _spread(sim: InputSet, data: InputSet) -> Finding:
@@ -366,15 +367,12 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
     text = "drift times (10 to 50 %) spread over {:.0f} ns simulated, {:.0f} ns measured"
     ratio = ranges[1] / max(ranges[0], 1e-9)
     chance = float(np.hypot(SURE * np.hypot(*errors), ROUNDING * data.dt_ns))
-    if 1 / SPREAD_RATIO < ratio < SPREAD_RATIO or abs(ranges[1] - ranges[0]) < chance:
-        return Finding("drift times", Level.FINE, text.format(*ranges))
-    return Finding(
-        "drift times",
-        Level.WARNING,
-        text.format(*ranges),
+    fine = 1 / SPREAD_RATIO < ratio < SPREAD_RATIO or abs(ranges[1] - ranges[0]) < chance
+    remedy = (
         "no readout does that: another detector or bias, hits of another frame, or other "
-        "energies; where the simulation is near, cpunet calibrate finds its physics",
+        "energies; where the simulation is near, cpunet calibrate finds its physics"
     )
+    return _judged("drift times", text.format(*ranges), remedy, fine)
 
 
 def _amplitude(sim: InputSet, data: InputSet) -> Finding:
@@ -382,15 +380,10 @@ def _amplitude(sim: InputSet, data: InputSet) -> Finding:
     highest = [float(np.nanquantile(_amplitudes(one), 0.9)) for one in (sim, data)]
     ratio = highest[1] / highest[0]
     text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
-    if ratio < SHARPER:
-        return Finding("current amplitude", Level.FINE, text)
-    return Finding(
-        "current amplitude",
-        Level.WARNING,
-        text,
-        "no readout makes pulses sharper: another detector, too wide a cloud, or other "
-        "energies",
+    remedy = (
+        "no readout makes pulses sharper: another detector, too wide a cloud, or other energies"
     )
+    return _judged("current amplitude", text, remedy, ratio < SHARPER)
 
 
 def _of_height_one(one: InputSet) -> FloatArray:

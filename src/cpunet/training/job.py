@@ -9,7 +9,6 @@ import time
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -33,7 +32,7 @@ from cpunet.pulses.loading import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
 from cpunet.training.chain_description import beyond, diagnosis, stretched
 from cpunet.training.check import Level, compare_sides
@@ -142,13 +141,6 @@ class TrainingJob:
         )
 
 
-def _continuum(pair: Pair, recipe: Recipe, away: EnergySelection) -> tuple[Pulses, Pulses]:
-    """Pulses of both sides away from all lines, read when a fit needs them."""
-    sim = load_pulses(pair[0], "simulated", recipe, away, tell=False)
-    data = load_pulses(pair[1], "measured", recipe, away, tell=False)
-    return sim.prepared.pulses, data.prepared.pulses
-
-
 @dataclass(frozen=True)
 class Training:
     """How to train, whatever the pulses; see `cpunet.train`."""
@@ -206,10 +198,17 @@ class Training:
         for finding in compare_sides(sim, data, selection):
             if finding.level != Level.FINE:
                 log.warning(finding)
-        away, beside = continuum(recipe), None
+        away = continuum(recipe)
+        beside: Continuum | None = None
         there = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
         if there >= MIN_PULSES and not selection.ranges_kev:
-            beside = partial(_continuum, pair, recipe, away)
+
+            def beside() -> tuple[Pulses, Pulses]:
+                """Pulses of both sides away from all lines, read when a fit needs them."""
+                sim = load_pulses(pair[0], "simulated", recipe, away, tell=False)
+                data = load_pulses(pair[1], "measured", recipe, away, tell=False)
+                return sim.prepared.pulses, data.prepared.pulses
+
         if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
             kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
             raise CpunetError(f"{init.name}: {kinds}; resample them")

@@ -103,8 +103,7 @@ def train(
         training = _Training(step, samplers, device, seed)
         if start is not None:
             training.load_state_dict(start)
-        with _Interruption() as interruption:
-            _iterate(training, listener, save, interruption)
+        training.run(listener, save)
         for averaged, network, sampler in zip(
             training.averages, training.generators, samplers, strict=True
         ):
@@ -223,6 +222,37 @@ class _Training:
         told = {"iteration": iteration, "rate": rate, "losses": losses}
         return told | ({"accuracy": self.step.accuracy} if self.step.accuracy else {})
 
+    def run(self, listener: Listener | None, save: Callable[[State], None] | None) -> None:
+        """Do all iterations that are left, or those until it is interrupted."""
+        config = self.config
+        pending: list[dict[str, Any]] = []
+        with _Interruption() as interruption:
+            while self.iteration < config.iterations:
+                pending.append(self.advance())
+                done = self.iteration
+                last = done == config.iterations
+                stop = 0 if last else interruption.signal
+                keep = last or stop or done % config.checkpoint_interval == 0
+                # several iterations are fetched at once: each transfer makes a GPU wait
+                if keep or len(pending) == config.log_interval:
+                    records = [_finite(record, self.seed) for record in pending]
+                    pending.clear()
+                    if listener is not None:
+                        listener(records)
+                if keep and save is not None:
+                    # losses are one iteration behind the weights
+                    for name, value in self.model.state_dict().items():
+                        if not bool(torch.isfinite(value).all()):
+                            told = f"{name} is not finite after iteration {done - 1}"
+                            raise _diverged(told, self.seed)
+                    save(self.state_dict())
+                if stop:
+                    log.info(
+                        f"stopped after {done} of {config.iterations} iterations; resume goes "
+                        "on from there"
+                    )
+                    signal.raise_signal(stop)
+
     def state_dict(self) -> State:
         """Return all that the next iterations depend on, except pulses and settings."""
         random = {"cpu": torch.get_rng_state()}
@@ -267,41 +297,6 @@ class _Interruption:
         self.__exit__()
         self.signal = number
         log.info("stopping after this iteration; once more to stop at once")
-
-
-def _iterate(
-    training: _Training,
-    listener: Listener | None,
-    save: Callable[[State], None] | None,
-    interruption: _Interruption,
-) -> None:
-    config = training.config
-    pending: list[dict[str, Any]] = []
-    while training.iteration < config.iterations:
-        pending.append(training.advance())
-        done = training.iteration
-        last = done == config.iterations
-        stop = 0 if last else interruption.signal
-        keep = last or stop or done % config.checkpoint_interval == 0
-        # several iterations are fetched at once: each transfer makes a GPU wait
-        if keep or len(pending) == config.log_interval:
-            records = [_finite(record, training.seed) for record in pending]
-            pending.clear()
-            if listener is not None:
-                listener(records)
-        if keep and save is not None:
-            # losses are one iteration behind the weights
-            for name, value in training.model.state_dict().items():
-                if not bool(torch.isfinite(value).all()):
-                    told = f"{name} is not finite after iteration {done - 1}"
-                    raise _diverged(told, training.seed)
-            save(training.state_dict())
-        if stop:
-            log.info(
-                f"stopped after {done} of {config.iterations} iterations; resume goes on "
-                "from there"
-            )
-            signal.raise_signal(stop)
 
 
 def _finite(record: dict[str, Any], seed: int) -> Record:

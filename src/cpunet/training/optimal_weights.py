@@ -29,6 +29,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import add
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -45,8 +47,7 @@ from cpunet.training.translated import SimulatedSide
 SHRUNK = 0.05  # share of a diagonal matrix in the correlations of the functions
 
 
-@dataclass(frozen=True, eq=False)
-class Sums:
+class Sums(NamedTuple):
     """Sums over pulses, which can be added.
 
     Parameters
@@ -77,13 +78,8 @@ class Sums:
         """
         return cls(len(values), values.sum(axis=0), values.T @ values)
 
-    def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.n + other.n,
-            self.total + other.total,
-            self.products + other.products,
-            self.moved + other.moved,
-        )
+    def __add__(self, other: Sums) -> Sums:  # type: ignore[override]
+        return Sums(*map(add, self, other))
 
     @property
     def mean(self) -> Values:
