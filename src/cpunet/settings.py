@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
 
@@ -100,6 +100,21 @@ def checked(
         return kind.model_validate(values)
     except ValidationError as error:
         raise CpunetError(f"{source}: {_fault(error, kind, values, missing or {})}") from error
+
+
+def flat(values: Any, joint: str = ".", key: str = "") -> Iterator[tuple[str, Any]]:
+    """Each value of nested mappings, after the keys that lead to it.
+
+    Examples
+    --------
+    >>> dict(flat({"bias_V": 4000, "layer": {"mm": 1.0, "ge": {"top": 2}}}))
+    {'bias_V': 4000, 'layer.mm': 1.0, 'layer.ge.top': 2}
+    """
+    if not isinstance(values, Mapping):
+        yield key, values
+        return
+    for name, value in values.items():
+        yield from flat(value, joint, f"{key}{joint}{name}" if key else str(name))
 
 
 def key_values(set_: Set) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from cpunet.errors import CpunetError
+from cpunet.settings import flat
 
 # keys of a diode and the fields of the detector
 _GEOMETRY = {
@@ -129,7 +130,9 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             f"detector {name}: type {reprlib.repr(kind)} is not simulated; "
             f"give one of type {', '.join(_SIMULATED)}"
         )
-    geometry = _flat(diode["geometry"], name)
+    if not isinstance(diode["geometry"], Mapping):
+        raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
+    geometry = dict(flat(diode["geometry"]))
     extra = diode["geometry"].get("extra") or {}
     if _at(extra, "crack") and _at(extra, "crack.width_in_mm") != 0:
         raise CpunetError(
@@ -191,19 +194,6 @@ def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
         "impurity_z0_1e10_per_cm3": float(offset),
         "impurity_gradient_1e10_per_cm4": float(slope),
     }
-
-
-def _flat(values: Any, name: str, prefix: str = "") -> dict[str, Any]:
-    """Flatten nested mappings; keys are joined by dots."""
-    if not isinstance(values, Mapping):
-        raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, name, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
 
 
 def _at(values: Any, place: str) -> Any:

@@ -144,8 +144,13 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     )
     for tau in taus[:n]:
         undecayed = undecayed * Exponentials.low_pass(tau)
-    if len(response.ringing):
-        undecayed = undecayed * _ringing(response)
+    if len(response.ringing):  # a step response 1 + exp(-t/damping) (a sin + b cos)
+        frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
+        sine, cosine = response.ringing.tolist()
+        pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
+        residue = 0.5 * complex(cosine, -sine) * pole
+        pair = (np.array([of, of.conjugate()]) for of in (pole, residue))
+        undecayed = undecayed * Exponentials(1 + cosine, *pair)
     shares = [1 - sum(fast), *fast]
     whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
     return Chain(name, whole, undecayed)
@@ -190,16 +195,6 @@ def with_noise(
         # both signs of the frequency
         2 * dt_us * noise.density / height**2,
     )
-
-
-def _ringing(response: ElectronicsResponse) -> Exponentials:
-    """Step response ``1 + exp(-t/damping) (a sin + b cos)``."""
-    frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
-    sine, cosine = response.ringing.tolist()
-    pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
-    residue = 0.5 * complex(cosine, -sine) * pole
-    poles = np.array([pole, pole.conjugate()])
-    return Exponentials(1 + cosine, poles, np.array([residue, residue.conjugate()]))
 
 
 def true_parameters(electronics: Electronics) -> Numbers:

@@ -216,7 +216,6 @@ class DifferentiableSet:
         functions: Functions,
         *,
         draws: int | None = None,
-        size: int = BLOCK,
     ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
         """Functions of each pulse and their derivatives, block by block, draw by draw.
 
@@ -229,8 +228,8 @@ class DifferentiableSet:
         with torch.no_grad():
             transfer = response.transfer(self.padded).to(torch.complex64)
         slopes = response.transfer_slopes(self.padded).to(torch.complex64)[:, None]
-        for first in range(0, len(self.sim), size):
-            spectra = torch.from_numpy(self.sim.spectrum(response, first, size))
+        for first in range(0, len(self.sim), BLOCK):
+            spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
             clean, moved = self.records(spectra, transfer), self.records(spectra, slopes)
             for draw in range(len(self.sim.noise.factor))[:draws]:
                 noise = self.noise(draw, first, len(clean))
@@ -247,7 +246,7 @@ class DifferentiableSet:
 
                 # the values are the same along all directions
                 values, columns = torch.func.vmap(along, out_dims=(None, 0))(moved)  # type: ignore[arg-type]
-                yield first, values, columns, self.weights[first : first + size]
+                yield first, values, columns, self.weights[first : first + BLOCK]
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:
         """Noise of `n` pulses from the first one on, shape (n, samples)."""

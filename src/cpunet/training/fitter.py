@@ -116,8 +116,11 @@ def levenberg_marquardt(
         cost = float(residuals @ residuals)
         jacobian, updates = problem.jacobian(vector, residuals), 0
         for _ in range(max(1, most)):
-            if not updates and _promised(parameters, vector, jacobian, residuals) < CONVERGED:
-                break
+            if not updates:  # what a full step would gain if the residuals were linear
+                gradient = jacobian.T @ residuals
+                move = _within(parameters, vector, jacobian.T @ jacobian, gradient)
+                if -float(gradient @ move) < CONVERGED:
+                    break
             step = _step(problem, jacobian, vector, residuals, damping)
             if step is None and updates:
                 # the derivatives may be outdated
@@ -153,14 +156,6 @@ def levenberg_marquardt(
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
     return Minimum(cost, covariance)
-
-
-def _promised(
-    parameters: Unknowns, vector: Values, jacobian: Values, residuals: Values
-) -> float:
-    """Fall of chi-square in a full step if the residuals were linear."""
-    gradient = jacobian.T @ residuals
-    return -float(gradient @ _within(parameters, vector, jacobian.T @ jacobian, gradient))
 
 
 def _step(

@@ -18,7 +18,7 @@ import logging
 import os
 import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,6 +45,7 @@ from cpunet.outputs import (
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
+from cpunet.settings import flat
 from cpunet.training.cyclegan import CycleGan, Outside
 from cpunet.training.loop import Record, State, judges_noted, train
 from cpunet.training.run import LOSSES, RUN, FitInfo, Run, read_losses
@@ -366,19 +367,11 @@ class UnfinishedRun:
 def differences(then: Any, now: Any) -> Iterator[str]:
     """Each difference between two JSON-like values, as ``"training.batch_size 32 → 16"``."""
     # as read back from a file: without tuples
-    old, new = (dict(_leaves("", json.loads(json.dumps(value)))) for value in (then, now))
+    old, new = (dict(flat(json.loads(json.dumps(value)))) for value in (then, now))
     for key in old | new:
         before, after = old.get(key, "none"), new.get(key, "none")
         if before != after:
             yield f"{key} {_short(before)} → {_short(after)}".strip()
-
-
-def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:
-    if not isinstance(value, Mapping):
-        yield key, value
-        return
-    for name, part in value.items():
-        yield from _leaves(f"{key}.{name}" if key else name, part)
 
 
 def _short(value: Any) -> str:

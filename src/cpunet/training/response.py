@@ -133,7 +133,7 @@ class Response:
             head += [self.content["truth"]["name"], "difference", "σ"]
         rows = []
         for name in _names(self.content):
-            label, unit = _label(name)
+            _, label, unit = _row(name)
             text = f"{label} [{unit}]" if unit else label
             rows.append([text, *_cells(self.content, name, unit)])
         return text_table(head, rows, title="Readout response")
@@ -268,18 +268,16 @@ def _names(told: dict[str, Any]) -> list[str]:
     if "truth" in told:
         sources.append(told["truth"]["values"])
     names = {name: None for source in sources for name in source}
-    patterns = list(ROWS)
-    return sorted(names, key=lambda name: patterns.index(_pattern(name)))
+    return sorted(names, key=lambda name: _row(name)[0])
 
 
-def _pattern(name: str) -> str:
-    return next(pattern for pattern in ROWS if re.fullmatch(pattern, name))
-
-
-def _label(name: str) -> tuple[str, str]:
-    pattern = _pattern(name)
-    text, unit = ROWS[pattern]
-    return re.sub(pattern, text, name), unit
+def _row(name: str) -> tuple[int, str, str]:
+    """Place, label and unit of a quantity in `ROWS`."""
+    return next(
+        (place, re.sub(pattern, text, name), unit)
+        for place, (pattern, (text, unit)) in enumerate(ROWS.items())
+        if re.fullmatch(pattern, name)
+    )
 
 
 def _cells(told: dict[str, Any], name: str, unit: str) -> list[str]:

@@ -19,6 +19,7 @@ from cpunet.html_pages import asset, figure_html, joined, part, rendered
 from cpunet.plotting import NO_NOISE, colours, label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.settings import flat
 from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
@@ -265,7 +266,7 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
 
 def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
     """Return a table of names and values; nested names are joined: ``data: saturated``."""
-    rows = [[name, number(value)] for name, value in _flat(values)]
+    rows = [[name, number(value)] for name, value in flat(values, ": ")]
     return _table(list(head), rows) if rows else part("p", "None recorded.")
 
 
@@ -291,14 +292,6 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
         rows.append([title, "Ceiling", ceiling, moved, apart])
     head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS"]
     return _table(head, rows, words={0, 1})
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for name, value in values.items():
-        nested = isinstance(value, Mapping)
-        rows += _flat(value, f"{prefix}{name}: ") if nested else [(f"{prefix}{name}", value)]
-    return rows
 
 
 def _sigma(value: float | None) -> str:
