@@ -375,6 +375,5 @@ def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
 
         found = match(job.sim, job.data, job.recipe, job.seed, listen, known, job.continuum)
     found.log()
-    seconds = time.perf_counter() - clock
-    began = started.isoformat(timespec="seconds")
-    return job.run(found.model, found.recipe, began, seconds, fit=found.info)
+    took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
+    return job.run(found.model, found.recipe, began, took, fit=found.info)

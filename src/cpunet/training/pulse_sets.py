@@ -171,6 +171,7 @@ def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
     return np.asarray(weights / max(weights.mean(), 1e-9))
 
 
+@dataclass(eq=False)
 class PulseSets:
     """Both sides in bands of energy, and representative subsets of them.
 
@@ -195,20 +196,18 @@ class PulseSets:
         If there are too few pulses, or an energy is not known.
     """
 
-    def __init__(
-        self,
-        sim: Pulses,
-        data: Pulses,
-        noise: BaselineNoise,
-        recipe: Recipe,
-        rng: np.random.Generator,
-        tails: DrawnTails | None = None,
-        continuum: Continuum | None = None,
-    ) -> None:
-        self.sim, self.data, self.noise, self.recipe, self.rng = sim, data, noise, recipe, rng
-        self.tails, self.continuum = tails, continuum
-        require_energies(sim.energy_kev)
-        parted = energy_bands(sim.energy_kev, data.energy_kev, recipe.peaks)
+    sim: Pulses
+    data: Pulses
+    noise: BaselineNoise
+    recipe: Recipe
+    rng: np.random.Generator
+    tails: DrawnTails | None = None
+    continuum: Continuum | None = None
+
+    def __post_init__(self) -> None:
+        sim_kev, data_kev, rng = self.sim.energy_kev, self.data.energy_kev, self.rng
+        require_energies(sim_kev)
+        parted = energy_bands(sim_kev, data_kev, self.recipe.peaks)
         # in random order, so that any first part is representative
         self.parted = [
             (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))

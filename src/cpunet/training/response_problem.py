@@ -226,16 +226,6 @@ class ResponseProblem:
         return float(np.mean([band.moments.slope for band in self.bands]))
 
     @property
-    def pairs(self) -> float:
-        """Number of pulses that errors refer to, in all bands."""
-        return sum(band.pairs for band in self.bands)
-
-    @property
-    def left_out(self) -> int:
-        """Number of measured pulses that are excluded."""
-        return sum(band.moments.left_out for band in self.bands)
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Names of the moments, with their band if there are several."""
         several = len(self.bands) > 1

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.pulses.channels import ALL, Outcome, each_channel, paired
-from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 
 if TYPE_CHECKING:
     from cpunet.recipes.schema import Recipe
@@ -102,23 +102,19 @@ def train(
     sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
 
     training = Training(chosen, peak, init, seed, device, resume, force)
+    trained: Run | Outcome[Run]
+    of_all: list[str] = []
     if sides[1].table != ALL:
         start = None if init is None else as_run(init)
-        run = training.run(sides, target, start, go_on=resume)
-        _tell_next(*sides, target)
-        return run
-    if target is None:
+        trained = training.run(sides, target, start, go_on=resume)
+    elif target is None:
         raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
-    trained = each_channel(paired(*sides), target, training.of_channel)
-    _tell_next(*sides, target)
-    return Outcome({name: Run.load(run) for name, run in trained.done.items()}, trained.failed)
-
-
-def _tell_next(sim: PulseFile, data: PulseFile, out: Path | None) -> None:
-    """Say how to validate runs of files."""
-    if out is None or sim.pulses is not None or data.pulses is not None:
-        return
-    words = ["cpunet", "validate", out, "--sim", sim.path, "--data", data.path, "--out"]
-    of_all = ["--data-table", ALL] if data.table == ALL else []
-    report = out.with_name(f"{out.name}-report")
-    log.info(f"next: {shlex.join(map(str, [*words, report, *of_all]))}")
+    else:
+        found = each_channel(paired(*sides), target, training.of_channel)
+        runs = {name: Run.load(run) for name, run in found.done.items()}
+        trained, of_all = Outcome(runs, found.failed), ["--data-table", ALL]
+    if target is not None and all(side.pulses is None for side in sides):
+        report = target.with_name(f"{target.name}-report")
+        words = ["cpunet", "validate", target, "--sim", sides[0].path, "--data", sides[1].path]
+        log.info(f"next: {shlex.join(map(str, [*words, '--out', report, *of_all]))}")
+    return trained
