@@ -246,7 +246,3 @@ class GruDiscriminator(nn.Module):
             return (x - low) / (high - low)
         least, most = x.amin(dim=1, keepdim=True), x.amax(dim=1, keepdim=True)
         return (x - least) / (most - least).clamp(min=torch.finfo(x.dtype).eps)
-
-    def fix_statistics(self) -> None:
-        """Use the running statistics until the next ``train()``."""
-        self.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation

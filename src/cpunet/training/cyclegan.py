@@ -284,7 +284,7 @@ class Step:
         self.noise = self.config.instance_noise * self._falling(iteration)
         for judge in model.judges().values():  # they are fixed here
             judge.requires_grad_(False)
-            judge.fix_statistics()
+            judge.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
         losses, fakes = self.generator_losses(sim, data, rows)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
