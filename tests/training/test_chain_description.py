@@ -191,6 +191,7 @@ def test_seeds_that_agree_by_their_data_are_not_far_from_the_truth(tmp_path):
     )
     assert sigma["noise_rms_kev"] == pytest.approx(0.03 / (1.98 * 0.0201), rel=0.1)
     assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)  # of the fit, not of the seeds
+    assert not {"slow_share", "decay_us"} & sigma.keys()  # parts are degenerate
     assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}
     # one run and two of the same data say the same
     alone = response(*runs[:1], truth=electronics(bandwidth_poles_ns=[49])).content["truth"]

@@ -66,6 +66,9 @@ ROWS = {
     r"noise_corner_mhz": ("noise corner", "MHz"),
     r"chi_square_per_moment": ("chi-square per moment", ""),
 }
+# The division of a chain into parts is degenerate, and times of slow parts and decays are fixed:
+# a true part between two of them is split, which the errors do not contain.
+PARTS = re.compile(r"slow_|missing_|overshoot|decay_|fast_decay_|droop_")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,7 +84,7 @@ class Response:
         ``difference`` of the run or of the mean of the runs from it, and ``sigma``, the
         difference divided by the error or the spread, whichever is larger.  A quantity
         without an error has no sigma: the runs share their data, so their spread shows how
-        well they agree, not how accurate they are.
+        well they agree, not how accurate they are.  Nor has one of `PARTS` of the chain.
     runs
         The chains of the runs.
     truth
@@ -236,7 +239,7 @@ def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
     sigma = {}
     for name, apart in difference.items():
         errors = [run["errors"][name] for run in runs if name in run["errors"]]
-        if len(errors) == len(runs) and any(errors):
+        if len(errors) == len(runs) and any(errors) and not PARTS.match(name):
             sigma[name] = apart / max(spread.get(name, 0.0), float(np.mean(errors)))
     return {"values": values, "difference": difference, "sigma": sigma}
 
