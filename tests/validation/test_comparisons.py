@@ -14,12 +14,16 @@ from hypothesis.extra.numpy import arrays
 
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes import load_recipe
-from cpunet.validation import distances
-from cpunet.validation.comparisons import ceiling, compare, histogram, iou, iou_error
-from cpunet.validation.distances import (
+from cpunet.validation import comparisons
+from cpunet.validation.comparisons import (
     Draws,
     Resampled,
+    ceiling,
+    compare,
     distance_errors,
+    histogram,
+    iou,
+    iou_error,
     kolmogorov_smirnov,
     null_distances,
     resampled_quantiles,
@@ -163,7 +167,7 @@ def test_errors_of_distances_are_the_scatter_of_fresh_samples():
 
 def on_grid(values: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Histogram of finite values as one draw."""
-    bins = distances._bins(values, upper)
+    bins = comparisons._bins(values, upper)
     return np.bincount(bins, minlength=len(upper)).astype(np.float32)[:, np.newaxis]
 
 
@@ -176,11 +180,11 @@ def test_distances_on_the_grid_against_scipy(shape, shift):
     a[:2], b[0] = (1e5, -1e4), 3e5
     null = null_distances(SHAPES[shape](rng, 4000), resampled_twice(4000, 4000, 5000, 20, 0))
     drawn = [np.random.default_rng(i).choice(v, len(v)) for i, v in enumerate((a, b))]
-    upper, positions = distances._grid(np.concatenate([a, b]), distances.NODES)
-    assert len(upper) <= distances.NODES
+    upper, positions = comparisons._grid(np.concatenate([a, b]), comparisons.NODES)
+    assert len(upper) <= comparisons.NODES
     counts = [on_grid(v, upper) for v in drawn]
     assert [c.sum() for c in counts] == [4000, 5000]
-    w1, ks = distances._distances(counts[0], counts[1], positions)
+    w1, ks = comparisons._distances(counts[0], counts[1], positions)
     exact = scipy.stats.wasserstein_distance(*drawn)
     assert w1 == pytest.approx(exact, abs=0.05 * null.wasserstein)
     assert ks == pytest.approx(scipy.stats.ks_2samp(*drawn).statistic, abs=0.004)
@@ -192,8 +196,8 @@ def test_distances_of_few_values_on_the_grid_are_exact(a, b):
     a, b = a[np.isfinite(a)], b[np.isfinite(b)]
     if not (a.size and b.size):
         return
-    upper, positions = distances._grid(np.concatenate([a, b]), distances.NODES)
-    w1, ks = distances._distances(on_grid(a, upper), on_grid(b, upper), positions)
+    upper, positions = comparisons._grid(np.concatenate([a, b]), comparisons.NODES)
+    w1, ks = comparisons._distances(on_grid(a, upper), on_grid(b, upper), positions)
     assert w1 == pytest.approx(scipy.stats.wasserstein_distance(a, b), rel=1e-9, abs=1e-9)
     assert ks == pytest.approx(kolmogorov_smirnov(a, b), abs=1e-9)
     if a.size > 1 and b.size > 1:  # of single values SciPy's p-value divides by zero
@@ -270,12 +274,12 @@ def test_compare_without_usable_data_gives_none(values):
 
 
 DRAWS = 400
-WAYS = {"events": distances.MAX_EVENTS, "bins": 0}  # what is drawn
+WAYS = {"events": comparisons.MAX_EVENTS, "bins": 0}  # what is drawn
 
 
 @pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
 def either_way(request, monkeypatch):
-    monkeypatch.setattr(distances, "MAX_EVENTS", request.param)
+    monkeypatch.setattr(comparisons, "MAX_EVENTS", request.param)
 
 
 @pytest.mark.parametrize("size", [2, 50])

@@ -39,7 +39,7 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.validation.distances import resampled_quantiles
+from cpunet.validation.comparisons import resampled_quantiles
 
 Values = npt.NDArray[np.float64]
 Range = tuple[float, float]

@@ -1,14 +1,25 @@
-"""Overlap of two distributions of a parameter, and the highest overlap to expect.
+"""Overlap and distances of two distributions of a parameter, and their values by chance.
 
 The intersection over union (IoU) of two finite samples of the *same* distribution is
 less than 100 %.  Each score therefore comes with its ceiling: the IoU of the measured
 data with itself, resampled at the sizes of both datasets.
+
+The Wasserstein-1 (W1) and Kolmogorov–Smirnov (KS) distances of two finite samples of the
+*same* distribution are not zero.  Each therefore comes with its null: the distance of two
+samples drawn from the data themselves.
+
+Distances between the datasets are exact.  Those of their bootstraps are computed together
+on a common grid, the quantiles of the pooled values, with each of the outermost values in
+a bin of its own.  The events of a bin are placed at its mean.  With 256 bins and thousands of
+events, W1 is accurate to a twentieth of its null and KS to 0.004.  Datasets with fewer values
+than bins are treated exactly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypedDict
+from dataclasses import dataclass, field
+from typing import NamedTuple, Self, TypedDict
 
 import hist
 import numpy as np
@@ -16,18 +27,327 @@ import numpy.typing as npt
 
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes.schema import ScoreConfig
-from cpunet.validation.distances import (
-    Bins,
-    Draws,
-    Resampled,
-    distance_errors,
-    kolmogorov_smirnov,
-    null_distances,
-    resampled_twice,
-    wasserstein,
-)
 
 Values = npt.NDArray[np.float64]
+
+NODES = 256  # bins for bootstrapped errors; a finer grid gives the same spread
+# The mean of a null is compared with exact values, and on a grid the KS distance is too
+# small: by about 4 % with 256 bins, by 1 % with this number.
+NULL_NODES = 4096
+Counts = npt.NDArray[np.float32]
+Bins = npt.NDArray[np.integer]
+Draws = tuple["Resampled", "Resampled"]  # of the two datasets that are compared
+
+# Above this number of events, bin counts are drawn directly, in a time independent of the
+# number of events; below it, sums over drawn events are up to ten times faster.
+MAX_EVENTS = 16_384
+
+
+@dataclass(frozen=True, eq=False)
+class Resampled:
+    """Bootstrap samples of a dataset.
+
+    Parameters
+    ----------
+    events, size
+        Number of events of the dataset, and of each sample.
+    draws
+        Number of samples.
+    rng
+        Random generator of bin counts that are drawn later.
+    weights
+        Multiplicity of each event in each sample, shape ``(events, draws)``; None for a large
+        dataset, whose bin counts are drawn anew each time.
+    """
+
+    events: int
+    size: int
+    draws: int
+    rng: np.random.Generator = field(repr=False)
+    weights: Counts | None = field(repr=False)
+
+    @classmethod
+    def of(cls, events: int, size: int, draws: int, rng: np.random.Generator) -> Self:
+        """Draw `size` of `events` events with replacement, `draws` times."""
+        weights = None
+        if 0 < max(events, size) <= MAX_EVENTS and events:
+            drawn = rng.integers(events, size=(size, draws), dtype=np.int32)
+            drawn *= draws
+            drawn += np.arange(draws, dtype=np.int32)
+            counts = np.bincount(drawn.ravel(), minlength=events * draws)
+            weights = counts.astype(np.float32).reshape(events, draws)
+        return cls(events, size, draws, rng, weights)
+
+    def counts(self, bins: Bins, n_bins: int) -> Counts:
+        """Histograms of the samples.
+
+        Parameters
+        ----------
+        bins
+            Bin of each event; events beyond the last bin are not counted.
+        n_bins
+            Number of bins.
+
+        Returns
+        -------
+        numpy.ndarray
+            Counts, float32, shape ``(n_bins, draws)``; all 0 if the dataset is empty.
+        """
+        from scipy.sparse import csc_array
+
+        if not self.events:
+            return np.zeros((n_bins, self.draws), np.float32)
+        if self.weights is None:
+            shares = np.bincount(bins, minlength=n_bins + 1) / self.events
+            drawn = self.rng.multinomial(self.size, shares, size=self.draws)
+            return np.ascontiguousarray(drawn[:, :n_bins].T, np.float32)
+        ones = np.ones(self.events, np.float32)
+        one_bin_each = (ones, bins.astype(np.int32), np.arange(self.events + 1, dtype=np.int32))
+        summed = csc_array(one_bin_each, shape=(n_bins + 1, self.events)) @ self.weights
+        return np.asarray(summed[:n_bins])
+
+
+def resampled_twice(
+    events: int, n_sim: int, n_data: int, draws: int, seed: int | np.random.Generator
+) -> Draws:
+    """Pairs of bootstraps of one dataset, of the simulated and of the measured size.
+
+    Parameters
+    ----------
+    events
+        Number of events of the dataset.
+    n_sim, n_data
+        Numbers of events of the two samples of a pair.
+    draws
+        Number of pairs.
+    seed
+        Seed or random generator.
+    """
+    rng = np.random.default_rng(seed)
+    return Resampled.of(events, n_sim, draws, rng), Resampled.of(events, n_data, draws, rng)
+
+
+def resampled_quantiles(
+    values: npt.NDArray[np.float64], quantile: float, draws: int, rng: np.random.Generator
+) -> npt.NDArray[np.float64]:
+    r"""Quantiles (NumPy's ``"weibull"``) of bootstrap samples, without drawing the samples.
+
+    The k-th smallest of n uniform numbers follows :math:`\mathrm{Beta}(k, n + 1 - k)`.  The
+    k-th smallest value of a bootstrap sample is the data value at that rank.  The next
+    order statistic follows from another beta variate.
+
+    Parameters
+    ----------
+    values
+        Data, shape ``(n,)``.
+    quantile
+        Quantile, 0 … 1.
+    draws
+        Number of bootstrap samples.
+    rng
+        Random generator.
+    """
+    ordered, n = np.sort(values), len(values)
+    rank = quantile * (n + 1)  # counted from 1; usually between two values
+    below = int(np.clip(np.floor(rank), 1, n))
+    first = rng.beta(below, n + 1 - below, draws)
+    lower = ordered[np.minimum((n * first).astype(int), n - 1)]
+    if below == n or rank <= below:
+        return np.asarray(lower)
+    second = first + (1 - first) * rng.beta(1, n - below, draws)
+    upper = ordered[np.minimum((n * second).astype(int), n - 1)]
+    return np.asarray(lower + (rank - below) * (upper - lower))
+
+
+class NullDistances(NamedTuple):
+    """Distances of two samples of one distribution: mean and standard deviation."""
+
+    wasserstein: float
+    wasserstein_std: float
+    ks: float
+    ks_std: float
+
+
+def wasserstein(a: Values, b: Values) -> float:
+    r"""Wasserstein-1 distance of the finite values, in the unit of the parameter.
+
+    .. math:: W_1 = \int |F_a(x) - F_b(x)| \, dx
+
+    with the cumulative distributions :math:`F`.
+
+    Parameters
+    ----------
+    a, b
+        Values of one parameter in both datasets.
+
+    Returns
+    -------
+    float
+        Distance; NaN if a dataset has no finite values.
+
+    Examples
+    --------
+    The distance between shifted copies is the shift:
+
+    >>> import numpy as np
+    >>> values = np.array([0.0, 1.0, 5.0])
+    >>> wasserstein(values, values + 2)
+    2.0
+    """
+    from scipy.stats import wasserstein_distance
+
+    a, b = _finite(a), _finite(b)
+    return float(wasserstein_distance(a, b)) if a.size and b.size else float("nan")
+
+
+def kolmogorov_smirnov(a: Values, b: Values) -> float:
+    r"""Kolmogorov–Smirnov distance of the finite values, 0 … 1.
+
+    .. math:: D = \max_x |F_a(x) - F_b(x)|
+
+    with the cumulative distributions :math:`F`.
+
+    Parameters
+    ----------
+    a, b
+        Values of one parameter in both datasets.
+
+    Returns
+    -------
+    float
+        Distance; NaN if a dataset has no finite values.
+
+    Examples
+    --------
+    Half of the first values are below all of the second:
+
+    >>> import numpy as np
+    >>> kolmogorov_smirnov(np.arange(4.0), np.arange(4.0) + 2)
+    0.5
+    """
+    a, b = np.sort(_finite(a)), np.sort(_finite(b))
+    if not (a.size and b.size):
+        return float("nan")
+    steps = np.concatenate([a, b])
+    below = [np.searchsorted(one, steps, side="right") / one.size for one in (a, b)]
+    return float(np.abs(below[0] - below[1]).max())
+
+
+def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:
+    """Standard deviations of W1 and KS under resampling of both datasets.
+
+    Well above the null they agree with the scatter of independent samples within a tenth.
+    Near the null they are a fifth too large, since a bootstrap adds its own scatter; there
+    `null_distances` gives the scale.
+
+    Parameters
+    ----------
+    a, b
+        Values of both datasets; non-finite ones are resampled but ignored.
+    draws
+        Bootstraps of both, each of its own size.
+
+    Returns
+    -------
+    tuple of float
+        Errors of W1 (in the parameter's unit) and of the KS distance; NaN if a dataset has
+        no finite values.
+    """
+    finite = np.concatenate([_finite(a), _finite(b)])
+    if not (np.isfinite(a).any() and np.isfinite(b).any()):
+        return float("nan"), float("nan")
+    upper, positions = _grid(finite, NODES)
+    drawn = [d.counts(_bins(v, upper), len(upper)) for v, d in zip((a, b), draws, strict=True)]
+    w1, ks = _distances(drawn[0], drawn[1], positions)
+    return float(w1.std()), float(ks.std())
+
+
+def null_distances(data: Values, draws: Draws) -> NullDistances:
+    r"""W1 and KS of the data with themselves: the distances of a perfect translation.
+
+    .. math:: \langle d(D^*_{\mathrm{sim}}, D^*_{\mathrm{data}}) \rangle, \qquad
+        d = W_1 \text{ or } D
+
+    In each draw, two samples :math:`D^*` are drawn from the data with replacement, one of
+    the size of the simulated dataset and one of the size of the measured one.  Both
+    distances scatter with an upward tail: 4 … 7 % of the draws are more than two standard
+    deviations above the mean.
+
+    Parameters
+    ----------
+    data
+        Measured values; non-finite ones are drawn but ignored.
+    draws
+        Bootstraps of the data, see `resampled_twice`.
+
+    Returns
+    -------
+    NullDistances
+        NaN if the data have no finite values or a dataset is empty.
+
+    Examples
+    --------
+    Equal values have no distance:
+
+    >>> import numpy as np
+    >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
+    >>> null_distances(np.ones(50), draws).wasserstein
+    0.0
+    """
+    finite = _finite(data)
+    if not (finite.size and all(d.size for d in draws)):
+        return NullDistances(*[float("nan")] * 4)
+    upper, positions = _grid(finite, NULL_NODES)
+    bins = _bins(data, upper)
+    sim, measured = (d.counts(bins, len(upper)) for d in draws)
+    w1, ks = _distances(sim, measured, positions)
+    return NullDistances(*(float(x) for x in (w1.mean(), w1.std(), ks.mean(), ks.std())))
+
+
+def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
+    """Upper edges of bins that contain every value, and the mean of the values in each.
+
+    The outermost values have bins of their own: a few outliers can dominate W1.
+    """
+    pooled = np.sort(pooled)
+    n, tail = len(pooled), nodes // 8
+    if n > nodes:
+        bulk = np.linspace(tail, n - 1 - tail, nodes - 2 * tail).round().astype(int)
+        pooled_upper = pooled[np.r_[0:tail, bulk, n - tail : n]]
+    else:
+        pooled_upper = pooled
+    upper = np.unique(pooled_upper)
+    first = np.searchsorted(pooled, upper[:-1], side="right")
+    starts = np.r_[0, first]
+    return upper, np.add.reduceat(pooled, starts) / np.diff(np.r_[starts, n])
+
+
+def _bins(values: Values, upper: Values) -> npt.NDArray[np.intp]:
+    """Bin of each value; non-finite values get the number after the last bin."""
+    return np.where(np.isfinite(values), np.searchsorted(upper, values), len(upper))
+
+
+def _distances(
+    a: npt.NDArray[np.float32], b: npt.NDArray[np.float32], positions: Values
+) -> tuple[Values, Values]:
+    """W1 and KS of histograms along the first axis, with their events at `positions`.
+
+    Draws in which a histogram is empty are left out.
+    """
+    # float32 represents whole numbers and their sums exactly below 2^24
+    below = [np.cumsum(h, axis=0) for h in (a, b)]
+    drawn = (below[0][-1] > 0) & (below[1][-1] > 0)
+    if not drawn.any():
+        return np.full(1, np.nan), np.full(1, np.nan)
+    one, other = (c[:, drawn] / c[-1, drawn].astype(float) for c in below)
+    apart = np.abs(np.subtract(one, other, out=one), out=one)
+    return np.diff(positions) @ apart[:-1], apart.max(axis=0)
+
+
+def _finite(values: Values) -> Values:
+    return values[np.isfinite(values)]
+
+
 ByMethod = dict[str, float | None]
 
 
@@ -116,7 +436,7 @@ def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float,
     axis
         Common binning, see `data_axis`.
     draws
-        Bootstraps of the data, see `cpunet.validation.distances.resampled_twice`.
+        Bootstraps of the data, see `resampled_twice`.
 
     Returns
     -------
@@ -128,12 +448,11 @@ def ceiling(data: Values, axis: hist.axis.Regular, draws: Draws) -> tuple[float,
     With all data in one bin nothing scatters:
 
     >>> import numpy as np
-    >>> from cpunet.validation.distances import resampled_twice
     >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
     >>> ceiling(np.full(50, 0.5), hist.axis.Regular(2, 0, 2), draws)
     (100.0, 0.0)
     """
-    bins, n_bins = _bins(data, axis)
+    bins, n_bins = _axis_bins(data, axis)
     scores = _overlap(*(of_set.counts(bins, n_bins) for of_set in draws))
     return float(scores.mean()), float(scores.std())
 
@@ -152,11 +471,11 @@ def iou_error(a: Values, b: Values, axis: hist.axis.Regular, draws: Draws) -> fl
     draws
         Bootstraps of both, each of its own size.
     """
-    drawn = (d.counts(*_bins(v, axis)) for v, d in zip((a, b), draws, strict=True))
+    drawn = (d.counts(*_axis_bins(v, axis)) for v, d in zip((a, b), draws, strict=True))
     return float(_overlap(*drawn).std())
 
 
-def _bins(values: Values, axis: hist.axis.Regular) -> tuple[Bins, int]:
+def _axis_bins(values: Values, axis: hist.axis.Regular) -> tuple[Bins, int]:
     """Bin of each value in `histogram`, and the number of bins."""
     places = np.asarray(axis.index(values)) + 1  # type: ignore[arg-type]  # arrays, too
     return np.where(np.isnan(values), axis.size + 2, places), axis.size + 3

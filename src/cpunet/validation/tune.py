@@ -40,7 +40,7 @@ from cpunet.training.run import Run, resolve_device
 from cpunet.translation.forms import drawn_kev, wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
-from cpunet.validation.distances import null_distances, resampled_twice, wasserstein
+from cpunet.validation.comparisons import null_distances, resampled_twice, wasserstein
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
