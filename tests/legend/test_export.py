@@ -13,10 +13,20 @@ import yaml
 
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
-from cpunet.legend.equivalent import ae_ratios, current_delay_ns, equivalent_kernel, kernel_step
-from cpunet.legend.export import export_legend
-from cpunet.legend.lithium import LithiumLayer, arrived, delayed, lithium_table
-from cpunet.legend.make_library import make_library
+from cpunet.legend.export import (
+    ae_ratios,
+    current_delay_ns,
+    equivalent_kernel,
+    export_legend,
+    kernel_step,
+)
+from cpunet.legend.make_library import (
+    LithiumLayer,
+    arrived,
+    delayed,
+    lithium_table,
+    make_library,
+)
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import write_chain
