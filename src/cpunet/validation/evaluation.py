@@ -42,7 +42,7 @@ from cpunet.validation.peaks import (
     score_peak,
 )
 from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
-from cpunet.validation.verdicts import summaries, verdict_table
+from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 # numbers of the noise that are shown beside each other; its spectrum is with the scores
@@ -223,7 +223,7 @@ def evaluate(
         },
     }
     metrics["verdicts"] = {
-        "summary": [words["ren"] for words in summaries(metrics).values() if "ren" in words],
+        "summary": [summary(metrics, name, "ren") for name in details],
         "table": verdict_table(metrics),
     }
     return Evaluation(ren, iren, run, sim_set, data_set, sets, values, details, metrics)

@@ -7,7 +7,7 @@ blocks all requests.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from cpunet.html_pages import asset, figure_html, joined, part, rendered
 from cpunet.plotting import NO_NOISE, colours, label
+from cpunet.progress import stage
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
 from cpunet.settings import flat
@@ -43,7 +44,7 @@ PLACES = {
 def write_page(
     folder: Path,
     metrics: Mapping[str, Any],
-    figures: Mapping[str, Figure],
+    figures: Mapping[str, Callable[[], Figure]],
     notes: Sequence[str],
 ) -> None:
     """Write an SVG per figure and ``report.html`` into a folder.
@@ -55,14 +56,16 @@ def write_page(
     metrics
         Content of ``metrics.json``.
     figures
-        Figures by name; the names become file names and captions.
+        Functions that draw a figure, by name; the names become file names and captions.
     notes
         Paragraphs of plain text for the top of the page.
     """
     drawn = {}
-    for name, figure in figures.items():
-        stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
-        drawn[name] = figure_html(name.replace("_", " "), figure, folder / f"{stem}.svg")
+    with stage("Drawing", len(figures)) as bar:
+        for name, draw in figures.items():
+            stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
+            drawn[name] = figure_html(name.replace("_", " "), draw(), folder / f"{stem}.svg")
+            bar.update(1)
     ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))

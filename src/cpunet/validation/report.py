@@ -5,9 +5,8 @@ from __future__ import annotations
 import gc
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
@@ -16,7 +15,6 @@ import numpy as np
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.progress import Stage, stage
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.settings import plain, read_json
 from cpunet.tables import text_table
@@ -34,16 +32,9 @@ REPORT = FolderKind(
     own=r"metrics\.json|report\.html|parameters\.npz",
 )
 # methods of the printed table, in the order of the page; those without noise are in the metrics
-_METHODS = {
-    "raw": "raw",
-    "rc": "rc",
-    "gauss_exp": "gauss_exp",
-    "superpulse": "superpulse",
-    "ren": "REN",
-    "truth": "truth",
-    "ceiling": "ceiling",
-}
+_METHODS = ("raw", "rc", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
 _NAMES = {
+    "ren": "REN",
     "current_amplitude": "I_max",
     "drift_time": "T_drift",
     "tail_slope": "tail slope",
@@ -235,13 +226,17 @@ class Report:
             if name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
-        with stage("Drawing", len(self.drawn)) as bar, _few_collections():
-            figures = {name: partial(_drawn, one, bar) for name, one in self.drawn.items()}
-            write_page(folder, metrics, _Figures(figures), self.notes)
+        before = gc.get_threshold()
+        # garbage is collected rarely: each time, all that is loaded is looked through as well
+        gc.set_threshold(100_000, 20, 100)
+        try:
+            write_page(folder, metrics, self.drawn, self.notes)
+        finally:
+            gc.set_threshold(*before)
 
     def __str__(self) -> str:
         head, rows = self._table(_METHODS)
-        names = [_METHODS.get(name, name) for name in head]
+        names = [_NAMES.get(name, name) for name in head]
         rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
         lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
         for peak, scores in self.metrics["peaks"].items():
@@ -311,21 +306,3 @@ class _Figures(Mapping[str, "Figure"]):
 
     def __len__(self) -> int:
         return len(self._drawn)
-
-
-@contextmanager
-def _few_collections() -> Iterator[None]:
-    """Collect garbage rarely: each time, all that is loaded is looked through as well."""
-    before = gc.get_threshold()
-    gc.set_threshold(100_000, 20, 100)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-
-
-def _drawn(drawing: Callable[[], Figure], bar: Stage) -> Figure:
-    """Draw a figure and report progress."""
-    figure = drawing()
-    bar.update(1)
-    return figure

@@ -29,20 +29,28 @@ class Cell:
 
     Attributes
     ----------
-    text
-        Score as displayed, with error and ceiling.
-    value
-        Score; None where there is none.
     digits
         Format of the score.
+    value
+        Score; None where there is none.
+    appended
+        Text that follows it.
     """
 
-    text: str = NO_VALUE
+    digits: str = ""
     value: float | None = None
     error: float | None = None
     expected: float | None = None
     expected_std: float | None = None
-    digits: str = ""
+    appended: str = field(default="", kw_only=True)
+
+    @property
+    def text(self) -> str:
+        """Score as displayed."""
+        if self.value is None:
+            return NO_VALUE
+        error = "" if self.error is None else f" ± {self.error:{self.digits.lstrip('+')}}"
+        return f"{self.value:{self.digits}}{error}{self.appended}"
 
 
 @dataclass(frozen=True)
@@ -320,11 +328,10 @@ def _over(cells: Sequence[Cell]) -> Cell:
         return Cell()
     values, digits = np.array([cell.value for cell in known], float), known[0].digits
     median, spread = float(np.median(values)), float(np.std(values, ddof=1))
-    text = f"{median:{digits}} ± {spread:{digits.lstrip('+')}}"
-    text += f" ({values.min():{digits}} – {values.max():{digits}})"
+    appended = f" ({values.min():{digits}} – {values.max():{digits}})"
     if missing := len(cells) - len(known):
-        text += f", {missing} missing"
-    return Cell(text, median, spread, digits=digits)
+        appended += f", {missing} missing"
+    return Cell(digits, median, spread, appended=appended)
 
 
 def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
@@ -337,18 +344,19 @@ def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
             value, ceiling = (number(one, "iou", key) for key in (method, "ceiling"))
             error, spread = (number(one, "iou_std", key) for key in (method, "ceiling"))
             appended = f" ({ceiling:.1f})" if ceiling is not None else ""
-            cells.append(_cell(".1f", value, error, ceiling, spread, appended=appended))
+            cells.append(Cell(".1f", value, error, ceiling, spread, appended=appended))
         title = f"{name.replace('_', ' ')}: IoU [%]{CEILING}"
         rows.append(_row(peak, title, cells, lambda c: -(c.value or 0.0)))
     cells = [
-        _cell(".3f", *(number(s, "two_sample", method, key) for key in AUC)) for s in scores
+        Cell(".3f", *(number(s, "two_sample", method, key) for key in AUC)) for s in scores
     ]
     rows.append(_row(peak, "classifier: AUC", cells, _off))
-    cells = [_cell("#.3g", number(s, "paired", method, "edge_rmse"), scale=1e3) for s in scores]
+    edges = (number(s, "paired", method, "edge_rmse") for s in scores)
+    cells = [Cell("#.3g", None if edge is None else 1e3 * edge) for edge in edges]
     rows.append(_row(peak, "edge RMSE [10⁻³]", cells, _off))
     survival = [part(metrics, "ae_survival", peak) for metrics in runs]
     cells = [
-        _cell("+.2f", number(s, "difference", method), number(s, "difference_std", method), 0.0)
+        Cell("+.2f", number(s, "difference", method), number(s, "difference_std", method), 0.0)
         for s in survival
     ]
     rows.append(_row(peak, "A/E survival minus data [points]", cells, _off))
@@ -364,24 +372,6 @@ def _row(peak: str, score: str, cells: Sequence[Cell], badness: Callable[[Cell],
 
 def _off(cell: Cell) -> float:
     return abs((cell.value or 0.0) - (cell.expected or 0.0))
-
-
-def _cell(
-    digits: str,
-    value: float | None,
-    error: float | None = None,
-    expected: float | None = None,
-    expected_std: float | None = None,
-    *,
-    appended: str = "",
-    scale: float = 1.0,
-) -> Cell:
-    if value is None:
-        return Cell()
-    value *= scale
-    of_error = f" ± {error:{digits.lstrip('+')}}" if error is not None else ""
-    text = f"{value:{digits}}{of_error}{appended}"
-    return Cell(text, value, error, expected, expected_std, digits)
 
 
 def _notes(runs: Mapping[str, Metrics]) -> list[str]:

@@ -218,14 +218,6 @@ def verdict_table(metrics: Mapping[str, Any]) -> dict[str, dict[str, dict[str, W
     }
 
 
-def summaries(metrics: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """Summary line by peak and method, see `summary`."""
-    return {
-        peak: {m: summary(metrics, peak, m) for m in methods_of(metrics, peak)}
-        for peak in part(metrics, "peaks")
-    }
-
-
 def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
     """Return one line with the quantities that agree with the data and those that are off.
 
