@@ -38,10 +38,9 @@ from cpunet.plotting import (
     stacked,
     styled,
 )
-from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.validation.comparisons import resampled_quantiles
 
-Values = npt.NDArray[np.float64]
 Range = tuple[float, float]
 ByPeak = Mapping[str, Mapping[str, Values]]
 

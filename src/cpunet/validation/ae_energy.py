@@ -12,15 +12,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.optimize
 from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
 from cpunet.plotting import GROUP, colours, group, label, stacked, styled
+from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP
 
-Values = npt.NDArray[np.float64]
 Range = tuple[float, float]
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0

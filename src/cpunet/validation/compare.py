@@ -21,8 +21,6 @@ from cpunet.validation.side_by_side import (
     side_by_side,
 )
 
-REPORT = "report"  # folder of a demonstration that contains the metrics
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
@@ -147,18 +145,23 @@ def compared(
     failed
         Reports to list as missing: what is in their folders is of an earlier validation.
     """
+    places: list[Path] = []
     metrics: list[Metrics | None] = []
     folders: list[Path | None] = []
     for report in reports:
         if isinstance(report, Report):
+            # one in memory is named by its run
+            places.append(report.folder or Path(report.metrics["compared"]["run"]))
             metrics.append(report.to_dict())
             folders.append(report.folder)
-        else:
-            path = Path(report)
-            file = None if path in failed else _metrics_file(path)
-            metrics.append(None if file is None else read_metrics(file))
-            folders.append(None if file is None else file.parent)
-    names = _names([_place(report) for report in reports])
+            continue
+        path = Path(report)
+        files = (path, path / METRICS, path / "report" / METRICS)  # the last one of a demo
+        file = next((f for f in files if f.is_file() and path not in failed), None)
+        places.append(path)
+        metrics.append(read_metrics(file) if file else None)
+        folders.append(file and file.parent)
+    names = _names(places)
     runs = {n: found for n, found in zip(names, metrics, strict=True) if found is not None}
     if not runs:
         raise CpunetError(
@@ -176,13 +179,6 @@ def _refuse(out: Path, reports: Sequence[Path | None], *, force: bool) -> None:
     refuse_existing(out, *reports, force=force)
 
 
-def _place(report: str | Path | Report) -> Path:
-    """Folder or file by which a report is named; one in memory has the name of its run."""
-    if not isinstance(report, Report):
-        return Path(report)
-    return report.folder or Path(report.metrics["compared"]["run"])
-
-
 def _text(table: SideBySide, title: str) -> str:
     """A row per peak and score, a column per run."""
     rows = []
@@ -192,12 +188,6 @@ def _text(table: SideBySide, title: str) -> str:
             cells = [f"{c.text}{'*' * (i in row.best)}" for i, c in enumerate(row.cells)]
             rows.append([names.pop() if names else "", row.score, *cells])
     return text_table(["peak", "score", *table.names], rows, words=2, title=title)
-
-
-def _metrics_file(report: Path) -> Path | None:
-    """Path of the metrics of a report, given as folder or file; None if it has none."""
-    places = (report, report / METRICS, report / REPORT / METRICS)
-    return next((place for place in places if place.is_file()), None)
 
 
 def _names(reports: Sequence[Path]) -> list[str]:

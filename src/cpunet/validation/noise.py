@@ -15,15 +15,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
 from cpunet.plotting import colours, group, label, logarithmic, stacked, styled
 from cpunet.pulses.container import FloatArray
-
-Values = npt.NDArray[np.float64]
+from cpunet.pulses.parameters import Values
 
 MIN_BASELINES = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2

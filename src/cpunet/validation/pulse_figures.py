@@ -31,9 +31,7 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.parameters import BLOCK, align_half_maximum
-
-Values = npt.NDArray[np.float64]
+from cpunet.pulses.parameters import BLOCK, Values, align_half_maximum
 
 BIN_KEV = 2.0  # or more, if there would be too many bins
 MAX_BINS = 2000

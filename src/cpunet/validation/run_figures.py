@@ -11,7 +11,6 @@ from typing import Any
 
 import hist
 import numpy as np
-import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -34,12 +33,10 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.validation.comparisons import Compared, histogram
 from cpunet.validation.slices import BEFORE, MeanPulse
-
-Values = npt.NDArray[np.float64]
 
 CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
 AVERAGED = 10  # records in the moving average

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from cpunet.plotting import (
@@ -35,9 +34,7 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import align_half_maximum
-
-Values = npt.NDArray[np.float64]
+from cpunet.pulses.parameters import Values, align_half_maximum
 
 BEFORE, AFTER = 100, 150  # samples of a mean pulse before and after half maximum
 SLICES = 4
