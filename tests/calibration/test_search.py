@@ -13,8 +13,13 @@ from hypothesis import strategies as st
 from cpunet.calibration import alternatives, search
 from cpunet.calibration.alternatives import NEEDED, decaying_chain, other_chain
 from cpunet.calibration.identifiability import Selection
-from cpunet.calibration.inputs import Freedom, known_depletion, require_depletion
-from cpunet.calibration.nuisances import Physics, named
+from cpunet.calibration.nuisances import (
+    Freedom,
+    Physics,
+    known_depletion,
+    named,
+    require_depletion,
+)
 from cpunet.calibration.search import Search, _relaxed
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse

@@ -25,16 +25,17 @@ from cpunet.calibration.calibrated_run import (
     SIM,
     Calibration,
     Plan,
-)
-from cpunet.calibration.figures import calibration_figures
-from cpunet.calibration.inputs import (
-    DEPLETION,
-    Freedom,
-    known_depletion,
-    require_depletion,
+    calibration_figures,
 )
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Physics, titled
+from cpunet.calibration.nuisances import (
+    DEPLETION,
+    Freedom,
+    Physics,
+    known_depletion,
+    require_depletion,
+    titled,
+)
 from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
@@ -323,7 +324,7 @@ class _Job:
             recipe=self.recipe,
             given={k: v for k, v in given.items() if k != DEPLETION},
             known=known_depletion(physics, given.get(DEPLETION)),
-            chosen=self.freedom.free is not None,
+            chosen=self.freedom.chosen,
         )
 
     def _content(self, calibrated: Calibrated) -> dict[str, Any]:
