@@ -237,7 +237,8 @@ def test_the_sizes_that_a_training_keeps_are_drawn_beside_the_law():
     kev = np.geomspace(2, 2000, 30)
     summary = {"rate_khz": 1.0, "rate_error_khz": 0.1, "decay_us": 55.0, "error_kev": 2.5}
     sizes = {"kev": kev.tolist(), "percent_above": (100 * law.share_above(kev)).tolist()}
-    axes = tails_figure(summary | {"traces": 5000}, sizes, law.energies_kev).axes[0]
+    kept = {"traces": 5000, "sizes": sizes, "drawn": {"energies_kev": law.energies_kev}}
+    axes = tails_figure(summary | kept).axes[0]
     measured, drawn = (line.get_ydata() for line in axes.lines[:2])
     np.testing.assert_allclose(measured, drawn)
     assert "1.00 ± 0.10 kHz" in axes.get_title()

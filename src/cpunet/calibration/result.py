@@ -110,22 +110,13 @@ class FreeParameter:
     prior: Mapping[str, float | str]
 
 
-@dataclass(frozen=True)
-class FixedParameter:
-    """A parameter that is as simulated; fall of chi-square, and its error, if it were free."""
-
-    value: float
-    chi_square_would_fall_by: float
-    error_if_free: float
-
-
 def described(calibrated: Calibrated) -> dict[str, Any]:
     """Content of ``calibration.json``.
 
     Returns
     -------
     dict
-        ``parameters`` (each a `FreeParameter`) and ``fixed`` (`FixedParameter`) by name;
+        ``parameters`` (each a `FreeParameter`) and ``fixed`` by name;
         ``together``: pairs of which only a combination is known, with its value and error in
         units of the priors; ``chi_square``; ``directions``; ``covariance`` of chain and
         coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
@@ -137,7 +128,7 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
     return {
         "parameters": {name: asdict(one) for name, one in free.items()},
         "together": _together(calibrated),
-        "fixed": {name: asdict(one) for name, one in _fixed(calibrated).items()},
+        "fixed": _fixed(calibrated),
         "chi_square": {
             "before": calibrated.chi_square_before,
             "after": calibrated.chi_square,
@@ -228,14 +219,15 @@ def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
     return free
 
 
-def _fixed(calibrated: Calibrated) -> dict[str, FixedParameter]:
-    """What is known of each fixed parameter, by name."""
+def _fixed(calibrated: Calibrated) -> dict[str, dict[str, float]]:
+    """Each fixed parameter by name; fall of chi-square, and its error, if it were free."""
     parameters, physics = calibrated.problem.parameters, calibrated.physics
     found = {}
     for i, fall in calibrated.promised.items():
         error = calibrated.scale * calibrated.information.errors([*parameters.free, i])[-1]
         value, own_error = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
-        found[physics.nuisances[i].name] = FixedParameter(value, fall, own_error)
+        of_free = {"chi_square_would_fall_by": fall, "error_if_free": own_error}
+        found[physics.nuisances[i].name] = {"value": value} | of_free
     return found
 
 

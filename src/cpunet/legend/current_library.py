@@ -170,10 +170,6 @@ def _read(group: h5py.Group, detector: str) -> CurrentLibrary:
     basis = group.get(_COMPONENTS)
     prefix = "waveform_" if basis is None else "coefficients_"
     arrays = {int(n.split("_")[1]): n for n in group if n.startswith(prefix)}
-    try:
-        told = json.loads(text_attribute(group, TOLD) or "{}")
-    except ValueError:
-        told = {}
     return CurrentLibrary(
         detector,
         np.asarray(group["r"][()], np.float64),
@@ -181,7 +177,7 @@ def _read(group: h5py.Group, detector: str) -> CurrentLibrary:
         group["dt"][()].item(),
         group["t0"][()].item(),
         {angle: group[n.replace(prefix, "drift_time_")][()] for angle, n in arrays.items()},
-        told if isinstance(told, dict) else {},
+        json.loads(text_attribute(group, TOLD) or "{}"),
         {angle: group[name][()] for angle, name in arrays.items()},
         None if basis is None else basis[()],
     )

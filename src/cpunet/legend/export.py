@@ -354,7 +354,13 @@ def _against_energy(
         other = [key for key in SAME if training[key] != trained[key]]
         missing = found.get("missing")
         methods = {} if missing else dict(found["methods"])
-        pars = {} if missing else _ae_pars(methods)
+        pars: dict[str, Any] = {}
+        if not missing:
+            # the mean of the translation, and the width of the data
+            mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
+            line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
+            pars["aoemeanmod"] = {"psl": {"expression": "x*a+b", "pars": line}}
+            pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CpunetError(
             f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
@@ -369,20 +375,6 @@ def _against_energy(
     return methods, pars
 
 
-def _ae_pars(methods: Mapping[str, Any]) -> dict[str, Any]:
-    """Production entries for A/E: mean of the translation and width of the data."""
-    mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
-    return {
-        "aoemeanmod": {
-            "psl": {"expression": "x*a+b", "pars": {k: mean[k] for k in ("a", "b")}}
-        },
-        "aoeresmod": {
-            "expression": "SigmaFit",
-            "parameters": {k: width[k] for k in ("a", "b", "c")},
-        },
-    }
-
-
 def _of_library(
     source: Path,
     wanted: Sequence[str],
@@ -395,7 +387,11 @@ def _of_library(
         held = chosen_libraries(file, source, wanted, known)
         library = IdealLibrary.of(file, held[0], source)
         values = file[f"{library.path}/waveform_{library.angles[0]}"]
-        charge = _some(values)
+        # of regularly spaced rows of r, a few thousand templates at most
+        step = max(1, values.shape[0] * values.shape[1] // TEMPLATES)
+        rows = [np.asarray(values[i], np.float32) for i in range(0, len(values), step)]
+    charge = np.concatenate(rows)
+    charge = charge[np.isfinite(charge).all(axis=1) & charge.any(axis=1)]
     if not len(charge):
         raise CpunetError(f"{source}: {library.path}: no template of charge")
     n = len(charge)
@@ -412,12 +408,3 @@ def _of_library(
             ("two_sites", 100 * (ae_ratios(two_sites, undecayed, nearest) / usual - 1)),
         )
     }
-
-
-def _some(values: Any) -> npt.NDArray[np.float32]:
-    """Templates of regularly spaced rows of r, a few thousand at most."""
-    n_r, n_z, _ = values.shape
-    step = max(1, n_r * n_z // TEMPLATES)
-    rows = [np.asarray(values[i], np.float32) for i in range(0, n_r, step)]
-    block = np.concatenate(rows)
-    return block[np.isfinite(block).all(axis=1) & block.any(axis=1)]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -124,9 +124,22 @@ class TranslatedLibrary:
     numbers: dict[str, Any]
 
     def __str__(self) -> str:
-        return "\n".join(
-            f"{self.path}: {name}: {_in_words(one)}" for name, one in self.numbers.items()
-        )
+        lines = []
+        for name, one in self.numbers.items():
+            healed = f", {one['healed']} of them within it" if one["healed"] else ""
+            lines.append(
+                f"{self.path}: {name}: {one['translated']} of {one['templates']} templates "
+                f"translated, {one['padded']} added about the crystal{healed}; A/E is most "
+                f"often {one['mode_per_ns']:.4g}/ns"
+            )
+            if loss := one.get("loss"):
+                lines.append(
+                    f"{one['rank']} components: samples within {loss['largest']:.1e} of the "
+                    f"most frequent A/E (RMS {loss['rms']:.1e}), A/E within "
+                    f"{loss['a_over_e_percent']:.2g} % (RMS "
+                    f"{loss['a_over_e_rms_percent']:.2g} %)"
+                )
+        return "\n".join(lines)
 
 
 def translate_library(
@@ -204,23 +217,6 @@ def translate_library(
                 job = _Writing(looked, one, rings, low_rank)
                 numbers[one.path] = job.write(given[one.path], group, made_from)
     return TranslatedLibrary(out, numbers)
-
-
-def _in_words(numbers: Mapping[str, Any]) -> str:
-    """Numbers of a library as text."""
-    healed = f", {numbers['healed']} of them within it" if numbers["healed"] else ""
-    text = (
-        f"{numbers['translated']} of {numbers['templates']} templates translated, "
-        f"{numbers['padded']} added about the crystal{healed}; A/E is most often "
-        f"{numbers['mode_per_ns']:.4g}/ns"
-    )
-    if loss := numbers.get("loss"):
-        text += (
-            f"\n{numbers['rank']} components: samples within {loss['largest']:.1e} of the "
-            f"most frequent A/E (RMS {loss['rms']:.1e}), A/E within "
-            f"{loss['a_over_e_percent']:.2g} % (RMS {loss['a_over_e_rms_percent']:.2g} %)"
-        )
-    return text
 
 
 @dataclass(eq=False)

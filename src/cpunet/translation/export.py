@@ -13,6 +13,7 @@ import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -189,16 +190,12 @@ class Graph:
     expected: Callable[[tuple[Tensor, ...]], Tensor]
 
 
-def example_windows(length: int) -> Callable[[int], Tensor]:
+def example_windows(length: int, n: int) -> Tensor:
     """Prepared pulses with edges of several widths and positions."""
-
-    def windows(n: int) -> Tensor:
-        rng = np.random.default_rng(n)
-        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
-        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
-        return torch.from_numpy(charge.astype(np.float32))
-
-    return windows
+    rng = np.random.default_rng(n)
+    width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
+    charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
+    return torch.from_numpy(charge.astype(np.float32))
 
 
 def graph_of(network: nn.Module, length: int) -> Graph:
@@ -208,7 +205,7 @@ def graph_of(network: nn.Module, length: int) -> Graph:
     for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a network,
     unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
     """
-    windows, network = example_windows(length), network.cpu()
+    windows, network = partial(example_windows, length), network.cpu()
     if isinstance(network, PositionalUNet):
         shape = (network.latent_mean.out_channels, length // 16)
 

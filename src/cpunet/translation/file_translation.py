@@ -202,7 +202,11 @@ class FileTranslation:
                 f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
                 f"{self.translator.dt_ns:g} ns; resample the pulses"
             )
-        require_side(pulses, self.kind.takes, self._remedy(pulses), insist=source.insist)
+        remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
+        found = recorded_side(pulses)
+        if found is not None and "translated" in found.why:
+            remedy = f"translate the {self.kind.takes} ones that they were made of"
+        require_side(pulses, self.kind.takes, remedy, insist=source.insist)
         return pulses
 
     def writer(self, out: Path, *, force: bool) -> PulseWriter:
@@ -225,13 +229,6 @@ class FileTranslation:
             return Windows(self.translator, tails, pile_up)
         scale = adc_scale(self.run, self.translator, adc)
         return AdcTraces(self.translator, *scale, adc, tails, pile_up)
-
-    def _remedy(self, pulses: PulseSource) -> str:
-        """Advice for pulses of the other side."""
-        found = recorded_side(pulses)
-        if found is not None and "translated" in found.why:
-            return f"translate the {self.kind.takes} ones that they were made of"
-        return f"{'leave out' if self.options.inverse else 'give'} `inverse`"
 
     def _counts(self, formed: Formed) -> Counts:
         return Counts.of(formed, adc=self.options.adc is not None)

@@ -58,8 +58,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     drawn: dict[str, Drawing] = {SPECTRUM: partial(spectrum_figure, energies, peaks)}
     tails = metrics["tails"] or {}
     if tails.get("rate_khz") and "sizes" in tails:  # if any are known and were kept
-        energies_kev = tails["drawn"]["energies_kev"]
-        drawn[TAILS] = partial(tails_figure, tails, tails["sizes"], energies_kev)
+        drawn[TAILS] = partial(tails_figure, tails)
     if methods := metrics["ae_energy"].get("methods"):
         drawn[AE_ENERGY] = partial(ae_energy_figure, methods)
     scored = [peak for peak in found.sets if found.values[peak.name]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ from cpunet.pulses.loading import (
     load_pulses,
     require_same_sampling,
 )
-from cpunet.pulses.parameters import Values
-from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.parameters import Values, current_amplitude
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
@@ -38,7 +38,6 @@ from cpunet.validation.methods import Responses, fit_baseline_methods, translate
 from cpunet.validation.peaks import (
     ByMethod,
     PeakSets,
-    current_amplitudes,
     score_peak,
 )
 from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
@@ -141,8 +140,10 @@ def evaluate(
         fitted=baselines,
     )
     translations = translate_all(ren, baseline_methods, sim_set, responses, seed)
-    amplitudes = current_amplitudes(sim_set, data_set, translations)
     simulated, measured = sim_set.prepared.pulses, data_set.prepared.pulses
+    # of each whole side at once, so that peaks that overlap share them
+    windows = {"raw": simulated.waveforms, **translations.noisy, "data": measured.waveforms}
+    amplitudes = {method: current_amplitude(of_method) for method, of_method in windows.items()}
     sets = []
     for name in names:
         chosen = parse_selection(name, recipe.peaks)
@@ -236,7 +237,11 @@ def _load_both(
     names: list[str],
     max_pulses: int,
 ) -> tuple[InputSet, InputSet]:
-    selection = validation_selection(names, ren.recipe)
+    # the peaks, with all sidebands and continua
+    chosen = parse_selection(",".join(names), ren.recipe.peaks)
+    more = [band for _, bands in _lines(ren.recipe).values() for band in bands]
+    more += ren.recipe.scores.continuum_kev.values()
+    selection = replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
     sim_set = load_pulses(sim, "simulated", ren.recipe, selection, max_pulses=max_pulses)
     data_set = load_pulses(data, "measured", ren.recipe, selection, max_pulses=max_pulses)
     require_same_sampling(sim_set, data_set)
@@ -246,14 +251,6 @@ def _load_both(
             f"{ren.dt_ns:g} ns; resample the pulses"
         )
     return sim_set, data_set
-
-
-def validation_selection(names: Sequence[str], recipe: Recipe) -> EnergySelection:
-    """Select named peaks and ranges, together with all sidebands and continua."""
-    chosen = parse_selection(",".join(names), recipe.peaks)
-    more = [band for _, bands in _lines(recipe).values() for band in bands]
-    more += recipe.scores.continuum_kev.values()
-    return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
 def _range_survivals(

@@ -197,20 +197,15 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
     rows = []
     for peak, found in survival.items():
         title = peak
-        for method, value in found.get("survival", {}).items():
+        for method in found.get("survival", {}):
             if method.endswith(NO_NOISE):
                 continue  # in metrics.json
-            rows.append(
-                [
-                    title,
-                    label(method),
-                    _percent(value, found["survival_std"].get(method)),
-                    _percent(
-                        found["difference"].get(method), found["difference_std"].get(method)
-                    ),
-                    _sigma(found["sigma"].get(method)),
-                ]
+            kept, apart = (
+                _percent(found[key].get(method), found[f"{key}_std"].get(method))
+                for key in ("survival", "difference")
             )
+            sigma = _sigma(found["sigma"].get(method))
+            rows.append([title, label(method), kept, apart, sigma])
             title = ""
     head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
     return _table(head, rows, words={0, 1})

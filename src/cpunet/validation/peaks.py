@@ -12,8 +12,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.plotting import NO_NOISE
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import PARAMETERS, Values, current_amplitude
+from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.comparisons import Compared, compare
@@ -136,18 +135,6 @@ class PeakSets:
 
     def _prepared(self, flags: npt.NDArray[np.bool_]) -> Rows:
         return self.sim_rows[flags[self.sim_rows]]
-
-
-def current_amplitudes(
-    sim_set: InputSet, data_set: InputSet, translations: Translations
-) -> dict[str, Values]:
-    """Current amplitudes of all pulses of the data, of the simulation, and with noise."""
-    windows = {
-        "raw": sim_set.prepared.pulses.waveforms,
-        **translations.noisy,
-        "data": data_set.prepared.pulses.waveforms,
-    }
-    return {method: current_amplitude(of_method) for method, of_method in windows.items()}
 
 
 def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:

@@ -6,7 +6,7 @@ simulated pulse is therefore shown beside the measured one nearest to its transl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -239,32 +239,27 @@ def single_pulse_figure(
 
 
 @styled
-def tails_figure(
-    summary: Mapping[str, Any],
-    sizes: Mapping[str, Sequence[float]],
-    energies_kev: Sequence[float],
-) -> Figure:
+def tails_figure(summary: Mapping[str, Any]) -> Figure:
     """Sizes of the pile-up tails with their law, from the values stored with a training.
 
     Parameters
     ----------
     summary
-        Result of `PileUpTails.describe`.
-    sizes
-        ``kev``: sizes in keV; ``percent_above``: percentages of the traces above each.
-    energies_kev
-        Quantiles of the energies of earlier pulses in keV.
+        Result of `PileUpTails.describe`, with ``sizes``: ``kev``, and ``percent_above``, the
+        percentages of the traces above each; and ``drawn``, with quantiles of the energies of
+        earlier pulses in keV.
     """
     figure, ((axes,),) = panels((5.2, 3.4))
-    kev = np.asarray(sizes["kev"], float)
+    kev, percent = (np.asarray(summary["sizes"][k], float) for k in ("kev", "percent_above"))
     # binomial error of a fraction of n traces
-    share, n = np.asarray(sizes["percent_above"], float) / 100, max(summary["traces"], 1)
+    share, n = percent / 100, max(summary["traces"], 1)
     error = np.sqrt(share * (1 - share) / n)
     axes.fill_between(
         kev, 100 * (share - error), 100 * (share + error), color=COLOURS["data"], alpha=0.3
     )
     axes.loglog(kev, 100 * share, color=COLOURS["data"], label=f"measured, {n:,} traces")
-    law = TailsLaw(summary["rate_khz"], summary["decay_us"], tuple(energies_kev))
+    energies_kev = tuple(summary["drawn"]["energies_kev"])
+    law = TailsLaw(summary["rate_khz"], summary["decay_us"], energies_kev)
     axes.loglog(kev, 100 * law.share_above(kev), color=COLOURS["ren"], label="law")
     twice = 2 * summary["error_kev"]
     axes.axvline(twice, color="0.6", lw=0.8, ls=":", label="twice the error of a size")
