@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -79,7 +80,13 @@ def reads() -> Iterator[Counter[Path]]:
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     from matplotlib.figure import Figure
 
-    patch.setattr("cpunet.validation.report._drawn", lambda _drawing, _bar: Figure())
+    from cpunet.validation import page
+
+    def write_page(folder: Path, metrics: Any, figures: Any, notes: Any) -> None:
+        write(folder, metrics, dict.fromkeys(figures, Figure), notes)
+
+    write = page.write_page
+    patch.setattr(page, "write_page", write_page)
 
 
 @pytest.fixture

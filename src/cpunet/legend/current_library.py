@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import opened, text_attribute
 from cpunet.legend.currents import LENGTH, PEAK, Floats, Loss, Values
 from cpunet.legend.library_files import put_array, put_column
 from cpunet.outputs import refuse_existing, written_aside
@@ -188,28 +188,14 @@ def current_libraries(file: h5py.File) -> list[str]:
     found: list[str] = []
 
     def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Group) and _is_current_library(item):
+        names = [*item] if isinstance(item, h5py.Group) else []
+        stored = [n for n in names if n.startswith(("waveform_", "coefficients_"))]
+        drift_times = {f"drift_time_{n.split('_', 1)[1]}" for n in stored}
+        if stored and {"r", "z", "dt", "t0"} | drift_times <= set(names):
             found.append(name)
 
     file.visititems(visit)
     return sorted(found)
-
-
-def _is_current_library(group: h5py.Group) -> bool:
-    axes, numbers = ([group.get(n) for n in names] for names in (("r", "z"), ("dt", "t0")))
-    if not all(is_column(item) and item.ndim == 1 for item in axes):
-        return False
-    if not all(is_column(item) and item.size == 1 for item in numbers):
-        return False
-    shape = tuple(map(len, axes))
-    names = [name for name in group if name.startswith(("waveform_", "coefficients_"))]
-    for name in names:
-        values, times = group[name], group.get(f"drift_time_{name.split('_', 1)[1]}")
-        if not (isinstance(values, h5py.Dataset) and isinstance(times, h5py.Dataset)):
-            return False
-        if values.ndim != 3 or not values.shape[:2] == times.shape == shape:
-            return False
-    return bool(names)
 
 
 def merge_libraries(

@@ -70,11 +70,7 @@ def iren(run: str, period: Any = None, seed: int = 0, device: str = "cpu") -> GU
 def _processor(translator: Translator, period: Any, noise: bool, seed: int) -> GUFuncWrapper:
     if period is not None:
         dt_ns = float(period.to("ns").magnitude) if hasattr(period, "to") else float(period)
-        if not np.isclose(dt_ns, translator.dt_ns):
-            raise CpunetError(
-                f"waveforms sampled every {dt_ns:g} ns, the run was trained on "
-                f"{translator.dt_ns:g} ns; resample them"
-            )
+        translator.require_sampling("waveforms", dt_ns)
     generator = translator.seeded(seed)
 
     def translate(

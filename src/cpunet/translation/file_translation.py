@@ -197,11 +197,7 @@ class FileTranslation:
             If it cannot be read, has another sampling period or is of the other side.
         """
         pulses = source.open()
-        if not np.isclose(pulses.dt_ns, self.translator.dt_ns):
-            raise CpunetError(
-                f"{source.path}: sampled every {pulses.dt_ns:g} ns, the run was trained on "
-                f"{self.translator.dt_ns:g} ns; resample the pulses"
-            )
+        self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
         remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
         found = recorded_side(pulses)
         if found is not None and "translated" in found.why:

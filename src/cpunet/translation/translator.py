@@ -204,11 +204,7 @@ class Translator:
         CpunetError
             If the sampling period is not that of the training.
         """
-        if not np.isclose(pulses.dt_ns, self.dt_ns):
-            raise CpunetError(
-                f"pulses sampled every {pulses.dt_ns:g} ns, the run was trained on "
-                f"{self.dt_ns:g} ns; resample them"
-            )
+        self.require_sampling("pulses", pulses.dt_ns)
         prepared = prepare(pulses, self.recipe.preparation, self.takes)
         length = self.recipe.preparation.length
         codes = prepared.codes.copy()
@@ -223,6 +219,14 @@ class Translator:
             Drawn(pulses.energy_kev, noise, generator, tails_kev, piled).of_rows(index),
         )
         return TranslatedPulses(pulses.with_waveforms(waveforms), codes)
+
+    def require_sampling(self, what: str, dt_ns: float) -> None:
+        """Raise a `CpunetError` if pulses are not sampled like those of the training."""
+        if not np.isclose(dt_ns, self.dt_ns):
+            raise CpunetError(
+                f"{what} sampled every {dt_ns:g} ns, the run was trained on {self.dt_ns:g} ns; "
+                "resample them"
+            )
 
     @property
     def tails(self) -> DrawnTails | None:

@@ -245,11 +245,7 @@ def _load_both(
     sim_set = load_pulses(sim, "simulated", ren.recipe, selection, max_pulses=max_pulses)
     data_set = load_pulses(data, "measured", ren.recipe, selection, max_pulses=max_pulses)
     require_same_sampling(sim_set, data_set)
-    if not np.isclose(sim_set.dt_ns, ren.dt_ns):
-        raise CpunetError(
-            f"{sim_set.path}: sampled every {sim_set.dt_ns:g} ns, the run was trained on "
-            f"{ren.dt_ns:g} ns; resample the pulses"
-        )
+    ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
     return sim_set, data_set
 
 

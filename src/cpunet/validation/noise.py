@@ -76,7 +76,9 @@ def baseline_spectra(
         few = f"{max(samples, 0)} samples before measured pulses begin"
         early = f"{few}; {MIN_SAMPLES} are needed"
         return {"frequency_mhz": []} | {method: {"missing": early} for method in windows}
-    edges = _band_edges(samples)
+    # bands of half an octave, from the lowest frequency to the highest
+    steps = 2 ** np.arange(0, np.log2(samples // 2 + 1), 1 / BANDS_PER_OCTAVE)
+    edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1)).astype(float)
     frequencies = np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.5)) / (samples * dt_ns * 1e-3)
     found: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
     for method, pulses in windows.items():
@@ -141,14 +143,6 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
         logarithmic(axis)
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
-
-
-def _band_edges(samples: int) -> Values:
-    """Edges, in bins of a spectrum, of half-octave bands, without frequency 0."""
-    octaves = np.log2(samples // 2 + 1)
-    steps = 2 ** np.arange(0, octaves, 1 / BANDS_PER_OCTAVE)
-    edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1))
-    return edges.astype(float)
 
 
 def _band_powers(baselines: FloatArray, edges: Values) -> Values:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from cpunet.errors import CpunetError
 from cpunet.plotting import GROUP, colours, label, panels, styled
 from cpunet.tables import NO_VALUE
-from cpunet.validation.verdicts import judged_scores, number, part, summary
+from cpunet.validation.verdicts import judged_scores, methods_of, number, part, summary
 
 Metrics = Mapping[str, Any]
 
@@ -217,13 +217,7 @@ def side_by_side(runs: Mapping[str, Metrics], method: str = "ren") -> SideBySide
         for row in _peak_rows(peak, list(runs.values()), method)
     ]
     if not rows:
-        parameters = (
-            parameter
-            for metrics in runs.values()
-            for peak in part(metrics, "peaks").values()
-            for parameter in part(peak, "parameters").values()
-        )
-        known = [m for m in _union(part(p, "iou") for p in parameters) if m != "ceiling"]
+        known = _union(methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks"))
         raise CpunetError(
             f"{', '.join(runs)}: no score of the method {method}; "
             + (f"there are {', '.join(known)}" if known else "nothing is scored there")

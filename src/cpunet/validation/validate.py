@@ -174,24 +174,18 @@ def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str
         "distribution do not reach 100 at finite size: the ceiling is what data score "
         "against data at these sizes.",
     ]
-    notes += _of_tails(metrics)
+    tails = metrics["tails"] or {}
+    if tails.get("rate_khz"):
+        shares = ", ".join(
+            f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
+            for size, share in tails["percent_above"].items()
+        )
+        notes.append(
+            f"Traces of the training lie on pile-up tails, {tails['rate_khz']:.2f} ± "
+            f"{tails['rate_error_khz']:.2f} kHz decaying with {tails['decay_us']:.1f} µs: "
+            f"percent of the traces, measured (by the law), {shares}. All translations and the "
+            "truth have tails drawn by this law, as likely as they pass the quality cuts."
+        )
     if truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
     return notes
-
-
-def _of_tails(metrics: Mapping[str, Any]) -> list[str]:
-    """Remarks on pile-up tails in the data, if they are certain."""
-    tails = metrics["tails"] or {}
-    if not tails.get("rate_khz"):
-        return []
-    shares = ", ".join(
-        f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
-        for size, share in tails["percent_above"].items()
-    )
-    return [
-        f"Traces of the training lie on pile-up tails, {tails['rate_khz']:.2f} ± "
-        f"{tails['rate_error_khz']:.2f} kHz decaying with {tails['decay_us']:.1f} µs: percent "
-        f"of the traces, measured (by the law), {shares}. All translations and the truth have "
-        "tails drawn by this law, as likely as they pass the quality cuts."
-    ]
