@@ -67,7 +67,7 @@ def main() -> None:
         recipe = load_recipe("paper", [f"generator.width={width}"])
         network = PositionalUNet(recipe.cyclegan.generator, 800).to(given.device)
         drawn = Drawn(generator=torch.Generator(given.device))
-        return rate(partial(NetworkBackend(network), pulses[:n], drawn), n)
+        return rate(partial(NetworkBackend(network, fast.preparation), pulses[:n], drawn), n)
 
     with torch.inference_mode():
         rates = {

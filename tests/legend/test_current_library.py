@@ -201,7 +201,7 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
     translate_library(chain, ideal, tmp_path / "whole.lh5")
     told = translate_library(chain, ideal, tmp_path / "few.lh5", low_rank=8).numbers["V01"]
     whole, few = read_library(tmp_path / "whole.lh5"), read_library(tmp_path / "few.lh5", "V01")
-    assert (whole.rank, few.rank) == (None, 8)
+    assert few.told["rank"] == 8
     np.testing.assert_array_equal(whole.drift_time_ns[45], few.drift_time_ns[45])
     apart = few.currents(45) - whole.currents(45)
     assert np.nanmax(np.abs(apart)) == pytest.approx(told["loss"]["largest"], rel=1e-3)

@@ -102,11 +102,6 @@ class CurrentLibrary:
     _stored: dict[int, Floats]
     _basis: Floats | None
 
-    @property
-    def rank(self) -> int | None:
-        """Number of components; None for a library of whole templates."""
-        return None if self._basis is None else len(self._basis)
-
     def template(self, r_mm: float, z_mm: float, angle: int = 0) -> Floats:
         """The current of the grid point nearest to a position, shape (samples,)."""
         i = int(np.abs(self.r_mm - r_mm).argmin())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -87,7 +86,7 @@ class Backend(ABC):
     """
 
     network: nn.Module
-    needs_energies: ClassVar[bool] = False
+    needs_energies: bool = False
     chain: ResponseGenerator | None = None
     noise: BaselineNoise | None = None
     tails: DrawnTails | None = None
@@ -108,59 +107,43 @@ class Backend(ABC):
 
 
 class NetworkBackend(Backend):
-    """A network that maps windows to windows; its noise is the latent noise."""
-
-    network: PositionalUNet
-
-    def __init__(self, network: PositionalUNet) -> None:
-        self.network = network.eval()
-
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Run the network; its output is a prepared window already."""
-        batch = torch.from_numpy(windows).to(self.device)
-        out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
-        result: FloatArray = out[:, 0].cpu().numpy()
-        return result, np.zeros(len(windows), np.uint8)
-
-
-class NoisyNetworkBackend(NetworkBackend):
-    """A network that maps windows to windows, with baseline noise added to its output.
+    """A network that maps windows to windows.
 
     Parameters
     ----------
     network
-        Network whose output has no electronic noise.
-    kept
-        Noise of the data's baselines.
+        Network; its noise is the latent noise unless `kept` is given.
     config
         The preparation of the data, which noisy pulses go through again.
+    kept
+        Noise of the data's baselines, which is added to the output of the network.
     tails
         Distribution of the pile-up tails under the data, if known.
     """
 
-    needs_energies = True
+    network: PositionalUNet
 
     def __init__(
         self,
         network: PositionalUNet,
-        kept: KeptNoise,
         config: PreparationConfig,
+        kept: KeptNoise | None = None,
         tails: DrawnTails | None = None,
     ) -> None:
-        super().__init__(network)
-        self.noise, self.dt_ns = kept.noise, kept.noise_dt_ns
-        self.config, self.tails = config, tails
+        self.network, self.config, self.kept = network.eval(), config, kept
+        if kept is not None:
+            self.needs_energies, self.noise, self.tails = True, kept.noise, tails
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Run the network, add noise in proportion to 1/energy, and prepare like data."""
+        """Run the network; add noise in proportion to 1/energy, and prepare like data."""
+        batch = torch.from_numpy(windows).to(self.device)
+        out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
+        clean: FloatArray = out[:, 0].cpu().numpy()
         energy_kev, piled = drawn.energy_kev, drawn.piled
-        clean, codes = super().__call__(
-            windows, Drawn(noise=drawn.noise, generator=drawn.generator)
-        )
-        if energy_kev is None or not drawn.noise:
-            return clean, codes
+        if self.kept is None or energy_kev is None or not drawn.noise:
+            return clean, np.zeros(len(windows), np.uint8)
         seed = drawn.seed(self.device)
-        dt_ns = self.dt_ns
+        dt_ns = self.kept.noise_dt_ns
         records = with_room(clean, self.config, dt_ns)
         added = None
         if drawn.others:
@@ -281,9 +264,9 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
     if isinstance(generator, PunetConfig):
         network = run.fill(part, PositionalUNet(generator, preparation.length), device)
         if not forward or recipe.cyclegan.training.noise == "none":
-            return NetworkBackend(network)
+            return NetworkBackend(network, preparation)
         kept = run.fill(NOISE, KeptNoise(run.dt_ns), device)
-        return NoisyNetworkBackend(network, kept, preparation, run.tails)
+        return NetworkBackend(network, preparation, kept, run.tails)
     if forward:
         response = run.fill(part, ResponseGenerator(generator, run.dt_ns), device)
         response.tails = run.tails

@@ -18,9 +18,7 @@ from scipy.special import expit, log_ndtr, ndtr
 
 from cpunet.plotting import GROUP, colours, group, label, stacked, styled
 from cpunet.pulses.parameters import Values
-from cpunet.validation.a_over_e import DEP
-
-Range = tuple[float, float]
+from cpunet.validation.a_over_e import DEP, Range
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
