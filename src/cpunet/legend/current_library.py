@@ -291,18 +291,15 @@ def expand_library(source: str | Path, out: str | Path, *, force: bool = False) 
             )
         with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
             for name in names:
-                if _COMPONENTS in file[name]:
-                    _write_whole(_read(file[name], name), made.h5.create_group(name))
-                else:
+                if _COMPONENTS not in file[name]:
                     _copy(file[name], made.h5)
+                    continue
+                library, group = _read(file[name], name), made.h5.create_group(name)
+                axes = library.r_mm, library.z_mm, library.dt_ns
+                whole = NewLibrary.begin(group, *axes, None)
+                for angle, drift_times in library.drift_time_ns.items():
+                    values, times = whole.arrays(f"{angle:03d}_deg")
+                    values[...], times[...] = library.currents(angle), drift_times
+                group.attrs[TOLD] = json.dumps(library.told)
+                describe(group)
     return names
-
-
-def _write_whole(library: CurrentLibrary, group: h5py.Group) -> None:
-    """Write the templates of a library of components."""
-    made = NewLibrary.begin(group, library.r_mm, library.z_mm, library.dt_ns, None)
-    for angle, drift_times in library.drift_time_ns.items():
-        values, times = made.arrays(f"{angle:03d}_deg")
-        values[...], times[...] = library.currents(angle), drift_times
-    group.attrs[TOLD] = json.dumps(library.told)
-    describe(group)

@@ -162,8 +162,13 @@ class FileTranslation:
         refuse_existing(out, force=force)
         pulses = self.opened(source)
         others = _other_columns(pulses)
+        counts, times = Counts(), self.options.realisations
+        give_back_large_arrays()
         with self.writer(out, force=force) as writer:
-            counts = self._written(pulses, noise_key, writer, others)
+            for formed in self._blocks(pulses, noise_key):
+                first, given = counts.read // times, len(formed.codes) // times
+                writer.append(formed.pulses, formed.columns, others.read(first, given, times))
+                counts += self._counts(formed)
             self._require_some(source, counts)
             if source_print(source) != before:
                 raise CpunetError(
@@ -236,27 +241,6 @@ class FileTranslation:
                 f"{source.path}: none of {counts.read} pulses can be translated "
                 f"({reasons}); are these {self.translator.takes} pulses?"
             )
-
-    def _written(
-        self,
-        pulses: PulseSource,
-        noise_key: str | None,
-        writer: PulseWriter,
-        others: RowColumns,
-    ) -> Counts:
-        give_back_large_arrays()
-        counts, start, times = Counts(), 0, self.options.realisations
-        for formed in self._blocks(pulses, noise_key):
-            given = len(formed.codes) // times
-            writer.append(formed.pulses, formed.columns, others.read(start, given, times))
-            counts += self._counts(formed)
-            start += given
-        if pulses.n_pulses not in (None, start):
-            raise CpunetError(
-                f"{pulses.path}: {start} pulses read of {pulses.n_pulses}; it changed while "
-                "it was read, so translate it once it is complete"
-            )
-        return counts
 
     def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[Formed]:
         """Translate block by block; the noise depends only on the order of the pulses."""

@@ -210,13 +210,8 @@ def evaluate(
             },
             "missing": baseline_methods.missing,
         },
-        "training": {
-            "recipe": recipe.name,
-            "seconds": run.seconds,
-            "device": run.device,
-            "seed": run.seed,
-            "peak": run.peak,
-        },
+        "training": {"recipe": recipe.name}
+        | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak")},
         "tails": None if known is None else known.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,

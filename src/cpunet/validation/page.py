@@ -161,14 +161,11 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
     tables = []
     if tested := scores.get("two_sample", {}):
         head = ["Distinguished from data by a classifier", "AUC", "Same with shuffled labels"]
+        pairs = (("auc", "auc_std"), ("null_mean", "null_std"))
         rows = [
             [label(method), NO_VALUE, found["missing"]]
             if "missing" in found
-            else [
-                label(method),
-                with_std(found["auc"], found["auc_std"]),
-                with_std(found["null_mean"], found["null_std"]),
-            ]
+            else [label(method), *(with_std(found[one], found[std]) for one, std in pairs)]
             for method, found in tested.items()
         ]
         tables.append(part("folded", "The classifier as a table", _table(head, rows)))

@@ -69,13 +69,9 @@ class PeakSets:
 
     def rows(self, method: str) -> Rows:
         """Rows of the pulses with noise of one method in its whole dataset."""
-        if method == "data":
-            return self.data_rows
-        return (
-            self.sim_rows
-            if method == "raw"
-            else self._prepared(self.translations.whole[method])
-        )
+        if method in ("data", "raw"):
+            return self.data_rows if method == "data" else self.sim_rows
+        return self._prepared(self.translations.whole[method])
 
     @property
     def methods(self) -> list[str]:
