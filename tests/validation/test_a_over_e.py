@@ -190,8 +190,7 @@ def test_every_range_and_method_with_its_own_cut():
         amplitude,
         energy,
         {"data": 0.5, "ren": 0.3},
-        {"line": ((9, 11), [(20, 30)])},
-        {"continuum": (5, 15)},
+        {"line": ((9, 11), [(20, 30)]), "continuum": ((5, 15), [])},
     )
     assert list(table) == ["line", "continuum"]
     assert table["line"]["data"]["survival"] == 50

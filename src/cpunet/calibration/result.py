@@ -77,12 +77,6 @@ class Calibrated:
         """Physics that the coordinates refer to."""
         return self.problem.nearby.simulator.physics
 
-    @property
-    def errors(self) -> Values:
-        """Standard errors of the free coordinates."""
-        n = self.problem.parameters.n_chain
-        return np.asarray(np.sqrt(self.covariance.diagonal()[n:]))
-
 
 @dataclass(frozen=True)
 class FreeParameter:
@@ -198,9 +192,10 @@ def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
     """What was found for each free parameter, by name."""
     parameters, physics = calibrated.problem.parameters, calibrated.physics
     centres, widths = physics.priors(parameters.given)
+    errors = np.sqrt(calibrated.covariance.diagonal()[parameters.n_chain :])
     errors_all = calibrated.scale * calibrated.information.errors()
     free = {}
-    for k, (i, error) in enumerate(zip(parameters.free, calibrated.errors, strict=True)):
+    for k, (i, error) in enumerate(zip(parameters.free, errors, strict=True)):
         name, x = physics.nuisances[i].name, float(parameters.coordinates[i])
         value, own_error = physics.in_own_unit(i, x, error)
         centre, width = physics.in_own_unit(i, float(centres[i]), widths[i])

@@ -285,8 +285,7 @@ def survival_by_range(
     amplitude: Mapping[str, Values],
     energy_kev: Mapping[str, Values],
     cuts: Mapping[str, float],
-    lines: Mapping[str, tuple[Range, Sequence[Range]]],
-    continua: Mapping[str, Range],
+    ranges: Mapping[str, tuple[Range, Sequence[Range]]],
 ) -> dict[str, dict[str, Any]]:
     """`peak_survival` of every line and range, by method.
 
@@ -295,17 +294,14 @@ def survival_by_range(
     amplitude, energy_kev, cuts
         Amplitudes, energies in keV and cut by method; each method has its own cut (see
         `ae_survival`), NaN if it has none.
-    lines
-        Range and sidebands of each gamma line in keV, by name.
-    continua
-        Ranges of the continuum in keV, by name.
+    ranges
+        Range and sidebands of each gamma line in keV, by name; a continuum has no sidebands.
 
     Returns
     -------
     dict
         Results of `peak_survival` by name and method.
     """
-    ranges = dict(lines) | {name: (span, ()) for name, span in continua.items()}
     return {
         name: {
             method: peak_survival(values, energy_kev[method], cuts[method], span, sidebands)

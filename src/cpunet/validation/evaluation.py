@@ -258,8 +258,8 @@ def _range_survivals(
         {method: values for method, values in amplitudes.items() if method in cuts},
         energies,
         {method: np.nan if cut is None else cut for method, cut in cuts.items()},
-        {name: line for name, line in _lines(recipe).items() if name != DEP},
-        recipe.scores.continuum_kev,
+        {name: line for name, line in _lines(recipe).items() if name != DEP}
+        | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
     )
 
 
