@@ -250,10 +250,8 @@ def interleaved(realisations: list[Formed]) -> Formed:
     if len(realisations) == 1:
         return realisations[0]
     number, given = len(realisations), len(realisations[0].codes)
-    rows, whole = (
-        np.arange(number * given).reshape(number, given).T.ravel(),
-        joined(realisations),
-    )
+    rows = np.arange(number * given).reshape(number, given).T.ravel()
+    whole = joined(realisations)
     truth = {name: (values[rows], units) for name, (values, units) in whole.truth.items()}
     truth["realisation"] = (np.tile(np.arange(number), given), "")
     return Formed(whole.pulses[rows], whole.codes[rows], whole.saturated[rows], truth)

@@ -35,11 +35,7 @@ from cpunet.validation.a_over_e import (
 )
 from cpunet.validation.ae_energy import against_energy
 from cpunet.validation.methods import Responses, fit_baseline_methods, translate_all
-from cpunet.validation.peaks import (
-    ByMethod,
-    PeakSets,
-    score_peak,
-)
+from cpunet.validation.peaks import ByMethod, PeakSets, score_peak
 from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
 from cpunet.validation.verdicts import summary, verdict_table
 
