@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.settings import checked
+from cpunet.simulation.fields import solve
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.fields import solve
 
 Values = npt.NDArray[np.float64]
 

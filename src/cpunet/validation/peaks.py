@@ -41,7 +41,7 @@ class PeakSets:
     translations
         Translations of the simulated pulses by all methods.
     amplitudes
-        Current amplitudes of all pulses with noise, see `current_amplitudes`.
+        Current amplitudes of all pulses of each side and method, with noise.
     """
 
     name: str
