@@ -105,7 +105,7 @@ def test_another_sampling_period_is_refused(ren, sim):
     with pytest.raises(CpunetError) as error:
         ren.translate_pulses(Pulses.of(sim, dt_ns=10))
     assert str(error.value) == (
-        "pulses sampled every 10 ns, the run was trained on 16 ns; resample them"
+        "pulses sampled every 10 ns, the run was trained on 16 ns; resample the pulses"
     )
 
 

@@ -225,7 +225,7 @@ class Translator:
         if not np.isclose(dt_ns, self.dt_ns):
             raise CpunetError(
                 f"{what} sampled every {dt_ns:g} ns, the run was trained on {self.dt_ns:g} ns; "
-                "resample them"
+                "resample the pulses"
             )
 
     @property
