@@ -66,8 +66,8 @@ ROWS = {
     r"noise_corner_mhz": ("noise corner", "MHz"),
     r"chi_square_per_moment": ("chi-square per moment", ""),
 }
-# The division of a chain into parts is degenerate, and times of slow parts and decays are fixed:
-# a true part between two of them is split, which the errors do not contain.
+# The division of a chain into parts is degenerate, and times of slow parts and decays are
+# fixed: a true part between two of them is split, which the errors do not contain.
 PARTS = re.compile(r"slow_|missing_|overshoot|decay_|fast_decay_|droop_")
 
 
