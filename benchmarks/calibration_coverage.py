@@ -106,6 +106,7 @@ def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, A
         calibrated = search.run()
     at = calibrated.problem.parameters.coordinates
     covariance = calibrated.covariance[-len(names) :, -len(names) :]
+    errors = np.sqrt(covariance.diagonal())
     return {
         "group": group,
         "seed": seed,
@@ -117,9 +118,7 @@ def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, A
         "seconds": time.perf_counter() - begun,
         "parameters": {
             n.name: {"found": float(x), "true": float(t), "error": float(e), "prior": float(w)}
-            for n, x, t, e, w in zip(
-                nuisances, at, truth, calibrated.errors, widths, strict=True
-            )
+            for n, x, t, e, w in zip(nuisances, at, truth, errors, widths, strict=True)
         },
         "covariance": covariance.tolist(),
     }
