@@ -37,6 +37,7 @@ from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+from cpunet.training.run import Run
 from cpunet.training.translated import Noise, SimulatedSide
 from cpunet.translation.translator import REN
 
@@ -72,7 +73,7 @@ def experiment(
 ) -> tuple[Pulses, Pulses, np.ndarray]:
     """Half of the pulses, the others with a known response as data, and true amplitudes."""
     half, config = len(sim) // 2, RECIPE.preparation
-    response = known_response(run, sim.dt_ns)
+    response = known_response(Run.load(run), RECIPE)
     kev = sim.energy_kev[half:]
 
     def records(pulses: np.ndarray) -> np.ndarray:

@@ -125,7 +125,7 @@ def main() -> None:
         size = (folder / "out.lh5").stat().st_size
     memory = np.array([mb for _, mb in seen])
     quarter = max(1, len(memory) // 4)
-    print(f"{told['translated']:,} pulses in {seconds:.0f} s: {told['read'] / seconds:,.0f}/s")
+    print(f"{told.translated:,} pulses in {seconds:.0f} s: {told.read / seconds:,.0f}/s")
     print(f"{size / given.pulses:,.0f} bytes a pulse")
     print(f"peak of memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
     print(

@@ -80,7 +80,7 @@ def _chain(config: Path) -> dict[str, Any]:
 
 def _decay_us(run: Path) -> float:
     try:
-        return float(describe_chain(Run.load(run))["values"]["decay_us"])
+        return float(describe_chain(Run.load(run)).values["decay_us"])
     except CpunetError as error:
         raise CpunetError(f"{error}; or give events.tau_us") from error
 
