@@ -394,13 +394,8 @@ def _write_data(
     electronics = stand.electronics
     labels: list[Labels] = []
     known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in OF_DATA}
-    writer = PulseWriter(
-        folder / "data.lh5",
-        table="geds/raw",
-        waveform_units="ADC",
-        attrs=MADE | {SIDE: "measured"},
-    )
-    with writer:
+    path, attrs = folder / "data.lh5", MADE | {SIDE: "measured"}
+    with PulseWriter(path, table="geds/raw", waveform_units="ADC", attrs=attrs) as writer:
         for fine, label, _ in side.blocks("Measured events", library):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
