@@ -187,9 +187,11 @@ def _tell(found: list[dict[str, Any]], figure: Path | None) -> None:
     for name, of in pulls.items():
         n = len(of)
         width = np.std(of, ddof=1) if n > 1 else float("nan")
+        core = np.diff(np.quantile(of, [0.159, 0.841]))[0] / 2
         print(
             f"{name}: {n} stands, error {np.median(known[name]):.2f} of the prior, pulls: mean "
-            f"{np.mean(of):+.2f} ± {1 / n**0.5:.2f}, width {width:.2f} ± {(2 * n) ** -0.5:.2f}"
+            f"{np.mean(of):+.2f} ± {1 / n**0.5:.2f}, width {width:.2f} ± "
+            f"{(2 * n) ** -0.5:.2f}, core {core:.2f}"
         )
     if figure is not None:
         drawn = {name: np.array(of) for name, of in pulls.items()}

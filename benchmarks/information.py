@@ -31,8 +31,9 @@ from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_fit
-from cpunet.training.fitter import Fitter, levenberg_marquardt
+from cpunet.training.fitter import Fitter
 from cpunet.training.job import known_response
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import PulseSets

@@ -19,7 +19,7 @@ import scipy.fft
 
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.legend.currents import PEAK, currents_about_peak
-from cpunet.legend.make_library import LithiumLayer, arrived, delayed
+from cpunet.legend.lithium import LithiumLayer, arrived, delayed
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector

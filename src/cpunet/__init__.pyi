@@ -15,8 +15,8 @@ from cpunet.legend.current_library import merge_libraries as merge_libraries
 from cpunet.legend.current_library import read_library as read_library
 from cpunet.legend.export import LegendParameters as LegendParameters
 from cpunet.legend.export import export_legend as export_legend
-from cpunet.legend.make_library import LithiumLayer as LithiumLayer
-from cpunet.legend.make_library import lithium_table as lithium_table
+from cpunet.legend.lithium import LithiumLayer as LithiumLayer
+from cpunet.legend.lithium import lithium_table as lithium_table
 from cpunet.legend.make_library import make_library as make_library
 from cpunet.legend.translate_library import translate_library as translate_library
 from cpunet.pulses.container import Pulses as Pulses

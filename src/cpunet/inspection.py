@@ -290,7 +290,7 @@ def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
 def _pulses(file: PulseFile, recipe: Recipe) -> InfoResult:
     """Describe the pulses of one table."""
     from cpunet.pulses.description import describe_pulses
-    from cpunet.pulses.peaks import spectrum_figure
+    from cpunet.pulses.spectrum import spectrum_figure
 
     source = file.open()
     found, spectrum = describe_pulses(source, recipe.peaks)

@@ -20,13 +20,8 @@ from cpunet.legend.export import (
     export_legend,
     kernel_step,
 )
-from cpunet.legend.make_library import (
-    LithiumLayer,
-    arrived,
-    delayed,
-    lithium_table,
-    make_library,
-)
+from cpunet.legend.lithium import LithiumLayer, arrived, delayed, lithium_table
+from cpunet.legend.make_library import make_library
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import write_chain

@@ -128,6 +128,16 @@ def test_a_damaged_checkpoint_is_told(tmp_path, content):
         unfinished(tmp_path).begin(resume=True)
 
 
+def test_one_damaged_byte_of_the_weights_is_told(tmp_path):
+    kept(tmp_path, 1.0)
+    path = tmp_path / CHECKPOINT
+    content = bytearray(path.read_bytes())
+    content[content.index(torch.ones(3).numpy().tobytes())] ^= 1  # torch loads another number
+    path.write_bytes(content)
+    with pytest.raises(CpunetError, match="damaged"):
+        unfinished(tmp_path).begin(resume=True)
+
+
 def test_a_checkpoint_executes_nothing(tmp_path):
     kept(tmp_path)
     torch.save({"state": Path("x").open}, tmp_path / CHECKPOINT)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from cpunet.training.fitter import levenberg_marquardt
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 
 TIMES = np.linspace(0.0, 2.0, 9)
 TRUTH = np.array([3.0, 1.5])  # height and rate

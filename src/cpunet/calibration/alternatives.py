@@ -25,7 +25,8 @@ from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import MatchingConfig, Recipe
 from cpunet.simulation.hits import Hits
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, levenberg_marquardt
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import ResponseProblem
 from cpunet.training.response_starts import ringing_if_better, with_free_decay

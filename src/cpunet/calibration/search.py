@@ -28,7 +28,7 @@ from cpunet.calibration.result import Calibrated
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
-from cpunet.training.fitter import Minimum, levenberg_marquardt
+from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import set_decay

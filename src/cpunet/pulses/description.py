@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.peaks import Spectrum, Values, label_peaks, suggested_calibration
+from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.spectrum import Spectrum, Values, suggested_calibration
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.tables import counted, percent, span
 

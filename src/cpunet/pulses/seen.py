@@ -14,11 +14,12 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.peaks import EnergySelection, suggested_calibration
+from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.provenance import require_apparent_side, require_recorded_side
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import PreparationConfig
 
 Values = npt.NDArray[np.float64]

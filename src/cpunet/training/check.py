@@ -28,9 +28,10 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.parameters import Values, current_amplitude
-from cpunet.pulses.peaks import EnergySelection, line_near, parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import Kind, Rejection
 from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
+from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.moments import spread

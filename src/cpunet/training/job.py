@@ -36,9 +36,10 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
 from cpunet.training.chain_description import beyond, diagnosis, stretched
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.fitter import Fitter, Listener
+from cpunet.training.fitter import Fitter
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
+from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name

@@ -18,6 +18,7 @@ import logging
 import os
 import pickle
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -286,8 +287,12 @@ class UnfinishedRun:
         path, state = self.folder / CHECKPOINT, None
         if resume and path.exists():
             try:
+                # torch writes checksums, but does not read them
+                with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as parts:
+                    if part := parts.testzip():
+                        raise zipfile.BadZipFile(part)
                 then = torch.load(path, map_location="cpu", weights_only=True)
-            except (RuntimeError, ValueError, EOFError, pickle.PickleError):
+            except (zipfile.BadZipFile, RuntimeError, ValueError, EOFError, pickle.PickleError):
                 raise CpunetError(f"{path}: damaged; begin again with `force`") from None
             for kind, now in self._fingerprint.items():
                 for difference in differences(then["fingerprint"].get(kind), now):

@@ -1,0 +1,258 @@
+"""Lines found in a spectrum, the calibration that they suggest, and its figure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.plotting import COLOURS, DATA_FILL, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Values = npt.NDArray[np.float64]
+
+WITHIN = 0.03  # relative half-width of the search range of a line
+BIN_KEV = 1.0
+MIN_COUNTS = 30  # minimum counts in the highest bins of a line
+ABOVE = 4.0  # minimum ratio of a line's counts to those beside it
+WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
+
+
+def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:
+    """Energy of the gamma line nearest to an expected energy.
+
+    Parameters
+    ----------
+    energies_kev
+        Energies of all pulses in keV, shape ``(n,)``; may contain NaN.
+    expected_kev
+        Expected energy of the line in keV; the search range is within 3 % of it.
+
+    Returns
+    -------
+    float or None
+        Energy in keV; None if no line stands out.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> energies = np.append(rng.uniform(2300, 2900, 500), rng.normal(2601, 1, 1000))
+    >>> round(line_near(energies, 2614.5))
+    2601
+    >>> line_near(energies[:500], 2614.5) is None
+    True
+    """
+    low, high = (1 - WITHIN) * expected_kev, (1 + WITHIN) * expected_kev
+    energies = np.asarray(energies_kev, float)
+    edges = np.arange(low, high + BIN_KEV, BIN_KEV)
+    counts, edges = np.histogram(energies[np.isfinite(energies)], edges)
+    if len(counts) < 2 * WIDTH_BINS + 1:
+        return None
+    near = np.convolve(counts, np.ones(3), "same")
+    # of equally high bins, the one nearest to the middle
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    highest = np.flatnonzero(near == near.max())
+    top = int(highest[np.abs(centre[highest] - expected_kev).argmin()])
+    if near[top] < MIN_COUNTS or near[top] < ABOVE * max(3 * float(np.median(counts)), 1.0):
+        return None
+    part = slice(max(top - WIDTH_BINS, 0), top + WIDTH_BINS + 1)
+    return float(np.average(centre[part], weights=counts[part]))
+
+
+# Gamma lines in keV of common calibration sources (ENSDF), strongest in a spectrum first, with
+# the single and double escape peaks of Tl-208.
+SOURCES = {
+    "Th-228": (2614.511, 583.187, 238.632, 510.77, 1592.511, 2103.511, 727.33, 860.56),
+    "Co-60": (1332.492, 1173.228),
+    "Co-56": (846.770, 1238.288, 2598.500, 1771.357, 1037.843, 3253.503),
+}
+MIN_BINS = 10  # minimum number of bins of a spectrum that may contain lines
+LOG_BIN = 0.002  # bin width in the logarithm of the amplitude
+BACKGROUND = 25  # bins to either side whose median is the background under a line
+HIGHEST = 12.0  # maximum contribution of one line, in standard deviations
+CLEAR, MIN_LINES = 4.0, 3  # significance of a clear line; clear lines required
+
+
+class Suggestion(NamedTuple):
+    """An energy calibration that matches the gamma lines of a source.
+
+    Parameters
+    ----------
+    kev_per_adc
+        Energy in keV per unit of the amplitude.
+    source
+        Calibration source of the lines.
+    lines_kev
+        Energies in keV of the lines found.
+    """
+
+    kev_per_adc: float
+    source: str
+    lines_kev: tuple[float, ...]
+
+    def __str__(self) -> str:
+        lines = ", ".join(f"{line:.0f}" for line in sorted(self.lines_kev))
+        return f"{self.source} ({lines} keV) at `kev_per_adc` {self.kev_per_adc:.4g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Energies in keV, or amplitudes in ADC counts if no energy is known.
+
+    Parameters
+    ----------
+    values
+        One per pulse, shape ``(n,)``.
+    in_kev
+        Whether they are energies.
+    found
+        Lines found, and the calibration that gives them the right energies.
+    """
+
+    values: Values
+    in_kev: bool
+    found: Suggestion | None
+
+
+def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
+    """Search a spectrum of amplitudes for the lines of calibration sources.
+
+    On a logarithmic axis a calibration is a shift.  The chosen shift is the one at which the
+    lines coincide best with excesses of counts.
+
+    Parameters
+    ----------
+    amplitudes
+        Amplitudes in any unit, shape ``(n,)``; may contain NaN.
+
+    Returns
+    -------
+    Suggestion or None
+        None if too few lines of every source are found.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> lines = np.repeat([2614.5, 583.2, 1592.5, 2103.5], [300, 600, 100, 90])
+    >>> spectrum = np.append(rng.uniform(100, 2600, 3000), rng.normal(lines, 1.5))
+    >>> found = suggested_calibration(spectrum / 0.065)
+    >>> found.source, round(found.kev_per_adc, 4)
+    ('Th-228', 0.065)
+    """
+    known = np.asarray(amplitudes, float)
+    known = np.log(known[np.isfinite(known) & (known > 0)])
+    if len(known) < MIN_COUNTS:
+        return None
+    edges = np.arange(known.min() - LOG_BIN, known.max() + 2 * LOG_BIN, LOG_BIN)
+    if len(edges) < MIN_BINS:  # one energy
+        return None
+    excess = _excess(np.histogram(known, edges)[0])
+    found = [_shifted(excess, edges[0], source, SOURCES[source]) for source in SOURCES]
+    clear = [one for one in found if one is not None]
+    if not clear:
+        return None
+    _, log_factor, source, lines = max(clear, key=lambda one: one[0])
+    return Suggestion(_refined(known, log_factor, lines), source, lines)
+
+
+def _excess(counts: npt.NDArray[np.integer]) -> Values:
+    """Excess of the counts of three bins over their background, in standard deviations."""
+    reflected = np.pad(counts.astype(float), BACKGROUND, "symmetric")
+    around = np.lib.stride_tricks.sliding_window_view(reflected, 2 * BACKGROUND + 1)
+    under = 3 * np.maximum(np.median(around, axis=1), 0.3 * around.mean(axis=1))
+    near = np.convolve(counts, np.ones(3), "same")
+    return np.asarray((near - under) / np.sqrt(np.maximum(under, 1.0)))
+
+
+def _shifted(
+    excess: Values, first: float, source: str, lines_kev: tuple[float, ...]
+) -> tuple[float, float, str, tuple[float, ...]] | None:
+    """The shift at which the lines of a source have the largest excess of counts."""
+    places = np.log(lines_kev) / LOG_BIN
+    offsets = np.round(places - places[0]).astype(int)
+    n = len(excess)
+    at = np.arange(n)[:, np.newaxis] + offsets
+    inside = (at >= 0) & (at < n)
+    values = np.where(inside, excess[np.clip(at, 0, n - 1)], 0.0)
+    # the first (strongest) line must be present
+    score = np.clip(values, -CLEAR, HIGHEST).sum(axis=1)
+    score[values[:, 0] < CLEAR] = -np.inf
+    best = int(score.argmax())
+    # two lines coincide by chance more easily than three
+    limit = CLEAR if len(lines_kev) > 2 else 2 * CLEAR
+    clear = tuple(
+        line for line, value in zip(lines_kev, values[best], strict=True) if value > limit
+    )
+    if not np.isfinite(score[best]) or len(clear) < min(MIN_LINES, len(lines_kev)):
+        return None
+    log_factor = float(places[0] * LOG_BIN - first - (best + 0.5) * LOG_BIN)
+    return float(score[best]), log_factor, source, clear
+
+
+def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, ...]) -> float:
+    """The calibration factor from the amplitudes near the highest line."""
+    line = max(lines_kev)
+    near = np.abs(log_amplitudes + log_factor - np.log(line)) < 2 * LOG_BIN
+    middle = float(np.median(log_amplitudes[near])) if near.any() else np.log(line) - log_factor
+    return float(line / np.exp(middle))
+
+
+BINS = 1000
+SHOWN = 0.999  # quantile of the values; the axis ends a little above it
+
+
+@styled
+def spectrum_figure(spectrum: Spectrum) -> Figure:
+    """Counts on a logarithmic axis; lines found are marked, others of their source dotted.
+
+    Amplitudes have a second axis in keV if a calibration is suggested.
+    """
+    from matplotlib.figure import Figure  # half a second, which no other function needs
+
+    figure = Figure(figsize=(9.0, 4.2))
+    axes = figure.subplots()
+    values = spectrum.values[np.isfinite(spectrum.values)]
+    top = 1.05 * float(np.quantile(values, SHOWN)) if len(values) else 1.0
+    bins = min(BINS, max(200, len(values) // 10))
+    counts, edges = np.histogram(values, bins, (0.0, max(top, 1e-9)))
+    axes.stairs(counts, edges, fill=True, color=DATA_FILL)
+    axes.stairs(counts, edges, color=COLOURS["data"], linewidth=0.6)
+    unit = "keV" if spectrum.in_kev else "ADC counts"
+    axes.set(
+        xlabel=f"Energy [{unit}]"
+        if spectrum.in_kev
+        else f"Amplitude over the baseline [{unit}]",
+        ylabel=f"Pulses / {edges[1] - edges[0]:.3g} {unit} (logarithmic)",
+        yscale="log",
+        xlim=(0.0, edges[-1]),
+        ylim=(0.5, 10.0 * max(counts.max(), 1)),
+    )
+    found = spectrum.found
+    if found is not None:
+        for line in sorted(SOURCES.get(found.source, found.lines_kev)):
+            place, sure = line / found.kev_per_adc, line in found.lines_kev
+            if place > edges[-1]:
+                continue
+            axes.axvline(place, color=COLOURS["raw"], lw=0.8, ls="-" if sure else ":", zorder=0)
+            axes.annotate(
+                f"{line:.0f}" if sure else f"({line:.0f})",
+                (place, 0.98),
+                xycoords=("data", "axes fraction"),
+                rotation=90,
+                ha="right",
+                va="top",
+                color=COLOURS["raw"],
+            )
+        if not spectrum.in_kev:
+            factor = found.kev_per_adc
+            above = axes.secondary_xaxis(
+                "top",
+                functions=(lambda v: np.multiply(v, factor), lambda v: np.divide(v, factor)),
+            )
+            above.set_xlabel(f"Energy [keV] with {factor:.4g} keV per ADC count")
+    return figure
