@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -158,32 +159,25 @@ def pulse_file(source: Source, options: FileOptions = FileOptions()) -> PulseFil
     )
 
 
-Format = Literal["hdf5", "fcio", "spe", "npz", "npy", "pickle", "text"]
+class Format(NamedTuple):
+    """A format of files: its name, its suffixes, and what opens it, in a module beside this."""
 
-_NAMES: dict[Format, str] = {
-    "hdf5": "HDF5",
-    "fcio": "FlashCam",
-    "spe": "spectrum",
-    "npz": "NumPy",
-    "npy": "NumPy",
-    "pickle": "pickle",
-    "text": "text",
-}
-_SUFFIXES: dict[str, Format] = {
-    ".lh5": "hdf5",
-    ".h5": "hdf5",
-    ".hdf5": "hdf5",
-    ".hdf": "hdf5",
-    ".fcio": "fcio",
-    ".spe": "spe",
-    ".npz": "npz",
-    ".npy": "npy",
-    ".pickle": "pickle",
-    ".pkl": "pickle",
-}
+    name: str
+    suffixes: tuple[str, ...]
+    module: str
+    opens: str
+
+
+HDF5 = Format("HDF5", (".lh5", ".h5", ".hdf5", ".hdf"), "hdf5", "open_hdf5")
+FLASHCAM = Format("FlashCam", (".fcio",), "flashcam", "FlashCamSource")
+NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "ArraySource")
+PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "PickleSource")
+SPECTRUM = Format("spectrum", (".spe",), "siggen", "SpectrumSource")
+TEXT = Format("text", (), "siggen", "TextSource")
+
 _HEAD_BYTES = 520
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-_PICKLE, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_PICKLE_MAGIC, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
 _TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
 # signs of any encoding, but no control characters
 _COMMENT = re.compile(rb"#[^\x00-\x1f\x7f]*")
@@ -241,31 +235,11 @@ def open_file(options: PulseFile) -> PulseSource:
 
         return MemorySource(options, options.pulses)
     # readers are imported when needed: the LH5 library alone takes seconds to load
-    match recognise(options.path):
-        case "hdf5":
-            from cpunet.pulses.reading.hdf5 import open_hdf5
-
-            return open_hdf5(options)
-        case "fcio":
-            from cpunet.pulses.reading.flashcam import FlashCamSource
-
-            return FlashCamSource(options)
-        case "npz" | "npy":
-            from cpunet.pulses.reading.arrays import ArraySource
-
-            return ArraySource(options)
-        case "pickle":
-            from cpunet.pulses.reading.published import PickleSource
-
-            return PickleSource(options)
-        case "spe":
-            from cpunet.pulses.reading.siggen import SpectrumSource
-
-            return SpectrumSource(options)
-        case "text":
-            from cpunet.pulses.reading.siggen import TextSource
-
-            return TextSource(options)
+    found = recognise(options.path)
+    source: PulseSource = getattr(import_module(f"{__package__}.{found.module}"), found.opens)(
+        options
+    )
+    return source
 
 
 def tables_of(path: str | Path) -> list[str]:
@@ -291,14 +265,12 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         If the file is missing or cannot be read.
     """
     path = Path(path)
-    match recognise(path):
-        case "hdf5":
-            return dict.fromkeys(_hdf5_tables(path))
-        case "fcio":
-            from cpunet.pulses.reading.flashcam import channel_sizes
+    found = recognise(path)
+    if found is FLASHCAM:
+        from cpunet.pulses.reading.flashcam import channel_sizes
 
-            return channel_sizes(path)
-    return {}
+        return channel_sizes(path)
+    return dict.fromkeys(_hdf5_tables(path)) if found is HDF5 else {}
 
 
 def _hdf5_tables(path: Path) -> list[str]:
@@ -321,16 +293,17 @@ def recognise(path: Path) -> Format:
     """
     head = _head(path)
     found = _by_content(head, path)
-    claimed = _SUFFIXES.get(path.suffix.lower())
+    formats = (HDF5, FLASHCAM, NUMPY, PICKLE, SPECTRUM)
+    claimed = next((one for one in formats if path.suffix.lower() in one.suffixes), None)
     # any text is accepted, unless its suffix is that of another format; pickles of protocol 0
     # are text
-    if found == "text" and claimed is not None:
-        found = "pickle" if claimed == "pickle" else None
+    if found is TEXT and claimed is not None:
+        found = PICKLE if claimed is PICKLE else None
     if found is not None:
         return found
     if claimed is not None:
         raise CpunetError(
-            f"{path}: not a {_NAMES[claimed]} file, despite its name; "
+            f"{path}: not a {claimed.name} file, despite its name; "
             "give a file of pulses or correct its suffix"
         )
     raise CpunetError(
@@ -356,20 +329,16 @@ def _head(path: Path) -> bytes:
 
 def _by_content(head: bytes, path: Path) -> Format | None:
     # MATLAB writes 512 bytes of its own before the HDF5 part
-    if _HDF5 in (head[:8], head[512:520]):
-        return "hdf5"
-    if head.startswith(b"\x93NUMPY"):
-        return "npy"
-    if head.startswith(b"PK\x03\x04"):
-        return "npz"
+    if _HDF5_MAGIC in (head[:8], head[512:520]):
+        return HDF5
+    if head.startswith((b"\x93NUMPY", b"PK\x03\x04")):
+        return NUMPY
     # the FCIO library unpacks these two itself, by their suffix
     if head[4:12] == b"FlashCam" or path.name.endswith((".fcio.gz", ".fcio.zst")):
-        return "fcio"
+        return FLASHCAM
     # Fortran record marks around the 24 bytes of a Radware header
     if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
-        return "spe"
-    if head[0] == _PICKLE and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
-        return "pickle"
-    if set(_COMMENT.sub(b"", head)) <= _TEXT_BYTES:
-        return "text"
-    return None
+        return SPECTRUM
+    if head[0] == _PICKLE_MAGIC and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
+        return PICKLE
+    return TEXT if set(_COMMENT.sub(b"", head)) <= _TEXT_BYTES else None
