@@ -193,7 +193,7 @@ def test_the_properties_are_those_that_were_made():
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
     told = info(stand_of_one_detector).values
     assert told["provenance"]["made by"].startswith("cpunet simulate")
-    assert told["provenance"]["detector"].startswith("ppc, 2500 V, 90 K")
+    assert told["provenance"]["detector"].startswith("ppc, 2500 V, 90 K, charge clouds of 0.1")
     assert told["provenance"]["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
 
 
@@ -202,6 +202,7 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     """A file with the attributes of ``cpunet simulate``."""
     made = {
         "detector": {"name": "ppc", "bias_V": 2500.0, "temperature_K": 90.0},
+        "settings": {"cloud_fwhm_mm": 0.1},
         "hits": {"file": "/a/hits.npz", "origin_mm": [0.0, 0.0, 0.0], "flip_z": False},
         "events": 3,
         "events_without_signal": 0,

@@ -73,27 +73,14 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
         If the file states that its pulses are of the other side, or if they appear to be
         and `insist` is False.
     """
-    if require_recorded_side(source, wanted, remedy) or insist:
-        return
-    first = next(iter(source.blocks(_FIRST_PULSES)))
-    require_apparent_side(source.path, first.waveforms, wanted, remedy)
-
-
-def require_recorded_side(source: PulseSource, wanted: Kind, remedy: str) -> bool:
-    """Refuse pulses whose file states the other side; whether it states one at all."""
     found = recorded_side(source)
-    _require(found, source.path, wanted, remedy)
-    return found is not None
+    if found is None and not insist:
+        found = apparent_side(next(iter(source.blocks(_FIRST_PULSES))).waveforms)
+    refuse_other_side(found, source.path, wanted, remedy)
 
 
-def require_apparent_side(
-    path: Path, waveforms: npt.NDArray[np.floating], wanted: Kind, remedy: str
-) -> None:
-    """Refuse pulses that appear to be of the other side by the first ones of them."""
-    _require(apparent_side(waveforms[:_FIRST_PULSES]), path, wanted, remedy)
-
-
-def _require(found: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
+def refuse_other_side(found: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
+    """Refuse pulses of a file that are `found` to be of the other side; see `require_side`."""
     if found is not None and found.side != wanted:
         begin = " If" if remedy.endswith("?") else "; if"
         sure = "" if found.certain else f"{begin} they are {wanted}, say so with `insist`"
@@ -135,12 +122,9 @@ def recorded_attributes(source: PulseSource) -> dict[str, str]:
 
 def recorded_detector(source: PulseSource) -> str | None:
     """Name of the simulated detector; None if the file does not contain it."""
-    try:
-        detector = json.loads(recorded_attributes(source).get(SIMULATION, "{}"))["detector"]
-        name = detector["name"]
-    except (ValueError, LookupError, TypeError):
-        return None
-    return name if isinstance(name, str) else None
+    with suppress(ValueError, LookupError, TypeError):
+        return str(json.loads(recorded_attributes(source)[SIMULATION])["detector"]["name"])
+    return None
 
 
 def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
@@ -153,7 +137,7 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
     Parameters
     ----------
     waveforms
-        Traces of shape ``(n, samples)``.
+        Traces of shape ``(n, samples)``, of which the first few hundred are looked at.
 
     Examples
     --------
@@ -167,7 +151,8 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
     >>> apparent_side((charge + noise / 3000)[None]) is None
     True
     """
-    known = waveforms[np.isfinite(waveforms).all(axis=1)].astype(float)
+    known = waveforms[:_FIRST_PULSES]
+    known = known[np.isfinite(known).all(axis=1)].astype(float)
     known = known[np.ptp(known, axis=1) > 0] if known.size else known
     if not len(known) or known.shape[1] < _MIN_SAMPLES:
         return None
@@ -216,59 +201,30 @@ def provenance(source: PulseSource) -> dict[str, str]:
     """
     told = recorded_attributes(source)
     words = {"made by": told.get(MADE_BY, ""), "side": told.get(SIDE, "")}
-    words |= _of_simulation(_parsed(told.get(SIMULATION)))
     if TRANSLATED_BY in told:
         part = told[TRANSLATED_BY].rpartition(" ")[2].upper()
         words["translated"] = f"by the {part} of {told.get(RUN, 'an unknown run')}"
-        words |= _of_translation(_parsed(told.get(TRANSLATION)))
+    # other programs may have attributes of these names
+    with suppress(ValueError, LookupError, TypeError, AttributeError):
+        words |= _of_simulation(json.loads(told[SIMULATION]))
+    with suppress(ValueError, LookupError, TypeError, AttributeError):
+        words["options"] = ", ".join(_given(json.loads(told[TRANSLATION])["options"]))
     return {name: text for name, text in words.items() if text}
 
 
-def _parsed(text: str | None) -> Mapping[str, Any]:
-    with suppress(ValueError, TypeError):
-        found = json.loads(text or "")
-        if isinstance(found, dict):
-            return found
-    return {}
-
-
-def _of_simulation(made: Mapping[str, Any]) -> dict[str, str]:
-    detector, hits, settings = (
-        found if isinstance(found := made.get(name), Mapping) else {}
-        for name in ("detector", "hits", "settings")
-    )
-    if not detector:
-        return {}
-    physics = [str(detector.get("name"))]
-    physics += [
-        f"{detector[name]:g} {unit}"
-        for name, unit in (("bias_V", "V"), ("temperature_K", "K"))
-        if isinstance(detector.get(name), int | float)
-    ]
-    if isinstance(settings.get("cloud_fwhm_mm"), int | float):
-        physics.append(f"charge clouds of {settings['cloud_fwhm_mm']:g} mm")
-    words = {"detector": ", ".join(physics), "hits": _of_hits(hits)}
+def _of_simulation(made: Any) -> dict[str, str]:
+    detector, hits, cloud = made["detector"], made["hits"], made["settings"]["cloud_fwhm_mm"]
+    physics = f"{detector['name']}, {detector['bias_V']:g} V, {detector['temperature_K']:g} K"
+    words = {
+        "detector": f"{physics}, charge clouds of {cloud:g} mm",
+        "hits": hits.get("monte_carlo", ""),
+    }
+    if "file" in hits:
+        flipped = ", z flipped" if hits["flip_z"] else ""
+        words["hits"] = f"{Path(hits['file']).name}, origin {hits['origin_mm']} mm{flipped}"
     if "events" in made:  # a stand records them in its ``stand.json``
-        lost, seed = made.get("events_without_signal"), made.get("seed")
+        lost, seed = made["events_without_signal"], made["seed"]
         words["events"] = f"{made['events']}, of which {lost} without a signal; seed {seed}"
-    return words
-
-
-def _of_hits(hits: Mapping[str, Any]) -> str:
-    if "file" not in hits:
-        return str(hits.get("monte_carlo", ""))
-    frame = f"origin {hits.get('origin_mm')} mm" + (", z flipped" if hits.get("flip_z") else "")
-    return f"{Path(str(hits['file'])).name}, {frame}"
-
-
-def _of_translation(record: Mapping[str, Any]) -> dict[str, str]:
-    source, chosen = record.get("source"), record.get("options")
-    words = {}
-    if isinstance(source, Mapping) and isinstance(source.get("files"), list):
-        names = [str(one.get("name")) for one in source["files"] if isinstance(one, Mapping)]
-        words["from"] = ", ".join(names)
-    if isinstance(chosen, Mapping):
-        words["options"] = ", ".join(_given(chosen))
     return words
 
 

@@ -16,7 +16,7 @@ from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.preparation import Kind, Prepared
-from cpunet.pulses.provenance import require_apparent_side, require_recorded_side
+from cpunet.pulses.provenance import apparent_side, recorded_side, refuse_other_side
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.spectrum import suggested_calibration
@@ -152,7 +152,9 @@ class Seen:
         self, source: PulseSource, side: Kind, config: PreparationConfig, *, insist: bool
     ) -> None:
         self._path, self._side, self._config, self._insist = source.path, side, config, insist
-        self._recorded = require_recorded_side(source, side, SWAPPED)
+        recorded = recorded_side(source)
+        refuse_other_side(recorded, source.path, side, SWAPPED)
+        self._guess = recorded is None and not insist
         self._kev, self._amplitudes = list[Values](), list[Values]()
         self._first: npt.NDArray[np.float32] | None = None
         self._baselines = list[Baselines]()
@@ -161,8 +163,9 @@ class Seen:
     def __call__(self, block: Pulses, usable: Prepared) -> None:
         """Keep what is needed of a block, of which some pulses can be used."""
         if self._first is None:
-            if not (self._recorded or self._insist):
-                require_apparent_side(self._path, block.waveforms, self._side, SWAPPED)
+            if self._guess:
+                found = apparent_side(block.waveforms)
+                refuse_other_side(found, self._path, self._side, SWAPPED)
             self._first = block.waveforms[:RATE_TRACES].copy()
         self._kev.append(block.energy_kev)
         self._amplitudes.append(amplitude(block.waveforms))
