@@ -19,8 +19,10 @@ from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_steps import (
+    Columns,
     Steps,
     choose,
+    in_memory,
     require_physics,
     require_some,
     to_hits,
@@ -48,7 +50,8 @@ _ZIP_MAGIC = b"PK"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
 # More hits outside the crystal are those of another frame, or of another detector.
 _MISPLACED_PERCENT = 1.0
-_NEEDED = ("x_mm", "y_mm", "z_mm", "edep_keV", "offsets")  # arrays of an NPZ
+# arrays of an NPZ beside the offsets, as columns of steps
+_ARRAYS = {f"{axis}_mm": (axis, "mm") for axis in "xyz"} | {"edep_keV": ("edep", "keV")}
 
 
 def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
@@ -178,23 +181,17 @@ def _steps(path: Path, options: HitOptions) -> Steps:
 def _npz(path: Path) -> Steps:
     """Read the steps of an archive. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
     arrays = read_arrays(path)
-    missing = [name for name in _NEEDED if name not in arrays]
-    if missing:
-        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(_NEEDED)}")
-    for name in _NEEDED:
-        values = arrays[name]
-        if values.ndim != 1 or values.dtype.kind not in "iuf":
-            raise CpunetError(
-                f"{path}: array {name} is of {values.dtype} and shape {values.shape}; give "
-                "one number per hit, and offsets of the events"
-            )
-    x, y, z, edep = (np.asarray(arrays[name], float) for name in _NEEDED[:-1])
+    needed = [*_ARRAYS, "offsets"]
+    if missing := [name for name in needed if name not in arrays]:
+        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
     offsets = whole_numbers(path, "offsets", arrays["offsets"])
-    rising = len(offsets) > 0 and offsets[0] == 0 and not np.any(np.diff(offsets) < 0)
-    if not rising or {len(a) for a in (x, y, z, edep)} != {int(offsets[-1])}:
+    counts = np.diff(offsets)
+    if offsets.ndim != 1 or not len(offsets) or offsets[0] or np.any(counts < 0):
         raise CpunetError(f"{path}: offsets do not divide the hits into events")
-    event = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    return Steps(event, np.stack([x, y, z], axis=1), edep)
+    columns = {"event": in_memory(np.repeat(np.arange(len(counts)), counts))}
+    for name, (role, unit) in _ARRAYS.items():
+        columns[role] = in_memory(arrays[name], unit)
+    return Columns(path, columns).steps(HitOptions())
 
 
 def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,12 @@ _NS = {"ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9, "ps": 1e-3}
 _LEAST_KEV, _MOST_KEV = 5.0, 1e5
 # values of a column for all steps, and the unit that belongs to them ("" for none)
 ReadColumn = Callable[[], tuple[npt.NDArray[Any], str]]
+
+
+def in_memory(values: npt.NDArray[Any], unit: str = "") -> ReadColumn:
+    """A column that is in memory already."""
+    return lambda: (values, unit)
+
 
 # what a column is, and its names in small letters: the first that is there is read
 _NAMES = {
@@ -249,81 +256,86 @@ def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     return found
 
 
-def steps_of(path: Path, columns: Mapping[str, ReadColumn], options: HitOptions) -> Steps:
-    """Steps of a table with these columns.
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a table of steps, by name, each of which is read when it is needed."""
 
-    Raises
-    ------
-    CpunetError
-        If a column is missing, is no number, names no known unit or differs in length.
-    """
-    found = roles(columns)
-    if missing := [role for role in NEEDED if role not in found]:
-        raise CpunetError(
-            f"{path}: no column for {missing[0]}; the file holds {', '.join(columns)}"
+    path: Path
+    read: Mapping[str, ReadColumn]
+
+    @cached_property
+    def roles(self) -> dict[str, tuple[str, str]]:
+        """What there is, see `roles`."""
+        return roles(self.read)
+
+    def steps(self, options: HitOptions) -> Steps:
+        """Steps of all detectors.
+
+        Raises
+        ------
+        CpunetError
+            If a column is missing, is no number, names no known unit or differs in length.
+        """
+        path, found = self.path, self.roles
+        if missing := [role for role in NEEDED if role not in found]:
+            raise CpunetError(
+                f"{path}: no column for {missing[0]}; the file holds {', '.join(self.read)}"
+            )
+        values: dict[str, npt.NDArray[Any]] = {}
+        for role, (name, in_name) in found.items():
+            if role == "detector":
+                continue
+            read, unit = self.read[name]()
+            if read.ndim != 1 or read.dtype.kind not in "iuf":
+                raise CpunetError(
+                    f"{path}: column {name} is of {read.dtype} and shape {read.shape}; give "
+                    "one number per step (g4simple: its option for steps)"
+                )
+            if role == "event":
+                values[role] = whole_numbers(path, name, read)
+            else:
+                values[role] = read * unit_factor(options, role, path, name, unit or in_name)
+            if len(read) != len(values["event"]):
+                raise CpunetError(
+                    f"{path}: columns {name} and {found['event'][0]} differ in length; "
+                    "truncated?"
+                )
+        position = np.stack([values[axis] for axis in "xyz"], axis=1)
+        return Steps(values["event"], position, values["edep"], values.get("time"))
+
+    def labels(self) -> npt.NDArray[np.str_] | None:
+        """Detector of each step as text, or None if no column tells it."""
+        if "detector" not in self.roles:
+            return None
+        labels = self.read[self.roles["detector"][0]]()[0]
+        if labels.dtype.kind == "f" and np.array_equal(labels, np.rint(labels)):
+            labels = labels.astype(np.int64)
+        if labels.dtype.kind in "SO":
+            return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in labels])
+        return labels.astype(np.str_)
+
+    def detectors(self) -> list[str]:
+        """Detectors with deposits; those without are the world or a holder."""
+        labels = self.labels()
+        if labels is None or "edep" not in self.roles:
+            return []
+        edep = self.read[self.roles["edep"][0]]()[0]
+        if len(edep) != len(labels):
+            return []  # the reader of the steps reports it
+        return sorted(
+            map(str, np.unique(labels[edep > 0])),
+            key=lambda label: (len(label), label) if label.isdigit() else (99, label),
         )
-    values: dict[str, npt.NDArray[Any]] = {}
-    for role, (name, in_name) in found.items():
-        if role == "detector":
-            continue
-        read, unit = columns[name]()
-        if read.ndim != 1 or read.dtype.kind not in "iuf":
+
+    def steps_of(self, detector: str | None, options: HitOptions) -> Steps:
+        """Steps of a detector by its label, or of the only one if none is given."""
+        steps, labels = self.steps(options), self.labels()
+        if labels is not None and len(labels) != len(steps.event):
             raise CpunetError(
-                f"{path}: column {name} is of {read.dtype} and shape {read.shape}; give one "
-                "number per step (g4simple: its option for steps)"
+                f"{self.path}: the column of detectors differs in length; truncated?"
             )
-        if role == "event":
-            values[role] = whole_numbers(path, name, read)
-        else:
-            values[role] = read * unit_factor(options, role, path, name, unit or in_name)
-        if len(read) != len(values["event"]):
-            raise CpunetError(
-                f"{path}: columns {name} and {found['event'][0]} differ in length; truncated?"
-            )
-    position = np.stack([values[axis] for axis in "xyz"], axis=1)
-    return Steps(values["event"], position, values["edep"], values.get("time"))
-
-
-def detector_labels(columns: Mapping[str, ReadColumn]) -> npt.NDArray[np.str_] | None:
-    """Detector of each step as text, or None if no column tells it."""
-    name, _ = roles(columns).get("detector", ("", ""))
-    if not name:
-        return None
-    labels = columns[name]()[0]
-    if labels.dtype.kind == "f" and np.array_equal(labels, np.rint(labels)):
-        labels = labels.astype(np.int64)
-    if labels.dtype.kind in "SO":
-        return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in labels])
-    return labels.astype(np.str_)
-
-
-def detectors_there(columns: Mapping[str, ReadColumn]) -> list[str]:
-    """Detectors with deposits; those without are the world or a holder."""
-    labels, found = detector_labels(columns), roles(columns)
-    if labels is None or "edep" not in found:
-        return []
-    edep = columns[found["edep"][0]]()[0]
-    if len(edep) != len(labels):
-        return []  # the reader of the steps reports it
-    there = [str(label) for label in np.unique(labels[edep > 0])]
-    return sorted(
-        there, key=lambda label: (len(label), label) if label.isdigit() else (99, label)
-    )
-
-
-def of_detector(
-    path: Path, steps: Steps, columns: Mapping[str, ReadColumn], detector: str | None
-) -> Steps:
-    """Steps of a detector by its label, or of the only one if none is given."""
-    labels = detector_labels(columns)
-    if labels is None:
-        choose(path, [], detector)
-        return steps
-    if len(labels) != len(steps.event):
-        raise CpunetError(f"{path}: the column of detectors differs in length; truncated?")
-    there = detectors_there(columns)
-    choose(path, there, detector)
-    return steps if detector is None else steps[labels == detector]
+        choose(self.path, self.detectors(), detector)
+        return steps if detector is None else steps[labels == detector]
 
 
 def choose(path: Path, there: list[str], detector: str | None) -> str | None:

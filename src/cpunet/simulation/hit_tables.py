@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise, takewhile
@@ -18,13 +17,11 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
 from cpunet.simulation.hit_steps import (
     NEEDED,
-    ReadColumn,
+    Columns,
     Steps,
     choose,
-    detectors_there,
-    of_detector,
+    in_memory,
     roles,
-    steps_of,
     unit_factor,
 )
 from cpunet.simulation.hits import HitOptions
@@ -69,9 +66,8 @@ def read_table(path: Path, table: Table, options: HitOptions, rows: slice = _ALL
         options = in_g4simples_units(options)
     with opened(path) as file:
         columns = _columns(path, file[table.name], rows)
-        steps = steps_of(path, columns, options)
-        if table.label is not None:
-            steps = of_detector(path, steps, columns, table.label)
+        shared = table.label is not None
+        steps = columns.steps_of(table.label, options) if shared else columns.steps(options)
         origin = _origin(path, file, table.label or table.name.rpartition("/")[2])
     return replace(steps, position_mm=steps.position_mm - origin)
 
@@ -114,7 +110,7 @@ def detectors_of(path: Path) -> dict[str, Table]:
                 if not isinstance(table, h5py.Group) or not set(NEEDED) <= roles(table).keys():
                     continue
                 place = f"{folder}/{name}"
-                labels = detectors_there(_columns(path, table, _ALL))
+                labels = _columns(path, table, _ALL).detectors()
                 if len(labels) > 1 or (labels and folder == NTUPLES):
                     found |= {label: Table(place, label) for label in labels}
                 else:
@@ -122,14 +118,15 @@ def detectors_of(path: Path) -> dict[str, Table]:
     return found
 
 
-def _columns(path: Path, table: h5py.Group, rows: slice) -> Mapping[str, ReadColumn]:
+def _columns(path: Path, table: h5py.Group, rows: slice) -> Columns:
     """Columns of a table, not yet read. The vectors of deposits tell the steps of each row."""
     edep = table[roles(table)["edep"][0]]
     counts = np.diff(_ends(edep, rows)) if _is_vectors(edep) else None
-    return {
+    read = {
         str(name): partial(_read, path, str(name), item, rows, counts)
         for name, item in table.items()
     }
+    return Columns(path, read)
 
 
 def _is_vectors(item: Any) -> bool:
@@ -208,16 +205,15 @@ def read_csv(path: Path, options: HitOptions) -> Steps:
     title, columns = _csv_columns(path)
     if title == _G4SIMPLE_TITLE:
         options = in_g4simples_units(options)
-    steps = steps_of(path, columns, options)
-    return of_detector(path, steps, columns, options.hits_detector)
+    return columns.steps_of(options.hits_detector, options)
 
 
 def csv_detectors(path: Path) -> list[str]:
     """Detectors with deposits, by their number or name; empty if no column tells them."""
-    return detectors_there(_csv_columns(path)[1])
+    return _csv_columns(path)[1].detectors()
 
 
-def _csv_columns(path: Path) -> tuple[str, Mapping[str, ReadColumn]]:
+def _csv_columns(path: Path) -> tuple[str, Columns]:
     """Title of the file, and its columns."""
     from pandas import DataFrame, read_csv  # half a second, which other formats do not need
 
@@ -243,8 +239,5 @@ def _csv_columns(path: Path) -> tuple[str, Mapping[str, ReadColumn]]:
         raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
     if cells[n - 1].isna().any():
         raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
-
-    def reader(at: int) -> ReadColumn:
-        return lambda: (cells[at].to_numpy(), "")
-
-    return title, {name: reader(at) for at, name in enumerate(names)}
+    read = {name: in_memory(cells[at].to_numpy()) for at, name in enumerate(names)}
+    return title, Columns(path, read)
