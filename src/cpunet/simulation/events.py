@@ -115,10 +115,7 @@ def simulate_events(
     outcome = np.zeros(len(table), np.int8)
     task = drift_task(fields, settings, stride)
     sums = (waveforms, lost_kev, trapped_kev, outcome)
-    if library is None:
-        _sum_exact(maps, table, hits.offsets, task, *sums)
-    else:
-        _sum_library(maps, library, table, hits.offsets, task, *sums)
+    _sum_events(maps, library, table, hits.offsets, task, *sums)
     return EventPulses(
         waveforms=waveforms,
         dt_ns=settings.dt_ns,
@@ -131,8 +128,9 @@ def simulate_events(
 
 
 @kernel(parallel=True)
-def _sum_exact(
+def _sum_events(
     maps: DriftMaps,
+    library: PulseLibrary | None,
     hits: FloatArray,
     offsets: npt.NDArray[np.int64],
     task: Task,
@@ -141,37 +139,7 @@ def _sum_exact(
     trapped_kev: FloatArray,
     outcome: npt.NDArray[np.int8],
 ) -> None:
-    for event in prange(len(offsets) - 1):
-        out = np.zeros(task.n_samples)
-        signal = np.empty(task.n_samples * task.per_sample)
-        lost = collected = trapped = 0.0
-        for i in range(offsets[event], offsets[event + 1]):
-            hit = hits[i]
-            if not in_active_volume(maps, hit[0], hit[1], hit[2]):
-                outcome[i] = NO_SIGNAL
-                lost += hit[3]
-                continue
-            collected += hit[3]
-            outcome[i], share = _add_drifted(maps, hit, task, signal, out)
-            trapped += hit[3] * share
-        lost_kev[event], trapped_kev[event] = lost, trapped
-        if collected > trapped:
-            for j in range(len(out)):
-                waveforms[event, j] = out[j] / (collected - trapped)
-
-
-@kernel(parallel=True)
-def _sum_library(
-    maps: DriftMaps,
-    library: PulseLibrary,
-    hits: FloatArray,
-    offsets: npt.NDArray[np.int64],
-    task: Task,
-    waveforms: npt.NDArray[np.float32],
-    lost_kev: FloatArray,
-    trapped_kev: FloatArray,
-    outcome: npt.NDArray[np.int8],
-) -> None:
+    """Fill the pulses and energies of events; compiled once with a library and once without."""
     n_events, n_samples = waveforms.shape
     # work arrays are shared by a chunk of events
     for chunk in prange((n_events + _CHUNK - 1) // _CHUNK):
@@ -191,14 +159,22 @@ def _sum_library(
                     lost += hit[3]
                     continue
                 collected += hit[3]
-                if covers(library, hit[0], hit[1], hit[2], hit[3]):
-                    outcome[i] = INTERPOLATED
-                    trapped += add_pulse(library, hit, hit[3], 0, quick, steps)
-                else:
+                known = False
+                if library is not None:
+                    known = covers(library, hit[0], hit[1], hit[2], hit[3])
+                    if known:
+                        outcome[i] = INTERPOLATED
+                        trapped += add_pulse(library, hit, hit[3], 0, quick, steps)
+                if not known:
                     outcome[i], part = _add_drifted(maps, hit, task, signal, out)
                     trapped += hit[3] * part
             lost_kev[event], trapped_kev[event] = lost, trapped
-            if collected > trapped:
+            if collected <= trapped:
+                continue
+            if library is None:
+                for j in range(n_samples):
+                    waveforms[event, j] = out[j] / (collected - trapped)
+            else:
                 share, flat = 1.0 / (collected - trapped), 0.0
                 for j in range(n_samples):
                     flat += steps[j]
