@@ -187,17 +187,11 @@ def tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
 
 
 # Stable rejection codes; `preparation.Rejection` names them.
-ACCEPTED = 0
-NAN = 1
-CONSTANT = 2
-SATURATED = 3
-WINDOW_OUTSIDE_RECORD = 4
-NO_AMPLITUDE = 5
-TAIL_NOT_POSITIVE = 6
+ACCEPTED, NAN, CONSTANT, SATURATED = range(4)
+WINDOW_OUTSIDE_RECORD, NO_AMPLITUDE, TAIL_NOT_POSITIVE = range(4, 7)
 
 # Columns of the table of numbers kept for each pulse.
 BASELINE, SCALE, ALIGN_SAMPLE, BASELINE_RMS, BASELINE_SLOPE, TAIL_SLOPE, CHI2 = range(7)
-N_COLUMNS = 7
 
 # The alignment moves the baseline window, and the baseline moves the 99.9 % threshold by
 # a thousandth of its own change.  Two rounds settle all but exact ties.
@@ -396,13 +390,13 @@ def prepare_block(
     -------
     tuple
         Codes of shape ``(n,)``.  For the accepted traces, windows of shape ``(kept,
-        samples_before + samples_after)`` and numbers of shape ``(kept, N_COLUMNS)``, with
+        samples_before + samples_after)`` and numbers of shape ``(kept, columns)``, with
         slopes per sample.
     """
     n = len(waveforms)
     length = settings.samples_before + settings.samples_after
     windows = np.empty((n, length), np.float32)
-    numbers = np.empty((n, N_COLUMNS))
+    numbers = np.empty((n, CHI2 + 1))
     codes = np.empty(n, np.uint8)
     kept = _prepare_block(np.ascontiguousarray(waveforms), settings, windows, numbers, codes)
     # Releases the unused rows without copying the others.

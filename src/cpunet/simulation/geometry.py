@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterable
 from itertools import chain
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -116,30 +116,35 @@ class Detector(Config):
 
     def _problems_of_shape(self) -> Iterable[str]:
         length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
-        top_radius = radius - self.outer_taper_length * math.tan(self.taper_angles_rad[0])
-        top_radius -= self.narrower("top")
-        bore_mouth = self.bore_radius + self.inner_taper_length * math.tan(
-            self.taper_angles_rad[1]
-        )
+        outer, inner, bottom = map(math.tan, self.taper_angles_rad)
+        top_radius = radius - self.outer_taper_length * outer - self.narrower("top")
+        bore_mouth = self.bore_radius + self.inner_taper_length * inner
         bore_mouth = max(bore_mouth, self.top_groove_radius)
-        bottom_radius = radius - self.bottom_taper_length * math.tan(self.taper_angles_rad[2])
-        bottom_radius -= self.narrower("bottom")
+        bottom_radius = radius - self.bottom_taper_length * bottom - self.narrower("bottom")
         ditch_inner = self.wrap_around_radius - self.ditch_thickness
-        sides: tuple[Literal["top", "bottom"], ...] = ("top", "bottom")
-        for side in sides:
-            depth = self.narrower(side)
-            if depth and getattr(self, f"{side}_bullet_radius"):
+        tapers = {"top": self.outer_taper_length, "bottom": self.bottom_taper_length}
+        for side, taper in tapers.items():
+            depth, bullet = self.narrower(side), getattr(self, f"{side}_bullet_radius")
+            if depth and bullet:
                 yield f"{side}_bullet_radius and {side}_cylinder_radius cannot both be given"
             if not 0 <= depth < radius:
                 yield f"{side}_cylinder_radius must be above 0 and at most crystal_radius"
+            if bullet and taper:
+                which = "outer" if side == "top" else side
+                yield f"{side}_bullet_radius and {which}_taper_length cannot both be given"
+        for one, other in (
+            ("bore_length", "bore_radius"),
+            ("ditch_depth", "ditch_thickness"),
+            ("top_groove_depth", "top_groove_radius"),
+        ):
+            if (getattr(self, one) > 0) != (getattr(self, other) > 0):
+                yield f"{one} and {other} must both be given, or both be 0"
         if 2 * li >= min(length, radius):
             yield "li_thickness leaves nothing of the crystal"
         if self.outer_taper_length + self.bottom_taper_length > length:
             yield "outer_taper_length and bottom_taper_length exceed crystal_length"
         if bottom_radius <= max(self.wrap_around_radius, self.point_contact_radius):
             yield "crystal_radius ends, with bottom_taper_length, inside a contact on z = 0"
-        if (self.bore_length > 0) != (self.bore_radius > 0):
-            yield "bore_length and bore_radius must both be given, or both be 0"
         if self.bore_length + 2 * li + self.point_contact_length >= length:
             which = "bore_length (with li_thickness)" if self.bore_length else "li_thickness"
             yield f"{which} reaches the point contact (point_contact_length)"
@@ -149,14 +154,8 @@ class Detector(Config):
             yield "bore_bullet_radius exceeds bore_radius or bore_length"
         if top_radius - bore_mouth <= 2 * li:
             yield "outer_taper_length or inner_taper_length leaves no germanium at the top"
-        if self.top_bullet_radius and self.outer_taper_length:
-            yield "top_bullet_radius and outer_taper_length cannot both be given"
-        if self.bottom_bullet_radius and self.bottom_taper_length:
-            yield "bottom_bullet_radius and bottom_taper_length cannot both be given"
         if self.top_bullet_radius + self.bottom_bullet_radius > min(length, radius):
             yield "top_bullet_radius and bottom_bullet_radius exceed the crystal"
-        if (self.ditch_depth > 0) != (self.ditch_thickness > 0):
-            yield "ditch_depth and ditch_thickness must both be given, or both be 0"
         if self.wrap_around_radius and ditch_inner < self.point_contact_radius:
             yield "point_contact_radius meets the ditch (wrap_around_radius - ditch_thickness)"
         if self.ditch_depth and not self.wrap_around_radius:
@@ -167,8 +166,6 @@ class Detector(Config):
             yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
         if self.ditch_depth + max(self.bore_length, self.top_groove_depth) + li >= length:
             yield "ditch_depth reaches the bore (bore_length) or the top"
-        if (self.top_groove_depth > 0) != (self.top_groove_radius > 0):
-            yield "top_groove_depth and top_groove_radius must both be given, or both be 0"
         narrow = self.bottom_cylinder_length + self.bottom_transition_length
         if narrow + self.top_cylinder_length > length:
             yield "bottom_cylinder_length and top_cylinder_length exceed crystal_length"
@@ -193,11 +190,13 @@ class Detector(Config):
     @property
     def taper_angles_rad(self) -> tuple[float, float, float]:
         """Angles of the outer, bore and bottom tapers in rad."""
-        inner = self.inner_taper_angle_deg
-        inner = self.taper_angle_deg if inner is None else inner
-        degrees = (self.taper_angle_deg, inner, self.bottom_taper_angle_deg)
-        outer_rad, inner_rad, bottom_rad = (math.radians(d) for d in degrees)
-        return outer_rad, inner_rad, bottom_rad
+        outer, inner = self.taper_angle_deg, self.inner_taper_angle_deg
+        inner = outer if inner is None else inner
+        return (
+            math.radians(outer),
+            math.radians(inner),
+            math.radians(self.bottom_taper_angle_deg),
+        )
 
     @property
     def ditch_walls(self) -> tuple[float, float, float]:
@@ -306,26 +305,26 @@ class Detector(Config):
         into_top = z - (self.crystal_length - self.outer_taper_length)
         into_bottom = self.bottom_taper_length - z
         straight = np.full_like(z, self.crystal_radius - shift)
-        if depth := self.narrower("top"):
-            beyond = self.crystal_length - self.top_cylinder_length - z
-            straight -= self._step(depth, beyond, 0.0, shift)
-        if depth := self.narrower("bottom"):
-            beyond = z - self.bottom_cylinder_length
-            straight -= self._step(depth, beyond, self.bottom_transition_length, shift)
+        beyond = self.crystal_length - self.top_cylinder_length - z
+        straight -= self._step(self.narrower("top"), beyond, 0.0, shift)
+        beyond, widening = z - self.bottom_cylinder_length, self.bottom_transition_length
+        straight -= self._step(self.narrower("bottom"), beyond, widening, shift)
         if self.outer_taper_length:
             straight -= self._taper(into_top, top, shift)
         if self.bottom_taper_length:
             straight -= self._taper(into_bottom, bottom, shift)
         return straight
 
-    def narrower(self, side: Literal["top", "bottom"]) -> float:
-        """Radius of the crystal less that of the cylinder at an end, if there is one, in mm."""
-        if side == "top":
-            there, radius = self.top_cylinder_length > 0, self.top_cylinder_radius
-        else:
-            there = self.bottom_cylinder_length + self.bottom_transition_length > 0
+    def narrower(self, side: str) -> float:
+        """Radius of the crystal less that of the cylinder at an end, if there is one, in mm.
+
+        The end is ``"top"`` or ``"bottom"``.
+        """
+        length, radius = self.top_cylinder_length, self.top_cylinder_radius
+        if side == "bottom":
+            length = self.bottom_cylinder_length + self.bottom_transition_length
             radius = self.bottom_cylinder_radius
-        return self.crystal_radius - radius if there else 0.0
+        return self.crystal_radius - radius if length > 0 else 0.0
 
     @staticmethod
     def _step(depth: float, beyond: FloatArray, length: float, shift: float) -> FloatArray:

@@ -70,15 +70,13 @@ _MEASURED = {
     ),
 }
 # Shapes that change nothing where their radius is another one, or they have no size.
-_EXTRA = (
-    ("top_groove", "bore_radius", ("top_groove_depth",)),
-    ("top_cylinder", "crystal_radius", ("top_cylinder_length",)),
-    (
-        "bottom_cylinder",
-        "crystal_radius",
-        ("bottom_cylinder_length", "bottom_transition_length"),
+_EXTRA = {
+    "top_groove_radius": ("bore_radius", ["top_groove_depth"]),
+    "top_cylinder_radius": ("crystal_radius", ["top_cylinder_length"]),
+    "bottom_cylinder_radius": (
+        "crystal_radius", ["bottom_cylinder_length", "bottom_transition_length"],
     ),
-)
+}  # fmt: skip
 # of the argon around LEGEND's detectors
 LIQUID_ARGON_K = 87.0
 _SIMULATED = ("icpc", "bege", "ppc")
@@ -133,8 +131,7 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(diode["geometry"], Mapping):
         raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
     geometry = dict(flat(diode["geometry"]))
-    extra = diode["geometry"].get("extra") or {}
-    if _at(extra, "crack") and _at(extra, "crack.width_in_mm") != 0:
+    if _at(diode, "geometry.extra.crack") and geometry.get("extra.crack.width_in_mm") != 0:
         raise CpunetError(
             f"detector {name}: geometry.extra.crack cuts off a side; only axially symmetric "
             "crystals are simulated; remove it to simulate the crystal without it"
@@ -150,10 +147,10 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             )
         if field := _GEOMETRY[key]:
             values[field] = value
-    for shape, same, sizes in _EXTRA:
-        none = not any(values.get(size) for size in sizes)
-        if none or values.get(f"{shape}_radius") == values.get(same, 0):
-            values = {k: v for k, v in values.items() if k not in (f"{shape}_radius", *sizes)}
+    for radius, (same, sizes) in _EXTRA.items():
+        if not any(map(values.get, sizes)) or values.get(radius) == values.get(same, 0):
+            for field in (radius, *sizes):
+                values.pop(field, None)
     outer, inner = (
         _number_at(diode, f"geometry.groove.radius_in_mm.{side}", f"detector {name}", 0.0)
         for side in ("outer", "inner")
@@ -161,9 +158,9 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = outer - inner
     for field, places in _MEASURED.items():
-        found = [v for v in (_at(diode, p) for p in places) if isinstance(v, int | float)]
-        if known := [v for v in found if v > 0]:
-            values[field] = known[0]
+        for found in (_at(diode, place) for place in reversed(places)):
+            if isinstance(found, int | float) and found > 0:
+                values[field] = found
     return values | _impurities(diode, name)
 
 
@@ -243,12 +240,13 @@ def impurity_values(
             f"{source}: impurity_curve.model {model!r} is not known; there are "
             f"{', '.join(MODELS)}; {_ANOTHER}"
         )
-    numbers = {
-        key: _number_at(crystal, f"impurity_curve.parameters.{key}", source)
+    numbers = dict.fromkeys("abcn", 0.0) | {
+        "a" if key == "value" else key: _number_at(
+            crystal, f"impurity_curve.parameters.{key}", source
+        )
         for key in MODELS[model]
     }
-    a = numbers.get("value", numbers.get("a", 0.0))
-    b, c, n = (numbers.get(key, 0.0) for key in "bcn")
+    a, b, c, n = (numbers[key] for key in "abcn")
     place = f"slices.{slice_name}.detector_offset_in_mm"
     contact = _number_at(crystal, place, source)
     scale = _number_at(crystal, "impurity_curve.corrections.scale", source, 1.0)
