@@ -17,7 +17,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_prepared
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
-from cpunet.pulses.reading.arrays import MemorySource
+from cpunet.pulses.reading import PulseSource
 from cpunet.pulses.reading.files import PulseFile
 from synthetic import PREPARATION as CONFIG
 
@@ -255,7 +255,7 @@ SIZES |= {"decay_fit_samples": 10, "max_padding_before": 5}
 SHORT = CONFIG.model_copy(update=SIZES)
 
 
-def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> MemorySource:
+def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> PulseSource:
     energy_kev = np.asarray(energies, float)
     t = np.maximum(np.arange(60) - 27, 0)
     raw = (
@@ -263,7 +263,7 @@ def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> Memor
     )
     raw[broken or []] = np.nan
     pulses = Pulses.of(raw, dt_ns=16, energy_kev=energy_kev)
-    return MemorySource(PulseFile(Path("run7.lh5")), pulses)
+    return PulseFile(Path("run7.lh5"), pulses=pulses).open()
 
 
 @pytest.fixture(autouse=True)

@@ -67,7 +67,7 @@ def test_a_choice_between_arrays(tmp_path):
     with pytest.raises(CpunetError, match=r"2 arrays of two dimensions \(wf1, wf16\); choose"):
         open_pulses(path, dt_ns=16)
     assert open_pulses(path, table="wf16", dt_ns=16).length == 15
-    with pytest.raises(CpunetError, match=r"no array wf2 .*; there are wf1, wf16"):
+    with pytest.raises(CpunetError, match="no array wf2; there are wf1, wf16"):
         open_pulses(path, table="wf2", dt_ns=16)
 
 

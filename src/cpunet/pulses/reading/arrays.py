@@ -16,12 +16,13 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 from cpunet.tables import shortened
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
 
 Arrays = dict[str, npt.NDArray[Any]]
+Columns = dict[str, MemoryColumn]
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -53,72 +54,53 @@ def read_arrays(path: Path) -> Arrays:
 
 
 class ArraySource(PulseSource):
-    """An array of shape ``(events, samples)``.
+    """An array of shape ``(events, samples)``, with columns of values per event."""
+
+    def __init__(
+        self, options: PulseFile, format: str, name: str, waveforms: Any, columns: Columns
+    ) -> None:
+        self._waveforms = waveforms
+        layout = Layout.of_array(options.path, format, name, waveforms.shape, columns)
+        super().__init__(options, layout)
+
+    def _traces(self, size: int) -> Iterator[Traces]:
+        for start in range(0, len(self._waveforms), size):
+            yield Traces(self._waveforms[start : start + size])
+
+
+def open_memory(options: PulseFile, pulses: Pulses) -> ArraySource:
+    """Pulses in memory as a source."""
+    columns = {
+        "energy_kev": MemoryColumn(pulses.energy_kev),
+        "event_number": MemoryColumn(pulses.event_number),
+        "dt_ns": MemoryColumn(np.array(pulses.dt_ns)),
+    }
+    return ArraySource(options, "memory", "", pulses.waveforms, columns)
+
+
+def open_arrays(options: PulseFile) -> ArraySource:
+    """Open a NumPy file.
 
     The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array
     that the option ``table`` names. Arrays with one value per event, such as ``dt_ns`` (or
     ``dt``), energies and event numbers, are columns.
     """
-
-    def __init__(self, options: PulseFile) -> None:
-        arrays = read_arrays(options.path)
-        name = _waveform_name(options, arrays)
-        self._values = arrays[name]
-        if self._values.dtype.kind not in "iuf":
-            raise CpunetError(
-                f"{options.path}: array {name or 'in it'} is of {self._values.dtype}; save "
-                "plain numbers"
-            )
-        columns = {
-            name: MemoryColumn(values)
-            for name, values in arrays.items()
-            if values.ndim <= 1 and values.dtype.kind in "iufb"
-        }
-        super().__init__(
-            options, Layout.of_array(options.path, "NumPy", name, self._values.shape, columns)
-        )
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        for start in range(0, len(self._values), size):
-            yield Traces(self._values[start : start + size])
-
-
-class MemorySource(PulseSource):
-    """Pulses in memory."""
-
-    def __init__(self, options: PulseFile, pulses: Pulses) -> None:
-        self._in_memory = pulses
-        columns = {
-            "energy_kev": MemoryColumn(pulses.energy_kev),
-            "event_number": MemoryColumn(pulses.event_number),
-            "dt_ns": MemoryColumn(np.array(pulses.dt_ns)),
-        }
-        shape = pulses.waveforms.shape
-        super().__init__(options, Layout.of_array(options.path, "memory", "", shape, columns))
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        for start in range(0, len(self._in_memory), size):
-            yield Traces(self._in_memory.waveforms[start : start + size])
-
-
-def _waveform_name(options: PulseFile, arrays: Arrays) -> str:
+    arrays = read_arrays(options.path)
     matrices = [name for name, values in arrays.items() if values.ndim == 2]
-    if options.table is not None:
-        if options.table not in matrices:
-            raise CpunetError(
-                f"{options.path}: no array {options.table} of two dimensions; "
-                f"there are {shortened(matrices)}"
-            )
-        return options.table
-    named = [name for name in _WAVEFORMS if name in matrices] or matrices
-    if not named:
+    if not matrices:
         raise CpunetError(
             f"{options.path}: no waveforms in it; it holds {shortened(arrays)}; "
             "give an array of two dimensions (event, sample)"
         )
-    if len(named) > 1:
+    usual = [name for name in _WAVEFORMS if name in matrices and options.table is None]
+    name = choose_table(options, usual or matrices, "array", "arrays of two dimensions")
+    if (kind := arrays[name].dtype).kind not in "iuf":
         raise CpunetError(
-            f"{options.path}: {len(named)} arrays of two dimensions ({shortened(named)}); "
-            "choose one with `table` (`sim_table`, `data_table`)"
+            f"{options.path}: array {name or 'in it'} is of {kind}; save plain numbers"
         )
-    return named[0]
+    columns = {
+        name: MemoryColumn(values)
+        for name, values in arrays.items()
+        if values.ndim <= 1 and values.dtype.kind in "iufb"
+    }
+    return ArraySource(options, "NumPy", name, arrays[name], columns)

@@ -170,7 +170,7 @@ class Format(NamedTuple):
 
 HDF5 = Format("HDF5", (".lh5", ".h5", ".hdf5", ".hdf"), "hdf5", "open_hdf5")
 FLASHCAM = Format("FlashCam", (".fcio",), "flashcam", "FlashCamSource")
-NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "ArraySource")
+NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "open_arrays")
 PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "PickleSource")
 SPECTRUM = Format("spectrum", (".spe",), "siggen", "SpectrumSource")
 TEXT = Format("text", (), "siggen", "TextSource")
@@ -231,9 +231,9 @@ def open_pulses(
 def open_file(options: PulseFile) -> PulseSource:
     """Like `open_pulses`; a file of pulses in memory is a source, too."""
     if options.pulses is not None:
-        from cpunet.pulses.reading.arrays import MemorySource
+        from cpunet.pulses.reading.arrays import open_memory
 
-        return MemorySource(options, options.pulses)
+        return open_memory(options, options.pulses)
     # readers are imported when needed: the LH5 library alone takes seconds to load
     found = recognise(options.path)
     source: PulseSource = getattr(import_module(f"{__package__}.{found.module}"), found.opens)(

@@ -17,8 +17,7 @@ from fcio import FCIO, Tags, fcio_open
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces
-from cpunet.tables import shortened
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 
 
 class FlashCamSource(PulseSource):
@@ -33,7 +32,8 @@ class FlashCamSource(PulseSource):
             n_channels = _n_channels(options.path, stream)
             length = int(stream.config.eventsamples)
             period_ns = np.asarray(float(stream.config.sampling_period_ns))
-        self._channel = _channel(options, n_channels)
+        channels = [str(channel) for channel in range(n_channels)]
+        self._channel = int(choose_table(options, channels, "channel", "channels"))
         layout = Layout(
             format="FlashCam",
             table=str(self._channel),
@@ -116,22 +116,6 @@ def _next(path: Path, stream: FCIO) -> bool:
     except Exception as error:  # the library raises various errors on damaged records
         said = " ".join(str(error).split())
         raise CpunetError(f"{path}: damaged ({said}); copy it again") from error
-
-
-def _channel(options: PulseFile, n_channels: int) -> int:
-    known = [str(channel) for channel in range(n_channels)]
-    if options.table is None:
-        if n_channels == 1:
-            return 0
-        raise CpunetError(
-            f"{options.path}: {n_channels} channels ({shortened(known)}); "
-            "choose one with `table` (`sim_table`, `data_table`)"
-        )
-    if options.table not in known:
-        raise CpunetError(
-            f"{options.path}: no channel {options.table}; there are {shortened(known)}"
-        )
-    return int(options.table)
 
 
 @contextmanager

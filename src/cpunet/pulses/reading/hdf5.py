@@ -209,7 +209,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
     if item is None:
         known = sorted({c.table for c in _walk(file, set())}) or _tables(file)
         raise CpunetError(f"{path}: no table {table}; there are {shortened(known)}")
-    column = _as_column(item)
+    column = _column(file, table)
     if column is not None:
         return column
     found = list(_walk(item, set())) if isinstance(item, h5py.Group) else []
@@ -276,7 +276,7 @@ def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformCol
     if (info.fileno, info.addr) in seen:
         return
     seen.add((info.fileno, info.addr))
-    columns = [_as_column(group.get(name), group, name) for name in group]
+    columns = [_column(group, name) for name in group]
     found = [column for column in columns if column is not None]
     lh5_found = [column for column in found if column.is_lh5]
     plain = [column for name in _PLAIN for column in found if column.name == name]
@@ -292,27 +292,14 @@ def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformCol
             yield from _walk(inner, seen)
 
 
-def _as_column(
-    item: object, parent: h5py.Group | None = None, name: str | None = None
-) -> WaveformColumn | None:
-    """Return an item, `name` in `parent`, as a waveform column; None if it is not one."""
-    if isinstance(item, h5py.Group):
-        is_lh5 = text_attribute(item, "datatype").startswith("table") and (
-            "values" in item and "dt" in item
-        )
-        if not is_lh5:
-            return None
-    elif isinstance(item, h5py.Dataset):
-        is_lh5 = False
-        if item.ndim != 2 or item.dtype.kind not in "iuf":
-            return None
-    else:
-        return None
-    if parent is None or name is None:
-        table, _, name = item.name.rpartition("/")
-    else:
-        table = parent.name
-    return WaveformColumn(table.strip("/"), name, is_lh5)
+def _column(group: h5py.Group, name: str) -> WaveformColumn | None:
+    """Return what has this name (or path) in a group as waveforms; None if it is none."""
+    item = group.get(name)  # None for a broken link
+    is_lh5 = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
+    is_lh5 = is_lh5 and text_attribute(item, "datatype").startswith("table")
+    plain = isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
+    table, _, own = f"{group.name}/{name.strip('/')}".rpartition("/")
+    return WaveformColumn(table.strip("/"), own, is_lh5) if is_lh5 or plain else None
 
 
 def _tables(group: h5py.Group) -> list[str]:

@@ -33,8 +33,7 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
 from cpunet.pulses.reading.energies import MemoryColumn
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces
-from cpunet.tables import shortened
+from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
@@ -100,19 +99,9 @@ def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
     """Rows of the chosen detector, in order."""
     if options.table == WAVEFORMS:
         return np.arange(n)
-    known = detectors(file)
-    if options.table is None:
-        if len(known) > 1:
-            raise CpunetError(
-                f"{options.path}: {len(known)} detectors ({shortened(known)}); choose one with "
-                f"`table`, or all with `table` {WAVEFORMS}"
-            )
-        return np.arange(n)
-    if options.table not in known:
-        raise CpunetError(
-            f"{options.path}: no detector {options.table}; there are {shortened(known)}"
-        )
-    return np.flatnonzero(file[DETECTOR][()].astype(str) == options.table)
+    remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
+    chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
+    return np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
 
 
 def _columns(file: h5py.File) -> Iterator[tuple[str, npt.NDArray[np.generic], str]]:

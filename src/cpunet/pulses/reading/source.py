@@ -21,6 +21,7 @@ from cpunet.pulses.reading.energies import (
     resolve_sampling,
 )
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.tables import shortened
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 _MAX_NUMBER = 2.0**62
@@ -87,6 +88,42 @@ class Layout:
         period_name = "dt_ns" if "dt_ns" in columns else "dt"
         period = columns.get(period_name)
         return cls(format, name, shape[0], shape[1], columns, period_name, period)
+
+
+def choose_table(
+    options: PulseFile,
+    known: list[str],
+    one: str,
+    many: str,
+    remedy: str = "choose one with `table` (`sim_table`, `data_table`)",
+) -> str:
+    """The table that the user chose, or the only one.
+
+    Parameters
+    ----------
+    options
+        The file and what was chosen.
+    known
+        Tables in the file, at least one.
+    one, many
+        What a table and several are called.
+    remedy
+        What to do if nothing was chosen.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such table, or there are several and none was chosen.
+    """
+    if options.table is None:
+        if len(known) == 1:
+            return known[0]
+        raise CpunetError(f"{options.path}: {len(known)} {many} ({shortened(known)}); {remedy}")
+    if options.table not in known:
+        raise CpunetError(
+            f"{options.path}: no {one} {options.table}; there are {shortened(known)}"
+        )
+    return options.table
 
 
 @dataclass(frozen=True)
