@@ -341,7 +341,7 @@ def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
     with PulseWriter(path, samples=np.uint16, waveform_units="ADC") as writer:
         for rows in (slice(0, 1), slice(1, 4)):
             column = VectorOfVectors(hits[rows], dtype=np.float64)
-            writer.append(pulses[rows], others={"edep": column})
+            writer.append(pulses[rows], {"edep": column})
         with pytest.raises(CpunetError, match="write them to separate files"):
             writer.append(pulses)
         writer.stamp("made", "by hand")

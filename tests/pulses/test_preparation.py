@@ -215,7 +215,7 @@ class TestSets:
         raw[[3, 17, 18]] = np.nan
         pulses = Pulses.of(raw, dt_ns=DT_NS, energy_kev=np.arange(30.0))
         whole = prepare(pulses, CONFIG, "measured")
-        blocks = [prepare(pulses[s : s + 7], CONFIG, "measured", s) for s in range(0, 30, 7)]
+        blocks = [prepare(pulses[s : s + 7], CONFIG, "measured") for s in range(0, 30, 7)]
         joined = Prepared.concatenate(blocks)
         assert joined.rejections == whole.rejections == {"nan": 3}
         np.testing.assert_array_equal(joined.index, whole.index)

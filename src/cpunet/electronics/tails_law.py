@@ -78,11 +78,6 @@ class TailsLaw:
         r"""Expected number of pulses per decay time, :math:`R \tau`."""
         return self.rate_khz * 1e-3 * self.decay_us
 
-    @property
-    def mean_kev(self) -> float:
-        r"""Mean tail in keV, :math:`R \tau \langle E \rangle` (Campbell's theorem)."""
-        return self.expected * float(_some(self.energies_kev).mean())
-
     def share_above(self, kev: npt.ArrayLike) -> FloatArray:
         r"""Fraction of traces on which a single earlier pulse leaves more than `kev`.
 

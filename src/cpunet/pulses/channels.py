@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Generic, TypeVar
 from urllib.parse import quote
@@ -148,12 +149,12 @@ def each_channel(
             f"{out}: is the output of one channel; choose another `out` for the folders of "
             f"{len(channels)}"
         )
-    work = _Work(dict(channels), out, do)
+    make = partial(_work, dict(channels), out, do)
     done: dict[str, R] = {}
     failed: dict[str, str] = {}
     with (
         stage("Channels", len(channels)) as bar,
-        closing(outcomes(work.ready, list(channels), usable_cores())) as found,
+        closing(outcomes(make, list(channels), usable_cores())) as found,
     ):
         for name, outcome in found:
             bar.update()
@@ -166,23 +167,19 @@ def each_channel(
     return Outcome(in_order, {name: failed[name] for name in channels if name in failed})
 
 
-@dataclass(frozen=True)
-class _Work(Generic[R]):
+def _work(
+    channels: Mapping[str, Pair | CpunetError], out: Path, do: Callable[[str, Pair, Path], R]
+) -> Callable[[str], R]:
     """The work of each process: one channel after another."""
 
-    channels: dict[str, Pair | CpunetError]
-    out: Path
-    do: Callable[[str, Pair, Path], R]
-
-    def ready(self) -> Callable[[str], R]:
-        return self.channel
-
-    def channel(self, name: str) -> R:
-        pair = self.channels[name]
+    def work(name: str) -> R:
+        pair = channels[name]
         if isinstance(pair, CpunetError):
             raise pair
         log.info(f"{name}:")
-        return self.do(name, pair, self.out / name)
+        return do(name, pair, out / name)
+
+    return work
 
 
 def own_folder(folder: Path, name: str, file: str) -> Path:

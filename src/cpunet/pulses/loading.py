@@ -95,14 +95,13 @@ def load_prepared(
         If no pulse is left; the message gives the file, the counts by reason and a remedy.
     """
     sets: list[Prepared] = []
-    n_read = n_kept = 0
+    n_kept = 0
     rng, drawn = np.random.default_rng(0), list[FloatColumn]()
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
-            part = _prepare_selected(block, config, kind, selection, n_read)
+            part = _prepare_selected(block, config, kind, selection)
             if seen is not None:
                 seen(block, part)
-            n_read += len(block)
             n_kept += len(part)
             sets.append(part)
             drawn.append(rng.random(len(part)))
@@ -149,7 +148,6 @@ def _prepare_selected(
     config: PreparationConfig,
     kind: Kind,
     selection: EnergySelection | None,
-    first_index: int,
 ) -> Prepared:
     """Prepare the selected pulses of a block; the others are coded as not selected."""
     codes: Codes = np.zeros(len(block), np.uint8)
@@ -167,9 +165,7 @@ def _prepare_selected(
         selected = replace(selected, peak=label_peaks(selected.energy_kev, selection.peaks))
     part = prepare(selected, config, kind)
     codes[rows] = part.codes
-    return replace(
-        part, index=first_index + rows[part.index], codes=codes, first_index=first_index
-    )
+    return replace(part, index=rows[part.index], codes=codes)
 
 
 def _nothing_left(source: PulseSource, sets: list[Prepared]) -> CpunetError:

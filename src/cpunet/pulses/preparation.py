@@ -78,7 +78,7 @@ class Prepared:
     pulses
         Accepted pulses, windows of shape ``(n, samples_before + samples_after)``.
     index
-        Row of each pulse in the source.
+        Row of each pulse among all that were read, as of `codes`.
     baseline, scale
         Baseline and scale of the raw trace, in its units.
     align_sample
@@ -95,8 +95,6 @@ class Prepared:
         sample; NaN for pulses without noise.
     codes
         `Rejection` code of every row read, accepted or not.
-    first_index
-        Row of the source to which ``codes[0]`` belongs.
     """
 
     pulses: Pulses
@@ -109,7 +107,6 @@ class Prepared:
     tail_slope: FloatColumn
     chi2: FloatColumn
     codes: Codes
-    first_index: int = 0
 
     def __len__(self) -> int:
         return len(self.pulses)
@@ -151,7 +148,7 @@ class Prepared:
         if not reasons.any():
             return self
         codes = self.codes.copy()
-        codes[self.index - self.first_index] = reasons
+        codes[self.index] = reasons
         return replace(self[reasons == Rejection.ACCEPTED], codes=codes)
 
     @classmethod
@@ -167,25 +164,20 @@ class Prepared:
             If there is no set, or lengths or sampling periods differ.
         """
         pulses = Pulses.concatenate([s.pulses for s in sets])
-        first = sets[0].first_index
-        starts = first + np.cumsum([0, *(s.n_read for s in sets[:-1])])
-        shifted = [
-            s.index + (start - s.first_index) for s, start in zip(sets, starts, strict=True)
-        ]
+        starts = np.cumsum([0, *(s.n_read for s in sets[:-1])])
+        index = [s.index + start for s, start in zip(sets, starts, strict=True)]
         joined = {
             name: np.concatenate([getattr(s, name) for s in sets])
             for name in (*_PER_PULSE, "codes")
             if name not in ("pulses", "index")
         }
-        return cls(pulses=pulses, index=np.concatenate(shifted), first_index=first, **joined)
+        return cls(pulses=pulses, index=np.concatenate(index), **joined)
 
 
-_PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name not in ("codes", "first_index"))
+_PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name != "codes")
 
 
-def prepare(
-    pulses: Pulses, config: PreparationConfig, kind: Kind, first_index: int = 0
-) -> Prepared:
+def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     """Align, cut out and normalise every pulse (paper, section 3.3).
 
     The window is placed so that its sample ``samples_before`` is the first one after the
@@ -204,8 +196,6 @@ def prepare(
         Preparation settings: lengths in samples, fractions and levels.
     kind
         Normalisation: ``"measured"`` or ``"simulated"``.
-    first_index
-        Row of the first pulse in its source.
 
     Returns
     -------
@@ -248,7 +238,7 @@ def prepare(
             event_number=pulses.event_number[rows],
             peak=pulses.peak[rows],
         ),
-        index=first_index + rows,
+        index=rows,
         baseline=numbers[:, _kernels.BASELINE].copy(),
         scale=numbers[:, _kernels.SCALE].copy(),
         align_sample=numbers[:, _kernels.ALIGN_SAMPLE].astype(np.int64),
@@ -257,7 +247,6 @@ def prepare(
         tail_slope=numbers[:, _kernels.TAIL_SLOPE] * per_ms,
         chi2=numbers[:, _kernels.CHI2].copy(),
         codes=codes,
-        first_index=first_index,
     )
 
 

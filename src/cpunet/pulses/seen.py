@@ -167,6 +167,7 @@ class Seen:
                 found = apparent_side(block.waveforms)
                 refuse_other_side(found, self._path, self._side, SWAPPED)
             self._first = block.waveforms[:RATE_TRACES].copy()
+        start = sum(map(len, self._kev))  # row of the file of the first pulse
         self._kev.append(block.energy_kev)
         self._amplitudes.append(amplitude(block.waveforms))
         if self._side == "simulated":
@@ -175,8 +176,8 @@ class Seen:
             like = self._baselines[:1]
             self._baselines.append(Baselines.of_block(block, self._config, *like))
         if (wanted := WHOLE - sum(map(len, self._whole))) > 0:
-            self._rows.append(usable.index[:wanted])
-            self._whole.append(block[self._rows[-1] - usable.first_index])
+            self._rows.append(start + usable.index[:wanted])
+            self._whole.append(block[usable.index[:wanted]])
 
     def baselines(self, kept: Prepared) -> Baselines:
         """Baselines, and whole traces of the pulses that are kept."""

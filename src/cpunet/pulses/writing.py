@@ -23,7 +23,8 @@ from cpunet.pulses.container import Pulses
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-Columns = Mapping[str, tuple[npt.ArrayLike, str]]
+# values and units by name, or LH5 objects
+Columns = Mapping[str, tuple[npt.ArrayLike, str] | LGDO]
 
 # Chunks of whole traces: a block of events is read without decompressing others.
 _CHUNK_BYTES = 1 << 18
@@ -95,7 +96,7 @@ class PulseWriter:
         self._attrs = dict(attrs or {})
         self._shape: tuple[int, float, tuple[str, ...]] | None = None
         self._stack = ExitStack()
-        self._file: FileInTheMaking | None = None
+        self._file: FileInTheMaking  # within the writer's with block
         refuse_existing(self.path, force=force)
 
     def __enter__(self) -> Self:
@@ -111,12 +112,7 @@ class PulseWriter:
                 raise CpunetError(f"{self.path}: no pulses to write; nothing was written")
         self._stack.__exit__(*error)
 
-    def append(
-        self,
-        pulses: Pulses,
-        columns: Columns | None = None,
-        others: Mapping[str, LGDO] | None = None,
-    ) -> None:
+    def append(self, pulses: Pulses, columns: Columns | None = None) -> None:
         """Append a block of pulses.
 
         Parameters
@@ -124,30 +120,28 @@ class PulseWriter:
         pulses
             Pulses to append; an empty block adds nothing.
         columns
-            Further values per event: name → (array of shape ``(n,)``, units).
-        others
-            Further columns as LH5 objects of n rows.
+            Further values per event: name → (array of shape ``(n,)``, units), or an LH5 object
+            of n rows.
         """
-        assert self._file is not None  # within the writer's with block
-        extra, others = dict(columns or {}), dict(others or {})
-        self._require_same(pulses, extra | others)
+        extra = dict(columns or {})
+        self._require_same(pulses, extra)
         if len(pulses) == 0:
             return
-        content = {
+        content: dict[str, LGDO] = {
             "waveform": waveform_table(
                 pulses, t0_ns=self._t0_ns, units=self._waveform_units, samples=self._samples
             ),
             "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
             "event_number": Array(pulses.event_number),
         }
-        for name, (values, units) in extra.items():
-            if np.shape(values) != (len(pulses),):
+        for name, column in extra.items():
+            if isinstance(column, tuple) and np.shape(column[0]) != (len(pulses),):
                 raise CpunetError(
-                    f"{self.path}: column {name} has shape {np.shape(values)} beside "
+                    f"{self.path}: column {name} has shape {np.shape(column[0])} beside "
                     f"{len(pulses)} pulses; give one value per pulse"
                 )
-            content[name] = _column(values, units)
-        block = Table(col_dict=content | others, attrs=dict(self._attrs))
+            content[name] = _column(column)
+        block = Table(col_dict=content, attrs=dict(self._attrs))
         group, _, name = self._table.rpartition("/")
         self._file.write(block, name, group or "/")
         self.n_pulses += len(pulses)
@@ -162,20 +156,17 @@ class PulseWriter:
         columns
             Name → (array of shape ``(rows,)``, units); the same names each time.
         """
-        assert self._file is not None  # within the writer's with block
         group, _, name = table.strip("/").rpartition("/")
-        content = {key: _column(values, units) for key, (values, units) in columns.items()}
+        content = {key: _column(column) for key, column in columns.items()}
         if len(next(iter(content.values()))) > 0:
             self._file.write(Table(content), name, group or "/")
 
     def annotate(self, attrs: Mapping[str, str | float]) -> None:
         """Add attributes to the table of pulses after the first block."""
-        assert self._file is not None  # within the writer's with block
         self._file.h5[self._table].attrs.update(attrs)
 
     def stamp(self, name: str, text: str) -> None:
         """Set an attribute of the file, such as its provenance record."""
-        assert self._file is not None  # within the writer's with block
         self._file.h5.attrs[name] = text
 
     def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
@@ -194,7 +185,10 @@ class PulseWriter:
             )
 
 
-def _column(values: npt.ArrayLike, units: str) -> Array:
+def _column(column: tuple[npt.ArrayLike, str] | LGDO) -> LGDO:
+    if not isinstance(column, tuple):
+        return column
+    values, units = column
     return Array(np.asarray(values), attrs={"units": units} if units else {})
 
 

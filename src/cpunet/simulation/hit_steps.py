@@ -335,7 +335,7 @@ class Columns:
                 f"{self.path}: the column of detectors differs in length; truncated?"
             )
         choose(self.path, self.detectors(), detector)
-        return steps if detector is None else steps[labels == detector]
+        return steps if labels is None or detector is None else steps[labels == detector]
 
 
 def choose(path: Path, there: list[str], detector: str | None) -> str | None:

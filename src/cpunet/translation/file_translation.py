@@ -167,7 +167,8 @@ class FileTranslation:
         with self.writer(out, force=force) as writer:
             for formed in self._blocks(pulses, noise_key):
                 first, given = counts.read // times, len(formed.codes) // times
-                writer.append(formed.pulses, formed.columns, others.read(first, given, times))
+                columns = {**formed.columns, **others.read(first, given, times)}
+                writer.append(formed.pulses, columns)
                 counts += self._counts(formed)
             self._require_some(source, counts)
             if source_print(source) != before:
