@@ -302,20 +302,12 @@ DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
 """Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
 
-@dataclass(frozen=True, eq=False)
-class RawTraces:
-    """Raw traces and the truth behind them.
+@dataclass(frozen=True, eq=False, repr=False)
+class RawTraces(Pulses):
+    """Raw traces, in ADC counts of uint16, and the truth behind them.
 
     Parameters
     ----------
-    waveforms
-        ADC counts, uint16, shape ``(n, length)``.
-    dt_ns
-        Sampling period in ns.
-    energy_kev
-        Calibrated energies in keV, including the energy resolution.
-    event_number
-        Event numbers of the source.
     flag
         Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
@@ -330,10 +322,6 @@ class RawTraces:
         (negative: before it). NaN where there is none.
     """
 
-    waveforms: npt.NDArray[np.uint16]
-    dt_ns: float
-    energy_kev: FloatArray
-    event_number: npt.NDArray[np.int64]
     flag: npt.NDArray[np.uint8]
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
@@ -343,19 +331,9 @@ class RawTraces:
     piled_kev: FloatArray
     piled_ns: FloatArray
 
-    def pulses(self) -> Pulses:
-        """The traces as pulses; the integers of the digitiser stay integers."""
-        return Pulses(
-            waveforms=cast(PulseArray, self.waveforms),
-            dt_ns=self.dt_ns,
-            energy_kev=self.energy_kev,
-            event_number=self.event_number,
-            peak=np.full(len(self.waveforms), ""),
-        )
-
 
 def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
-    """Pass ideal pulses through a readout chain.
+    """Pass ideal pulses through a readout chain; energies have the resolution of the chain.
 
     Parameters
     ----------
@@ -406,7 +384,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         | np.where(beyond.any(axis=1), SATURATED, 0)
     ).astype(np.uint8)
     return RawTraces(
-        waveforms=np.clip(adc, 0, electronics.adc_top).astype(np.uint16),
+        waveforms=cast(PulseArray, np.clip(adc, 0, electronics.adc_top).astype(np.uint16)),
         dt_ns=electronics.dt_ns,
         energy_kev=with_resolution(
             energy,
@@ -415,6 +393,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
             seed=int(resolution.integers(2**63)),
         ),
         event_number=pulses.event_number,
+        peak=pulses.peak,
         flag=flag,
         response=response.astype(np.float32),
         true_energy_kev=energy,

@@ -399,7 +399,7 @@ def _write_data(
         for fine, label, _ in side.blocks("Measured events", library):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
-            writer.append(traces.pulses())
+            writer.append(traces)
             labels.append(label)
             for name, values in known.items():
                 values.append(getattr(traces, name))
