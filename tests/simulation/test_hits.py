@@ -87,9 +87,3 @@ def test_energy_and_centre_of_each_event_stay(counts: list[int], distance: float
         )
         np.testing.assert_allclose(after, before, rtol=1e-9)
     np.testing.assert_array_equal(merged.event_number, hits.event_number)
-
-
-@pytest.mark.parametrize("distance", [-1.0, float("nan"), float("inf")])
-def test_no_distance_is_refused(distance: float) -> None:
-    with pytest.raises(CpunetError, match="give 0 or more"):
-        cluster_hits(event_of(3, 0), distance)

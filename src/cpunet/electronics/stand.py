@@ -24,7 +24,7 @@ from cpunet.pulses.provenance import MADE_BY, SIDE
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.settings import Set, checked, read_json, read_settings, require_seed
+from cpunet.settings import Set, checked, read_json, require_seed
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
@@ -192,10 +192,9 @@ def make_stand(
     words = [w for given in (shift, settings) if not isinstance(given, Mapping) for w in given]
     given = (electronics, detector, *words)
     refuse_inputs(Path(out), *(f for f in given if isinstance(f, str | Path)))
-    of_detector, of_settings = split_overrides(settings)
+    of_detector, physics = split_overrides(settings)
     readout = Electronics.model_fields.keys() - {"name"}
     of_chain = {k: of_detector.pop(k) for k in [*of_detector] if k.split(".")[0] in readout}
-    physics = read_settings(SimulationSettings, set_=of_settings)
     seed, moved = require_seed(seed), Shift.of(shift)
     chain = read_electronics(electronics, of_chain)
     wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
@@ -392,18 +391,16 @@ def _write_data(
 ) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = stand.electronics
-    labels: list[Labels] = []
-    known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in OF_DATA}
+    known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("label", *OF_DATA)}
     path, attrs = folder / "data.lh5", MADE | {SIDE: "measured"}
     with PulseWriter(path, table="geds/raw", waveform_units="ADC", attrs=attrs) as writer:
         for fine, label, _ in side.blocks("Measured events", library):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(traces)
-            labels.append(label)
-            for name, values in known.items():
-                values.append(getattr(traces, name))
-        label = np.concatenate(labels)
+            known["label"].append(label)
+            for name in OF_DATA:
+                known[name].append(getattr(traces, name))
         told: dict[str, Any] = {n: np.concatenate(values) for n, values in known.items()}
         flag = told["flag"]
         saturated = int((flag & SATURATED > 0).sum())
@@ -412,9 +409,9 @@ def _write_data(
                 f"electronics {electronics.name}: {saturated} of {len(flag)} traces leave the "
                 "ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
             )
-    np.savez(folder / "data_labels.npz", label=label, **told)
-    stand.n_data = len(label)
-    stand.data_lines = _by_line(label)
+    np.savez(folder / "data_labels.npz", **told)
+    stand.n_data = len(flag)
+    stand.data_lines = _by_line(told["label"])
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
         stand.flags[name] = int((flag & bit > 0).sum())
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float32]
 
+_PER_PULSE = ("waveforms", "energy_kev", "event_number", "peak")
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pulses:
@@ -65,7 +67,7 @@ class Pulses:
                 f"waveforms have shape {self.waveforms.shape}; expected (pulses, samples)"
             )
         n = len(self.waveforms)
-        for name in ("energy_kev", "event_number", "peak"):
+        for name in _PER_PULSE[1:]:
             shape = getattr(self, name).shape
             if shape != (n,):
                 raise CpunetError(f"{name} has shape {shape} beside {n} waveforms")
@@ -109,13 +111,8 @@ class Pulses:
         self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
     ) -> Pulses:
         """The pulses selected by a slice, a mask or row numbers."""
-        return Pulses(
-            waveforms=self.waveforms[which],
-            dt_ns=self.dt_ns,
-            energy_kev=self.energy_kev[which],
-            event_number=self.event_number[which],
-            peak=self.peak[which],
-        )
+        chosen = {name: getattr(self, name)[which] for name in _PER_PULSE}
+        return Pulses(dt_ns=self.dt_ns, **chosen)
 
     def __repr__(self) -> str:
         known = self.energy_kev[np.isfinite(self.energy_kev)]
@@ -147,8 +144,8 @@ class Pulses:
         """The same events with other waveforms."""
         return replace(self, waveforms=waveforms)
 
-    @classmethod
-    def concatenate(cls, sets: Sequence[Pulses]) -> Pulses:
+    @staticmethod
+    def concatenate(sets: Sequence[Pulses]) -> Pulses:
         """Concatenate sets of equal length and sampling."""
         if not sets:
             raise CpunetError("no sets of pulses to join")
@@ -159,10 +156,5 @@ class Pulses:
                     f"cannot join {other.length} samples of {other.dt_ns} ns "
                     f"to {first.length} samples of {first.dt_ns} ns"
                 )
-        return cls(
-            waveforms=np.concatenate([s.waveforms for s in sets]),
-            dt_ns=first.dt_ns,
-            energy_kev=np.concatenate([s.energy_kev for s in sets]),
-            event_number=np.concatenate([s.event_number for s in sets]),
-            peak=np.concatenate([s.peak for s in sets]),
-        )
+        joined = {n: np.concatenate([getattr(s, n) for s in sets]) for n in _PER_PULSE}
+        return Pulses(dt_ns=first.dt_ns, **joined)

@@ -5,16 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import PeakConfig
-
-if TYPE_CHECKING:
-    pass
 
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE]\+?\d+)?)"
 _RANGE = re.compile(rf"{_NUMBER}\s*-\s*{_NUMBER}?")

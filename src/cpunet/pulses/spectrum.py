@@ -152,12 +152,8 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     if len(edges) < MIN_BINS:  # one energy
         return None
     excess = _excess(np.histogram(known, edges)[0])
-    found = [_shifted(excess, edges[0], source, SOURCES[source]) for source in SOURCES]
-    clear = [one for one in found if one is not None]
-    if not clear:
-        return None
-    _, log_factor, source, lines = max(clear, key=lambda one: one[0])
-    return Suggestion(_refined(known, log_factor, lines), source, lines)
+    found = [one for source in SOURCES if (one := _shifted(known, edges[0], excess, source))]
+    return max(found, key=lambda one: one[0])[1] if found else None
 
 
 def _excess(counts: npt.NDArray[np.integer]) -> Values:
@@ -170,9 +166,10 @@ def _excess(counts: npt.NDArray[np.integer]) -> Values:
 
 
 def _shifted(
-    excess: Values, first: float, source: str, lines_kev: tuple[float, ...]
-) -> tuple[float, float, str, tuple[float, ...]] | None:
-    """The shift at which the lines of a source have the largest excess of counts."""
+    log_amplitudes: Values, first: float, excess: Values, source: str
+) -> tuple[float, Suggestion] | None:
+    """Largest excess of counts at the lines of a source, and the shift that leads to it."""
+    lines_kev = SOURCES[source]
     places = np.log(lines_kev) / LOG_BIN
     offsets = np.round(places - places[0]).astype(int)
     n = len(excess)
@@ -191,7 +188,8 @@ def _shifted(
     if not np.isfinite(score[best]) or len(clear) < min(MIN_LINES, len(lines_kev)):
         return None
     log_factor = float(places[0] * LOG_BIN - first - (best + 0.5) * LOG_BIN)
-    return float(score[best]), log_factor, source, clear
+    factor = _refined(log_amplitudes, log_factor, clear)
+    return float(score[best]), Suggestion(factor, source, clear)
 
 
 def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, ...]) -> float:

@@ -72,14 +72,7 @@ class StoredSimulation:
             raise CpunetError(
                 f"{file}: several pulses have the same event_number; simulate them again"
             )
-        hits = read_hits(file).of_events(numbers)
-        missing = np.diff(hits.offsets) == 0
-        if missing.any():
-            raise CpunetError(
-                f"{file}: {HIT_TABLE} has no hit of event {numbers[np.argmax(missing)]}; "
-                "simulate it again"
-            )
-        return cls(detector, settings, hits)
+        return cls(detector, settings, read_hits(file).of_events(numbers))
 
 
 # Maximum number of time steps that a drift step of quick pulses replaces.

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
@@ -39,11 +36,6 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     distance_mm
         Maximum distance between neighbours in mm. 0 merges only hits at the same position.
 
-    Raises
-    ------
-    CpunetError
-        If the distance is negative or not a number.
-
     Examples
     --------
     >>> hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 9]], [100, 300, 50], [0, 3])
@@ -51,8 +43,6 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     >>> sites.z_mm, sites.edep_kev
     (array([1.75, 9.  ]), array([400.,  50.]))
     """
-    if not (math.isfinite(distance_mm) and distance_mm >= 0):
-        raise CpunetError(f"hits cannot be merged within {distance_mm} mm; give 0 or more")
     near = float(distance_mm) ** 2  # always a float, so that the loop is compiled only once
     merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, near)
     x, y, z, energy = merged.T.copy()

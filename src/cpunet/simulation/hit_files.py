@@ -16,6 +16,7 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.source import whole_numbers
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_steps import (
@@ -26,7 +27,6 @@ from cpunet.simulation.hit_steps import (
     require_physics,
     require_some,
     to_hits,
-    whole_numbers,
 )
 from cpunet.simulation.hit_tables import (
     NTUPLES,
@@ -184,7 +184,7 @@ def _npz(path: Path) -> Steps:
     needed = [*_ARRAYS, "offsets"]
     if missing := [name for name in needed if name not in arrays]:
         raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
-    offsets = whole_numbers(path, "offsets", arrays["offsets"])
+    offsets = whole_numbers(arrays["offsets"], f"{path}: offsets")
     counts = np.diff(offsets)
     if offsets.ndim != 1 or not len(offsets) or offsets[0] or np.any(counts < 0):
         raise CpunetError(f"{path}: offsets do not divide the hits into events")

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.reading.source import whole_numbers
 from cpunet.simulation.hits import (
     FARTHEST_MM,
     LATE_NS,
@@ -25,7 +26,6 @@ from cpunet.simulation.hits import (
 
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
-_MAX_NUMBER = 2.0**62
 _MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
 _KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
 _NS = {"ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9, "ps": 1e-3}
@@ -175,23 +175,6 @@ def require_physics(path: Path, energy_kev: FloatArray) -> None:
         )
 
 
-def whole_numbers(path: Path, name: str, values: npt.NDArray[Any]) -> IntArray:
-    """Convert a column of whole numbers, which may be stored as floats, to int64.
-
-    Raises
-    ------
-    CpunetError
-        If a value is not a whole number or too large.
-    """
-    kind = values.dtype.kind
-    fit = kind in "iuf" and bool((np.abs(values.astype(float)) < _MAX_NUMBER).all())
-    if fit and kind == "f":
-        fit = bool((values == np.rint(values)).all())
-    if not fit:
-        raise CpunetError(f"{path}: {name} holds what is no whole number; write it again")
-    return values.astype(np.int64)
-
-
 def event_of_step(number: IntArray, time_ns: FloatArray | None, window_us: float) -> IntArray:
     """Label of the event of each step; labels are arbitrary, equal within an event.
 
@@ -292,7 +275,7 @@ class Columns:
                     "one number per step (g4simple: its option for steps)"
                 )
             if role == "event":
-                values[role] = whole_numbers(path, name, read)
+                values[role] = whole_numbers(read, f"{path}: column {name}")
             else:
                 values[role] = read * unit_factor(options, role, path, name, unit or in_name)
             if len(read) != len(values["event"]):

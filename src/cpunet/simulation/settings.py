@@ -158,20 +158,18 @@ class SimulationSettings(Config):
         return self
 
 
-def split_overrides(overrides: Set) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split words and YAML files into values of the detector and of `SimulationSettings`.
+def split_overrides(overrides: Set) -> tuple[dict[str, Any], SimulationSettings]:
+    """Split words and YAML files into values of the detector, and settings.
 
     Examples
     --------
-    >>> split_overrides(["bias_V=3500", "hole_trapping_per_us=0.01"])
-    ({'bias_V': 3500}, {'hole_trapping_per_us': 0.01})
+    >>> of_detector, settings = split_overrides(["bias_V=3500", "hole_trapping_per_us=0.01"])
+    >>> of_detector, settings.hole_trapping_per_us
+    ({'bias_V': 3500}, 0.01)
     """
     values = words_and_files(overrides)
-    of_settings = values.keys() & SimulationSettings.model_fields.keys()
-    return (
-        {key: value for key, value in values.items() if key not in of_settings},
-        {key: value for key, value in values.items() if key in of_settings},
-    )
+    own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
+    return values, checked(SimulationSettings, own, "settings")
 
 
 _SHIFTS = Path(__file__).parent / "shifts"

@@ -20,7 +20,7 @@ from cpunet.progress import stage
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.settings import Set, read_settings, require_seed
+from cpunet.settings import Set, require_seed
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
@@ -192,12 +192,11 @@ def simulate(
     """
     require_seed(seed)
     out = Path(out)
-    of_detector, of_settings = split_overrides(settings)
+    of_detector, physics = split_overrides(settings)
     words = () if isinstance(settings, Mapping) else settings
     files = [f for f in (detector, *words) if isinstance(f, str | Path)]
     files += [hits.path if isinstance(hits, HitFile) else hits] if hits is not None else []
     refuse_inputs(out, *files)
-    physics = read_settings(SimulationSettings, set_=of_settings)
     peaks = load_recipe("fast").peaks
     windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
     source: HitSource

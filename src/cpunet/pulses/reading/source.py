@@ -226,21 +226,41 @@ class PulseSource(ABC):
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
                 "give the energies of the same events"
             )
-        event_number = self._whole(start, np.asarray(numbers))
+        event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         self._sampling.check(start, event_number)
         return Pulses.of(
             waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number
         )
 
-    def _whole(self, start: int, numbers: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        """Event numbers as integers; some files store them as floating-point numbers."""
-        if numbers.dtype.kind == "i":
-            return numbers.astype(np.int64)
-        values = numbers.astype(np.float64)
-        bad = ~((values == np.rint(values)) & (np.abs(values) < _MAX_NUMBER))
+
+def whole_numbers(
+    values: npt.NDArray[Any], where: str, start: int = 0
+) -> npt.NDArray[np.int64]:
+    """Numbers of events as integers; some files store them as floating-point numbers.
+
+    Parameters
+    ----------
+    values
+        A number for each row.
+    where
+        File and column, for the message.
+    start
+        Row of the first number.
+
+    Raises
+    ------
+    CpunetError
+        If one is no whole number or too large.
+    """
+    if values.dtype.kind != "i":
+        numbers = (
+            values.astype(float) if values.dtype.kind in "uf" else np.full(len(values), np.nan)
+        )
+        bad = ~((numbers == np.rint(numbers)) & (np.abs(numbers) < _MAX_NUMBER))
         if bad.any():
+            row = int(bad.argmax())
             raise CpunetError(
-                f"{self.path}: row {start + int(bad.argmax())}: the event number is "
-                f"{values[bad][0]:g}; number the events anew"
+                f"{where}: row {start + row}: {values[row]} is no number of an event; number "
+                "the events anew"
             )
-        return numbers.astype(np.int64)
+    return values.astype(np.int64)
