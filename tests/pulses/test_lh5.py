@@ -187,13 +187,6 @@ def test_a_period_that_changes_names_the_event(file, raw):
         list(open_pulses(file).blocks(4))
 
 
-def test_the_users_period_must_agree(file, raw):
-    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
-    assert open_pulses(file, dt_ns=16).dt_ns == 16
-    with pytest.raises(CpunetError, match=r"every 16 ns, but `dt_ns` says 10; drop"):
-        open_pulses(file, dt_ns=10)
-
-
 def test_a_period_without_units_needs_the_user(file, raw):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw, 16.0, "")}), "raw", file)
     with pytest.raises(CpunetError, match=r"\(raw/waveform/dt\) has no units; give `dt_ns`"):
