@@ -87,23 +87,6 @@ def test_an_undepleted_detector_is_refused() -> None:
         compute_fields(read_detector("icpc", [*COARSE, "impurity_z0_1e10_per_cm3=-90"]))
 
 
-def test_solved_once(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("DEBUG", "cpunet")
-    detector = read_detector("icpc", COARSE)
-    first = compute_fields(detector)
-    assert caplog.messages
-    caplog.clear()
-    warmer = detector.model_copy(update={"temperature_K": 100.0, "name": "warm"})
-    second = compute_fields(warmer)
-    assert not caplog.messages
-    assert second.temperature_K == 100
-    np.testing.assert_array_equal(first.potential_V, second.potential_V)
-    assert same(first, compute_fields(detector))
-    thicker = detector.model_copy(update={"li_thickness": 1.1})
-    compute_fields(thicker)
-    assert caplog.messages
-
-
 @pytest.mark.parametrize("damage", ["cut", "empty", "text", "other"])
 def test_a_damaged_cache_is_solved_anew(damage: str) -> None:
     detector = read_detector("icpc", COARSE)

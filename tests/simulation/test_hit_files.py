@@ -12,7 +12,7 @@ import pytest
 from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.simulation import hit_sources
+from cpunet.simulation import hit_sources, hit_tables
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits, hit_detectors, hit_parts, read_hits
@@ -41,22 +41,25 @@ def remage(path: Path, columns: dict[str, Column], *, vectors: bool, table: str)
         array = Array(values, attrs={"units": units} if units else {})
         built[name] = (
             VectorOfVectors(flattened_data=array, cumulative_length=Array(ends))
-            if (vectors)
+            if vectors
             else array
         )
     lh5.write(Table(col_dict=built), f"stp/{table}", path, wo_mode="overwrite_file")
     return path
 
 
-def ntuple_csv(path: Path, columns: dict[str, Column]) -> Path:
-    head = "#class tools::wcsv::ntuple\n#title hits\n#separator 44\n"
-    head += "".join(
-        f"#column double {n}_in_{u}\n" if u else f"#column int {n}\n"
-        for n, (_, u) in columns.items()
-    )
-    rows = zip(*(values.tolist() for values, _ in columns.values()), strict=True)
-    path.write_text(head + "\n".join(",".join(map(str, row)) for row in rows))
+def csv_file(folder: Path, columns: list[str], rows: list[str], title: str = "hits") -> Path:
+    head = f"#class tools::wcsv::ntuple\n#title {title}\n#separator 44\n"
+    head += "".join(f"#column double {c}\n" for c in columns)
+    path = folder / "hits.csv"
+    path.write_text(head + "\n".join(rows))
     return path
+
+
+def ntuple_csv(folder: Path, columns: dict[str, Column]) -> Path:
+    names = [f"{name}_in_{unit}" if unit else name for name, (_, unit) in columns.items()]
+    rows = zip(*(values.tolist() for values, _ in columns.values()), strict=True)
+    return csv_file(folder, names, [",".join(map(str, row)) for row in rows])
 
 
 def ntuple_hdf5(path: Path, columns: dict[str, Column]) -> Path:
@@ -77,7 +80,7 @@ def steps(**changed: Column) -> dict[str, Column]:
 
 def written(folder: Path, layout: str, columns: dict[str, Column], table: str = "det1") -> Path:
     if layout == "csv":
-        return ntuple_csv(folder / "hits.csv", columns)
+        return ntuple_csv(folder, columns)
     if layout == "hdf5":
         return ntuple_hdf5(folder / "hits.hdf5", columns)
     return remage(folder / "hits.lh5", columns, vectors=layout == "vectors", table=table)
@@ -104,7 +107,7 @@ def test_decays_of_a_chain_are_events_of_their_own(tmp_path: Path, layout: str) 
 @pytest.mark.parametrize("size", [4, 1000])
 def test_late_deposits_are_counted_once(tmp_path, monkeypatch, caplog, size) -> None:
     """A third of the events has its second step 500 ns after the first."""
-    monkeypatch.setattr(parts_of, "__defaults__", (size,))
+    monkeypatch.setattr(hit_tables, "ROWS", size)
     time = TIME_NS.copy()
     time[1::9] += 500
     path = written(tmp_path, "vectors", steps(time=(time, "ns")))
@@ -184,7 +187,7 @@ def test_energies_of_another_unit_are_named(tmp_path, monkeypatch, factor, said)
     path = written(tmp_path, "flat", steps(edep=(factor * EDEP_KEV, "keV")))
     with pytest.raises(CpunetError, match=rf"{said}.* correct the unit of their column"):
         read_hits(path)
-    monkeypatch.setattr(parts_of, "__defaults__", (4,))
+    monkeypatch.setattr(hit_tables, "ROWS", 4)
     with pytest.raises(CpunetError, match=said):
         list(hit_parts(path)())
 
@@ -225,8 +228,7 @@ def test_parts_hold_the_same_hits(tmp_path, monkeypatch, size, repeated):
         np.repeat(np.arange(EVENTS), 3)[:EVENTS] if repeated else 10 * np.arange(EVENTS)[::-1]
     )
     file = stp(tmp_path / "stp.lh5", numbers)
-    monkeypatch.setattr("cpunet.simulation.hit_tables.ROWS", size)
-    monkeypatch.setattr(parts_of, "__defaults__", (size,))
+    monkeypatch.setattr(hit_tables, "ROWS", size)
     parts = hit_parts(file)
     for _ in range(2):  # as often as one likes
         found = list(parts())
@@ -240,7 +242,7 @@ def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path, monkeypatc
     read = read_hits(file)
     np.testing.assert_array_equal(read.event_number, 2**53 + small.event_number)
     np.testing.assert_array_equal(read.offsets, small.offsets)
-    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    monkeypatch.setattr(hit_tables, "ROWS", 5)
     require_same(Hits.concatenate(list(hit_parts(file)())), read)
 
 
@@ -255,7 +257,7 @@ def test_event_numbers_that_are_text(tmp_path):
 
 
 def test_rows_of_an_event_that_lie_apart_are_read_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    monkeypatch.setattr(hit_tables, "ROWS", 5)
     file = stp(tmp_path / "stp.lh5", np.r_[np.arange(EVENTS - 1), 0])
     assert parts_of(file, table_of(file, None)) is None
     (whole,) = hit_parts(file)()
@@ -269,7 +271,7 @@ def test_a_file_of_hits_gives_the_same_blocks(tmp_path, monkeypatch):
     windows = (EnergyWindow("some", 100.0, 1500.0),)
     whole = [HitFile(file), HitFile(file, windows=windows)]
     expected = [(o.n_events, list(o.blocks)) for o in (one.open(detector) for one in whole)]
-    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    monkeypatch.setattr(hit_tables, "ROWS", 5)
     for source, (n_events, blocks) in zip(whole, expected, strict=True):
         opened = source.open(detector)
         found = list(opened.blocks)
@@ -281,7 +283,7 @@ def test_a_file_of_hits_gives_the_same_blocks(tmp_path, monkeypatch):
 
 
 def test_what_is_wrong_is_told_of_parts_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(parts_of, "__defaults__", (5,))
+    monkeypatch.setattr(hit_tables, "ROWS", 5)
     detector = read_detector("icpc")
     file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
     with pytest.raises(CpunetError, match="no event in none; widen window_kev"):
@@ -293,16 +295,6 @@ def test_what_is_wrong_is_told_of_parts_too(tmp_path, monkeypatch):
     stp(file, np.arange(EVENTS), deposits=False)
     with pytest.raises(CpunetError, match="no step deposits energy"):
         HitFile(file).open(detector)
-
-
-CSV_HEAD = "#class tools::wcsv::ntuple\n#title {title}\n#separator 44\n"
-
-
-def csv_file(folder: Path, columns: list[str], rows: list[str], title: str = "hits") -> Path:
-    head = CSV_HEAD.format(title=title) + "".join(f"#column double {c}\n" for c in columns)
-    path = folder / "hits.csv"
-    path.write_text(head + "\n".join(rows))
-    return path
 
 
 def g4simple_file(folder: Path, **changed: object) -> Path:

@@ -20,7 +20,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.provenance import MADE_BY, SIDE
+from cpunet.pulses.provenance import MADE_BY, SIDE, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
@@ -55,8 +55,8 @@ OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 # What ``stand.json`` counts.
 COUNTS = ("n_sim", "n_data", "sim_lines", "data_lines", "flags")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
-LABELS = {"DEP": 0, "SEP": 1, "FEP": 2}
-OTHER = 3
+LABELS = {"DEP": 0, "SEP": 1, "FEP": 2, "other": 3}
+OTHER = LABELS["other"]
 # Period of the simulated pulses at the input of the chain; same as that of the library.
 _FINE_NS = 4.0
 
@@ -373,7 +373,7 @@ def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: St
             labels.append(label)
         simulation = {"cpunet": cpunet.__version__, **side.provenance()}
         simulation["settings"] |= {"dt_ns": electronics.dt_ns}  # that of the means
-        writer.annotate({"simulation": json.dumps(simulation)})
+        writer.annotate(SIMULATION, json.dumps(simulation))
     label = np.concatenate(labels)
     np.savez(
         folder / "truth.npz",
@@ -430,5 +430,4 @@ def _block_means(pulses: Pulses, per_sample: int) -> Pulses:
 
 
 def _by_line(labels: Labels) -> Counter[str]:
-    names = {number: name for name, number in LABELS.items()} | {OTHER: "other"}
-    return Counter({name: int((labels == i).sum()) for i, name in names.items()})
+    return Counter({name: int((labels == i).sum()) for name, i in LABELS.items()})

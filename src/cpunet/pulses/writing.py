@@ -161,13 +161,10 @@ class PulseWriter:
         if len(next(iter(content.values()))) > 0:
             self._file.write(Table(content), name, group or "/")
 
-    def annotate(self, attrs: Mapping[str, str | float]) -> None:
-        """Add attributes to the table of pulses after the first block."""
-        self._file.h5[self._table].attrs.update(attrs)
-
-    def stamp(self, name: str, text: str) -> None:
-        """Set an attribute of the file, such as its provenance record."""
-        self._file.h5.attrs[name] = text
+    def annotate(self, name: str, text: str, *, file: bool = False) -> None:
+        """Set an attribute of the table of pulses after the first block, or of the `file`."""
+        item = self._file.h5 if file else self._file.h5[self._table]
+        item.attrs[name] = text
 
     def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
         taken = {"waveform", "energy", "event_number"} & set(extra)

@@ -130,7 +130,7 @@ def read_detector(
     if name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
         values = read_values(path, _FOLDER)
     else:
-        values = siggen_values(read_text(path, _FOLDER), name)
+        values = {**siggen_values(read_text(path, _FOLDER), name)}
     if "geometry" in values:
         values, hints = _legend(values, Path(path), crystal)
         if "temperature_K" not in given:
@@ -202,7 +202,7 @@ def _legend(
     return values | impurity_values(content, str(found), slice_name, length), hints
 
 
-def siggen_values(text: str, name: str) -> dict[str, Any]:
+def siggen_values(text: str, name: str) -> dict[str, float]:
     r"""Fields of `Detector` from the content `text` of siggen's configuration file `name`.
 
     It is read as siggen does: a key stands at the beginning of its line (others are comments),

@@ -67,11 +67,10 @@ def unit_factor(
     CpunetError
         If the unit is unknown, or nobody tells it.
     """
-    given, known, option = {
-        "edep": (options.energy_unit, _KEV, "energy_unit"),
-        "time": ("ns", _NS, ""),
-    }.get(role, (options.length_unit, _MM, "length_unit"))
-    unit = named or given
+    known, option = {"edep": (_KEV, "energy_unit"), "time": (_NS, "")}.get(
+        role, (_MM, "length_unit")
+    )
+    unit = named or (getattr(options, option) if option else "ns")
     if unit is None:
         raise CpunetError(
             f"{path}: column {column} names no unit; give `{option}`: {', '.join(known)}"

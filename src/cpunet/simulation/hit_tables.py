@@ -72,8 +72,8 @@ def read_table(path: Path, table: Table, options: HitOptions, rows: slice = _ALL
     return replace(steps, position_mm=steps.position_mm - origin)
 
 
-def parts_of(path: Path, table: Table, size: int = ROWS) -> tuple[list[slice], int] | None:
-    """Divide the rows of a table into parts of at least `size` rows that split no event.
+def parts_of(path: Path, table: Table) -> tuple[list[slice], int] | None:
+    """Divide the rows of a table into parts of at least `ROWS` rows that split no event.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def parts_of(path: Path, table: Table, size: int = ROWS) -> tuple[list[slice], i
         return None
     cuts = [0]
     while cuts[-1] < len(numbers):
-        after = np.searchsorted(starts, cuts[-1] + size)
+        after = np.searchsorted(starts, cuts[-1] + ROWS)
         cuts.append(int(starts[after]) if after < len(starts) else len(numbers))
     return [slice(a, b) for a, b in pairwise(cuts)], int(numbers.max(initial=-1))
 

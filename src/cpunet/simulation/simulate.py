@@ -17,6 +17,7 @@ import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.progress import stage
+from cpunet.pulses.provenance import MADE_BY, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
@@ -214,9 +215,8 @@ def simulate(
         raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
     found = read_detector(detector, of_detector)
     simulation = Simulation(out, found, physics, windows, resolution, seed)
-    writer = PulseWriter(
-        out, attrs={"made_by": f"cpunet simulate {cpunet.__version__}"}, force=force
-    )
+    attrs = {MADE_BY: f"cpunet simulate {cpunet.__version__}"}
+    writer = PulseWriter(out, attrs=attrs, force=force)
     simulation.smeared(np.zeros(0), seed)  # a wrong resolution is told before any work
     _simulate(simulation, source, writer)
     return simulation
@@ -266,7 +266,7 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
             "events_without_signal": simulation.without_signal,
             "depletion_V": fields.depletion_V,
         }
-        writer.annotate({"simulation": json.dumps(made)})
+        writer.annotate(SIMULATION, json.dumps(made))
 
 
 def _append(

@@ -178,7 +178,7 @@ class FileTranslation:
                 )
             record = provenance | {"counts": asdict(counts), "cpunet": cpunet.__version__}
             # options given from Python may be numbers of NumPy
-            writer.stamp(TRANSLATION, json.dumps(record, default=np.generic.item))
+            writer.annotate(TRANSLATION, json.dumps(record, default=np.generic.item), file=True)
         return counts
 
     def in_memory(self, source: PulseFile) -> tuple[Formed, Counts]:
