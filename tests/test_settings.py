@@ -188,6 +188,7 @@ def test_wrong_settings_of_a_matching_are_named(override, part):
 def test_values_of_a_file_and_of_words(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text("dt_ns: 4\nbias_V: 3000\n")
-    assert split_overrides([str(path), "dt_ns=2"]) == ({"bias_V": 3000}, {"dt_ns": 2})
+    expected = {"bias_V": 3000}, SimulationSettings(dt_ns=2)
+    assert split_overrides([str(path), "dt_ns=2"]) == expected
     with pytest.raises(CpunetError, match="expected KEY=VALUE"):
         split_overrides([str(tmp_path / "none.yaml")])

@@ -18,7 +18,7 @@ from cpunet.legend.library_files import put_array, put_column
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import Stage, stage
 from cpunet.pulses.writing import FileInTheMaking
-from cpunet.settings import Set, read_settings
+from cpunet.settings import Set
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.geometry_readers import read_detector
@@ -114,14 +114,12 @@ def make_library(
     words = () if isinstance(settings, Mapping) else settings
     inputs = [given for given in (detector, *words) if isinstance(given, str | Path)]
     refuse_existing(out, *inputs, force=force)
-    of_detector, of_settings = split_overrides(settings)
+    of_detector, wanted = split_overrides(settings, dt_ns=DT_NS, length_ns=LENGTH_NS)
     if not isinstance(detector, Detector):
         detector = read_detector(detector, of_detector)
     angles_deg = _degrees(angles)
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
-    sampling = {"dt_ns": DT_NS, "length_ns": LENGTH_NS}
-    wanted = read_settings(SimulationSettings, set_=sampling | of_settings)
     with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))

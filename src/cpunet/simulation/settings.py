@@ -158,8 +158,10 @@ class SimulationSettings(Config):
         return self
 
 
-def split_overrides(overrides: Set) -> tuple[dict[str, Any], SimulationSettings]:
-    """Split words and YAML files into values of the detector, and settings.
+def split_overrides(
+    overrides: Set, **defaults: float
+) -> tuple[dict[str, Any], SimulationSettings]:
+    """Split words and YAML files into values of the detector, and settings with `defaults`.
 
     Examples
     --------
@@ -169,7 +171,7 @@ def split_overrides(overrides: Set) -> tuple[dict[str, Any], SimulationSettings]
     """
     values = words_and_files(overrides)
     own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
-    return values, checked(SimulationSettings, own, "settings")
+    return values, checked(SimulationSettings, defaults | own, "settings")
 
 
 _SHIFTS = Path(__file__).parent / "shifts"
