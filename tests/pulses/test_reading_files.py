@@ -200,8 +200,7 @@ def write_all(folder: Path) -> list[Path]:
     np.savez(folder / "b.npz", waveform=values, energy_kev=np.arange(30.0))
     np.savez_compressed(folder / "c.npz", waveform=values)
     np.save(folder / "d.npy", values)
-    head = struct.pack("<i8siiiiii", 24, b"p" * 8, 40, 30, 1, 1, 24, values.nbytes)
-    (folder / "e.spe").write_bytes(head + values.tobytes() + head[-4:])
+    (folder / "e.spe").write_bytes(spectrum(values))
     return sorted(folder.iterdir())
 
 

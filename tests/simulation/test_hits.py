@@ -37,12 +37,6 @@ def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject)
     assert both.n_events == hits.n_events
 
 
-def test_order_of_rows_is_kept() -> None:
-    hits = hits_with([1, 2, 3])
-    np.testing.assert_array_equal(hits[np.array([2, 0])].event_number, [20, 0])
-    np.testing.assert_array_equal(hits[1:].offsets, [0, 2, 5])
-
-
 def test_events_by_their_numbers() -> None:
     hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 3]], [1, 2, 4], [0, 2, 2, 3], [5, 9, 7])
     chosen = hits.of_events([7, 6, 5, 7])

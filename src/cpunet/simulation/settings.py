@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -133,15 +134,10 @@ class SimulationSettings(Config):
     @field_validator("diffusion_constant", mode="before")
     @classmethod
     def _known_diffusion(cls, value: Any) -> Any:
-        try:
-            known = value in ("temperature", "siggen") or 0 < float(value) <= 1000
-        except (TypeError, ValueError, OverflowError):
-            known = False
-        if not known:
-            raise ValueError(
-                "give a number above 0 (to 1000) in V mm/cm, temperature or siggen"
-            )
-        return value
+        with suppress(TypeError, ValueError, OverflowError):
+            if value in ("temperature", "siggen") or 0 < float(value) <= 1000:
+                return value
+        raise ValueError("give a number above 0 (to 1000) in V mm/cm, temperature or siggen")
 
     @model_validator(mode="after")
     def _whole_steps(self) -> SimulationSettings:

@@ -151,29 +151,23 @@ def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
         neither in energy units nor calibrated, or is in energy units although ``kev_per_adc``
         is given.
     """
-    path, energy, kev_per_adc = options.path, options.energy, options.kev_per_adc
-    columns, n_pulses = layout.columns, layout.n_pulses
-    if energy is None:
-        usual = next((name for name in _USUAL if name in columns), None)
-        if usual is not None:
-            rule = _calibrated(path, usual, columns[usual], kev_per_adc)
-            if rule is not None:
-                require_length(path, usual, columns[usual], n_pulses)
-                return rule
-        if kev_per_adc is not None:
-            return Energies(f"amplitude x {kev_per_adc:g} keV/ADC", kev_per_adc)
-        found = f" (column {usual} is not in energy units)" if usual else ""
-        return Energies(f"not known{found}")
-    column = _named_column(path, columns, energy)
-    require_length(path, energy, column, n_pulses)
-    rule = _calibrated(path, energy, column, kev_per_adc)
-    if rule is None:
-        units = f"in {column.units}" if column.units else "without units"
-        raise CpunetError(
-            f"{path}: column {energy} is {units}, no energy in keV; "
-            "add `kev_per_adc` (1 if it is in keV)"
-        )
-    return rule
+    path, kev_per_adc, columns = options.path, options.kev_per_adc, layout.columns
+    name = options.energy or next((name for name in _USUAL if name in columns), "")
+    column = _named_column(path, columns, name) if name else None
+    if column is not None:
+        rule = _calibrated(path, name, column, kev_per_adc)
+        if rule is not None:
+            require_length(path, name, column, layout.n_pulses)
+            return rule
+        if options.energy is not None:
+            units = f"in {column.units}" if column.units else "without units"
+            raise CpunetError(
+                f"{path}: column {name} is {units}, no energy in keV; "
+                "add `kev_per_adc` (1 if it is in keV)"
+            )
+    if kev_per_adc is not None:
+        return Energies(f"amplitude x {kev_per_adc:g} keV/ADC", kev_per_adc)
+    return Energies(f"not known{f' (column {name} is not in energy units)' if name else ''}")
 
 
 def _calibrated(
