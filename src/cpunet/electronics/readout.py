@@ -16,7 +16,7 @@ from scipy import fft
 from scipy.signal import lfilter
 
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum, Wander
-from cpunet.electronics.drawn_pile_up import DrawnPileUp
+from cpunet.electronics.drawn_pile_up import DrawnPileUp, InTracePileUp
 from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
@@ -197,33 +197,9 @@ def noise_of(
     return unit * np.float32(noise.rms_kev)
 
 
-@dataclass(frozen=True, eq=False)
-class OtherPulses:
-    """The disturbances added to the traces and their truth.
-
-    Parameters
-    ----------
-    added_kev
-        Added signal in keV, shape ``(n, length)``.
-    tails_kev
-        Sum of the pile-up tails at the first sample of each trace, in keV.
-    n_piled
-        Number of additional pulses within each trace.
-    piled_kev, piled_ns
-        Energy of the largest additional pulse, and its start after `n_pre` samples in ns
-        (negative: before them). NaN where there is none.
-    """
-
-    added_kev: FloatArray
-    tails_kev: FloatArray
-    n_piled: npt.NDArray[np.int64]
-    piled_kev: FloatArray
-    piled_ns: FloatArray
-
-
 def draw_other_pulses(
     pulses: Pulses, electronics: Electronics, rng: np.random.Generator
-) -> OtherPulses:
+) -> tuple[FloatArray, FloatArray, InTracePileUp]:
     """Draw the other pulses of each trace, see `cpunet.electronics.chain`.
 
     Parameters
@@ -234,12 +210,18 @@ def draw_other_pulses(
         The readout chain with the rates.
     rng
         Random generator.
+
+    Returns
+    -------
+    tuple
+        Signal in keV that is added to each trace, shape ``(n, length)``; sum of the pile-up
+        tails at the first sample of each, in keV; piled-up pulses in the traces.
     """
-    tails, piled, slow = rng.spawn(3)
+    tails, within, slow = rng.spawn(3)
     added_kev = _tails(len(pulses), electronics, tails)
     # before hum and piled-up pulses are added
     tails_kev = added_kev[:, 0].copy()
-    n_piled, piled_kev, piled_ns = _add_piled(pulses, electronics, added_kev, piled)
+    piled = _add_piled(pulses, electronics, added_kev, within)
     if electronics.hum is not None:
         added_kev += _hum(len(pulses), electronics, slow)
     if electronics.wander is not None:
@@ -247,7 +229,7 @@ def draw_other_pulses(
         # its own generator, so that it does not change the other random numbers
         (drift,) = rng.spawn(1)
         added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
-    return OtherPulses(added_kev, tails_kev, n_piled, piled_kev, piled_ns)
+    return added_kev, tails_kev, piled
 
 
 def _tails(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
@@ -269,14 +251,14 @@ def _tails(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatA
 
 def _add_piled(
     pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
-) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
+) -> InTracePileUp:
     """Add piled-up pulses anywhere in the record, with shapes of randomly chosen pulses."""
     dt_ns = electronics.dt_ns
     others = electronics.pile_up.rate_kHz, electronics.other_pulses_kev, dt_ns
     piled = DrawnPileUp(*others).draw(len(pulses), electronics.n_pre, electronics.length, rng)
     shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
     np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
-    return piled.largest()
+    return piled
 
 
 def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
@@ -315,11 +297,13 @@ class RawTraces(Pulses):
         baseline and without earlier or piled-up pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
         Scale in keV and offset in ADC counts of each pulse.
-    tails_kev, n_piled, piled_kev
-        Properties of other pulses, see `cpunet.electronics.readout.OtherPulses`.
-    piled_ns
-        Start of the largest additional pulse after that of the trace's own pulse in ns
-        (negative: before it). NaN where there is none.
+    tails_kev
+        Sum of the pile-up tails at the first sample of each trace, in keV.
+    n_piled
+        Number of additional pulses within each trace.
+    piled_kev, piled_ns
+        Energy of the largest additional pulse, and its start after that of the trace's own
+        pulse in ns (negative: before it). NaN where there is none.
     """
 
     flag: npt.NDArray[np.uint8]
@@ -365,8 +349,9 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     shift_ns += clock.normal(0, electronics.trigger_jitter_ns, size=n)
     linear = linear_response(pulses, electronics, shift_ns)
     own_kev = energy[:, None] * linear
-    other = draw_other_pulses(pulses, electronics, others)
-    total_kev = own_kev + other.added_kev
+    added_kev, tails_kev, piled = draw_other_pulses(pulses, electronics, others)
+    n_piled, piled_kev, piled_ns = piled.largest()
+    total_kev = own_kev + added_kev
     response = linear
     if electronics.non_linearity is not None:
         figures, dt_ns = electronics.non_linearity, electronics.dt_ns
@@ -379,8 +364,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
     flag = (
-        np.where(other.tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
-        | np.where(other.n_piled > 0, PILE_UP, 0)
+        np.where(tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
+        | np.where(n_piled > 0, PILE_UP, 0)
         | np.where(beyond.any(axis=1), SATURATED, 0)
     ).astype(np.uint8)
     return RawTraces(
@@ -398,8 +383,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         response=response.astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
-        tails_kev=other.tails_kev,
-        n_piled=other.n_piled,
-        piled_kev=other.piled_kev,
-        piled_ns=other.piled_ns - shift_ns,
+        tails_kev=tails_kev,
+        n_piled=n_piled,
+        piled_kev=piled_kev,
+        piled_ns=piled_ns - shift_ns,
     )
