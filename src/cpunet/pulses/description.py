@@ -97,19 +97,17 @@ def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> TracesInfo:
         If too few traces contain a pulse.
     """
     # compiled loops, which a look at plain pulses does not need
-    from cpunet.pulses.preparation import Prepared, Rejection, apply_cuts, fit_cuts, prepare
+    from cpunet.pulses.preparation import Rejection, apply_cuts, fit_cuts, prepare
 
-    seen = list(islice(blocks, BLOCKS))
-    found = [_edges(block) for block in seen]
-    half, start, noise = (np.concatenate(part) for part in zip(*found, strict=True))
+    whole = Pulses.concatenate(list(islice(blocks, BLOCKS)))
+    half, start, noise = _edges(whole)
     with_pulse = np.isfinite(half)
     if with_pulse.sum() < MIN_NUMBER:
         raise CpunetError(f"only {with_pulse.sum()} of {len(half)} traces hold a pulse")
-    kev = np.concatenate([block.energy_kev for block in seen])[with_pulse]
-    kev /= np.concatenate([amplitude(block.waveforms) for block in seen])[with_pulse]
+    kev = whole.energy_kev[with_pulse] / amplitude(whole.waveforms[with_pulse])
     known = np.isfinite(kev).sum() >= MIN_NUMBER
     noise_adc, slope = float(np.nanmedian(noise)), 0.0
-    prepared = Prepared.concatenate([prepare(b, recipe.preparation, "measured") for b in seen])
+    prepared = prepare(whole, recipe.preparation, "measured")
     if len(prepared) >= MIN_NUMBER:
         slope = float(np.median(prepared.tail_slope))
         prepared = apply_cuts(prepared, fit_cuts(prepared, recipe.cuts))

@@ -66,10 +66,10 @@ class RowColumns:
         with opened(path) as file:
             group = file[table or "/"]
             for name in group:
-                if name == chosen or _is_same(name, group.get(name), own):
+                item = group.get(name)
+                if name == chosen or _is_same(name, item, own):
                     continue
-                reason = _unreadable(group.get(name), n_pulses)
-                if reason:
+                if reason := _unreadable(item, n_pulses):
                     left_out[name] = reason
                 else:
                     names.append(name)
