@@ -160,7 +160,7 @@ def message(name: str, *overrides: str) -> str:
         ("training.batch_size", "expected KEY=VALUE"),
         ("training.batch_size=[", "not YAML"),
         ("training.rate_generators=.nan", "training.rate_generators: "),
-        ("discriminator.value_range=[1, 0]", "discriminator: "),
+        ("discriminator.value_range=[1, 0]", "discriminator.value_range: must go from a lower"),
         ("discriminator.samples_per_step=7", "samples_per_step (7)"),
         ("preparation.samples_before=300", "the loss windows cover 800 samples"),
         ("preparation.baseline_samples=400", "baseline_samples must be fewer"),

@@ -6,6 +6,7 @@ import json
 import sys
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -288,7 +289,8 @@ def test_every_parameter_has_a_row(also):
     config = load_recipe("fast").matching[0].model_copy(update=also)
     values = ElectronicsResponse(config, 16.0).describe()
     values = {k: v for k, v in values.items() if not k.startswith("slow_")}  # told as a sum
-    shown = str(Response({"runs": [{"path": "run", "values": values, "errors": {}}]}, []))
+    run = SimpleNamespace(run=SimpleNamespace(name="run"), values=values, errors={})
+    shown = str(Response([run]))
     assert len(shown.splitlines()) == 2 + len(values)
 
 

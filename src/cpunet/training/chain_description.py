@@ -121,7 +121,7 @@ def _noise_error(run: Run, chain: Chain) -> Numbers:
     """Error of the noise in keV, from the baselines and the height of a full charge."""
     measured = {} if run.fit is None else run.fit.noise
     error, rms = measured.get("rms_error"), measured.get("rms")
-    if not error or not rms or chain.noise_kev2_per_mhz is None:
+    if not error or not rms or chain.noise is None:
         return {}
     preparation = run.recipe.preparation
     end_ns = (
@@ -303,17 +303,14 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
     ['70 % of the charge would arrive too early, which no readout does; see the fit']
     """
     slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
-    if slow < MAX_NEGATIVE:
-        return [
-            f"{-100 * slow:.0f} % of the charge would arrive too early, which no readout does; "
-            "see the fit"
-        ]
-    if slow > MAX_SLOW:
-        return [
-            f"{100 * slow:.0f} % of the charge would arrive late, as of slower pulses than "
-            "simulated; see the fit"
-        ]
-    return []
+    if MAX_NEGATIVE <= slow <= MAX_SLOW:
+        return []
+    how = (
+        "too early, which no readout does"
+        if slow < 0
+        else "late, as of slower pulses than simulated"
+    )
+    return [f"{100 * abs(slow):.0f} % of the charge would arrive {how}; see the fit"]
 
 
 def stretched(parameters: Mapping[str, float], gains: Mapping[str, str] = {}) -> list[str]:

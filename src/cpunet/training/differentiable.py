@@ -56,11 +56,9 @@ class DifferentiableReadings:
     def __init__(self, moments: Moments, last: int) -> None:
         self.moments, self.config = moments, moments.config
         self.window = w = moments.window(last)
-        matrix = np.concatenate([moments.stretches, moments.components], axis=1)
-        self.matrix = torch.from_numpy(matrix)
-        offset = moments.mean.astype(float) @ moments.components
-        self.offset = torch.zeros(matrix.shape[1])
-        self.offset[-len(offset) :] = torch.from_numpy(offset)
+        self.matrix = torch.from_numpy(moments.quantities)
+        self.offset = torch.zeros(self.matrix.shape[1])
+        self.offset[-len(moments.offset) :] = torch.from_numpy(moments.offset)
         self.centres, self.spreads, self.bins, self.bin_widths = (
             torch.from_numpy(values).float()
             for values in (

@@ -37,6 +37,7 @@ from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
+from cpunet.tables import aligned
 from cpunet.training.loop import Record
 
 if TYPE_CHECKING:
@@ -335,9 +336,7 @@ class Run(InfoPart):
         return summary(self)
 
     def __str__(self) -> str:
-        lines = self.summary()
-        width = max(len(topic) for topic, _ in lines)
-        return "\n".join(f"{topic:<{width}}  {text}" for topic, text in lines)
+        return aligned(self.summary())
 
     def __repr__(self) -> str:
         per = None if self.fit is None else self.fit.chi_square_per_moment
