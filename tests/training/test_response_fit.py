@@ -18,8 +18,7 @@ from cpunet.networks.response_layer import (
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
-from cpunet.training.levenberg_marquardt import Listener
+from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, Listener
 from cpunet.training.moments import Moments, Readings
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import Fit, fit_response

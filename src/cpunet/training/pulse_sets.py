@@ -19,6 +19,7 @@ from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.moments import MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
@@ -37,7 +38,7 @@ SINGLE = "single sites of the continuum"  # name of their band
 # Draws of the noise of single sites, of which there are few, for each of other pulses.
 MORE_DRAWS = 4
 
-Continuum = Callable[[], tuple[Pulses, Pulses]]
+Continuum = Callable[[], tuple[InputSet, InputSet]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +238,7 @@ class PulseSets:
         """
         if self.continuum is None:
             return []
-        sim, data = self.continuum()
+        sim, data = (side.prepared.pulses for side in self.continuum())
         _, training = self.recipe.matching
         try:
             moments = Moments.of_data(data.waveforms, training, self.recipe.preparation)

@@ -137,20 +137,16 @@ class Fit:
         """Remaining difference between translation and data, in a sentence."""
         shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
         off = abs(shift) >= 2 * error
-        size = f"the current amplitude is off by {shift:+.2f} ± {error:.2f} %"
-        if not off:
-            size = f"the current amplitude is right to {abs(shift) + error:.2f} %"
-        per = self.chi_square / self.moments
+        right = f"right to {abs(shift) + error:.2f} %"
+        size = f"off by {shift:+.2f} ± {error:.2f} %" if off else right
+        per, why = self.chi_square / self.moments, "as by chance"
         if self.poor:
-            # a shift that is small compared with its error does not make the shape right
-            more = f"; {size}" if off else ""
-            return f"chi-square is {per:.1f} per moment, too much for chance{more}"
-        if per > GOOD_FIT:
-            return (
-                f"chi-square is {per:.1f} per moment, of a misfit that only so many pulses "
-                f"tell; {size}"
-            )
-        return f"chi-square is {per:.1f} per moment, as by chance; {size}"
+            why = "too much for chance"
+        elif per > GOOD_FIT:
+            why = "of a misfit that only so many pulses tell"
+        # a shift that is small compared with its error does not make the shape right
+        more = f"; the current amplitude is {size}" if off or not self.poor else ""
+        return f"chi-square is {per:.1f} per moment, {why}{more}"
 
     @property
     def poor(self) -> bool:

@@ -18,15 +18,21 @@ from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
 
-# Widths of the priors around the start: wide for times (in their logarithm); for weights such
-# that half of the charge may be slow, and that the main decay dominates.
-TIME_WIDTH, WEIGHT_WIDTH, DECAY_WIDTH, RINGING_WIDTH = 1.0, 0.1, 0.03, 0.3
-TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # steps of the finite differences
+# Widths of the priors around the start, and steps of the finite differences.  Widths are wide
+# for times (in their logarithm); for weights such that half of the charge may be slow, and that
+# the main decay dominates.
+TIME_WIDTH, TIME_STEP, WEIGHT_STEP = 1.0, 0.01, 0.002
 # The same for the stretch of the drift, and for its change per us.
 STRETCH_WIDTHS, STRETCH_STEPS = (0.1, 0.05), (0.003, 0.002)
 STRETCH = "drift.stretch"
 # Of a learned step response, whose coordinates have priors of width 1 around 0.
 COORDINATES, LONGEST = "coordinates", 2.0
+SCALES = {
+    "decay_weights": (0.03, WEIGHT_STEP),
+    "ringing": (0.3, WEIGHT_STEP),
+    "slow_weights": (0.1, WEIGHT_STEP),
+    COORDINATES: (1.0, WEIGHT_STEP),
+}
 
 
 class Parameters:
@@ -46,13 +52,8 @@ class Parameters:
         self._parts = [part for _, part in named]
         self.labels = [n for n, p in named for _ in range(p.numel())]
         self.centre = self.vector()
-        widths = {
-            "decay_weights": DECAY_WIDTH,
-            "ringing": RINGING_WIDTH,
-            "slow_weights": WEIGHT_WIDTH,
-            COORDINATES: 1.0,
-        }
-        self.widths = np.array([widths.get(name, TIME_WIDTH) for name in self.labels])
+        scales = [SCALES.get(name, (TIME_WIDTH, TIME_STEP)) for name in self.labels]
+        self.widths, self.steps = np.array(scales).T.copy()
         if response.decay_known is not None:
             self.widths[self.labels.index("log_decay_us")] = response.decay_known
         learned = np.array([name == COORDINATES for name in self.labels])
@@ -60,8 +61,6 @@ class Parameters:
         self.longest = np.where(learned, LONGEST, self.widths)
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
-        times = [label.startswith("log") for label in self.labels]
-        self.steps = np.where(times, TIME_STEP, WEIGHT_STEP)
         stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
         self.widths[stretched] = STRETCH_WIDTHS[: len(stretched)]
         self.steps[stretched] = STRETCH_STEPS[: len(stretched)]
