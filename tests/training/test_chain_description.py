@@ -23,11 +23,7 @@ from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
 from cpunet.training.chain_description import beyond, diagnosis, parts_off
-from cpunet.training.closed_forms import (
-    learned_chain,
-    propagated,
-    true_chain_of,
-)
+from cpunet.training.closed_forms import learned_chain, propagated, true_chain_of
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
@@ -156,12 +152,7 @@ def test_errors_go_with_the_poles_they_belong_to(run):
     (told,) = response(run).content["runs"]
     assert told["values"]["pole_1_ns"] == pytest.approx(55)
     assert told["errors"] == pytest.approx(
-        {
-            "pole_1_ns": 0.05 * 55,
-            "pole_2_ns": 0.02 * 35,
-            "decay_us": 0.8,
-            "decay_4_us": 0.002,
-        }
+        {"pole_1_ns": 0.05 * 55, "pole_2_ns": 0.02 * 35, "decay_us": 0.8, "decay_4_us": 0.002}
     )
     assert told["parameter_errors"]["slow_400_ns"] == 0.004
     assert told["parameters"]["slow_400_ns"] == pytest.approx(0.065)

@@ -12,12 +12,7 @@ import torch
 from cpunet import outputs
 from cpunet.errors import CpunetError
 from cpunet.training.loop import train
-from cpunet.training.networks import (
-    CHECKPOINT,
-    MARKER,
-    UnfinishedRun,
-    unfinished_folder,
-)
+from cpunet.training.networks import CHECKPOINT, MARKER, UnfinishedRun, unfinished_folder
 from cpunet.training.run import LOSSES, WEIGHTS
 from synthetic import interrupted_in, nearly_full_disk
 

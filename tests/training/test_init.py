@@ -180,11 +180,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
 def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> None:
     shorter = load_recipe(
         "paper",
-        [
-            "generator.width=2",
-            "preparation.samples_after=384",
-            "training.losses.tail_len=334",
-        ],
+        ["generator.width=2", "preparation.samples_after=384", "training.losses.tail_len=334"],
     )
     with pytest.raises(CpunetError, match=r"know windows of 400 \+ 400 samples") as told:
         train(files["sim"], files["one"], tmp_path / "a", recipe=shorter, init=network)

@@ -17,12 +17,7 @@ from torch import nn
 from cpunet.errors import CpunetError
 from cpunet.training import loop
 from cpunet.training.cyclegan import Step
-from cpunet.training.loop import (
-    EpochSampler,
-    judges_noted,
-    refresh_batch_statistics,
-    train,
-)
+from cpunet.training.loop import EpochSampler, judges_noted, refresh_batch_statistics, train
 from synthetic import LOSS_NAMES, interrupted_in
 
 
@@ -55,9 +50,7 @@ def test_the_global_random_state_is_left_alone(tiny, sets):
 def test_records_come_in_bunches_and_none_is_lost(tiny, sets):
     bunches = []
     recipe = tiny(
-        "training.iterations=7",
-        "training.log_interval=3",
-        "training.discriminator_interval=2",
+        "training.iterations=7", "training.log_interval=3", "training.discriminator_interval=2"
     )
     train(*sets, recipe, seed=0, listener=bunches.append)
     assert [len(bunch) for bunch in bunches] == [3, 3, 1]
@@ -131,13 +124,7 @@ def kept(sets, recipe):
         states.append((state["iteration"], len(records)))
 
     try:
-        train(
-            *sets,
-            recipe,
-            seed=0,
-            listener=records.extend,
-            save=save,
-        )
+        train(*sets, recipe, seed=0, listener=records.extend, save=save)
     finally:
         assert [record["iteration"] for record in records] == [*range(len(records))]
     return states

@@ -149,10 +149,7 @@ def test_one_generator_is_enough(files, tmp_path):
     [
         (lambda s: s.pop("fc_var.bias"), "1 tensors differ, first latent_log_variance.bias"),
         (lambda s: s.update(more=torch.zeros(1)), "1 tensors differ, first more"),
-        (
-            lambda s: s.update({"fc_mean.bias": torch.zeros(3)}),
-            "first latent_mean.bias",
-        ),
+        (lambda s: s.update({"fc_mean.bias": torch.zeros(3)}), "first latent_mean.bias"),
         (lambda s: s.pop("inc.double_conv.0.weight"), "no Positional U-Net"),
         (lambda s: s.update({"inc.double_conv.0.weight": torch.zeros(())}), "no Positional"),
     ],

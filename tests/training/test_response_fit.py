@@ -11,10 +11,7 @@ import pytest
 import torch
 
 from cpunet.electronics.chain import Electronics
-from cpunet.networks.response_layer import (
-    ElectronicsResponse,
-    record_length,
-)
+from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
 from cpunet.training import response_starts

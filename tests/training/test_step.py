@@ -10,13 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from cpunet.recipes import load_recipe
-from cpunet.training.cyclegan import (
-    CycleGan,
-    Step,
-    fake_loss,
-    real_loss,
-    window_weights,
-)
+from cpunet.training.cyclegan import CycleGan, Step, fake_loss, real_loss, window_weights
 from synthetic import LOSS_NAMES
 
 pytestmark = [

@@ -209,11 +209,7 @@ class DifferentiableSet:
         return torch.cat(out).double().numpy()
 
     def blocks(
-        self,
-        response: StepResponse,
-        functions: Functions,
-        *,
-        draws: int | None = None,
+        self, response: StepResponse, functions: Functions, *, draws: int | None = None
     ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
         """Functions of each pulse and their derivatives, block by block, draw by draw.
 
@@ -236,9 +232,7 @@ class DifferentiableSet:
                     return functions(*self.readings(self.scaled(records) + noise))
 
                 def along(
-                    tangent: Tensor,
-                    of: Callable[[Tensor], Tensor] = of,
-                    clean: Tensor = clean,
+                    tangent: Tensor, of: Callable[[Tensor], Tensor] = of, clean: Tensor = clean
                 ) -> Any:
                     return torch.func.jvp(of, (clean,), (tangent,))
 

@@ -35,13 +35,7 @@ from cpunet.networks.learned_response import DriftUNet, LearnedResponse, StepRes
 from cpunet.networks.response_layer import current_spectrum
 from cpunet.recipes.schema import LearnedConfig
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.fitter import (
-    Fitted,
-    Fitter,
-    HeldOutPulses,
-    compared,
-    split,
-)
+from cpunet.training.fitter import Fitted, Fitter, HeldOutPulses, compared, split
 from cpunet.training.levenberg_marquardt import FIRST_CLIPS
 from cpunet.training.moments import BLOCK, Values
 from cpunet.training.optimal_weights import refine
