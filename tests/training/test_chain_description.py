@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +14,6 @@ import torch
 import yaml
 from torch import nn
 
-from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
@@ -27,10 +25,9 @@ from cpunet.training.closed_forms import learned_chain, propagated, true_chain_o
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
-from synthetic import write_run
+from synthetic import FACTS, status_of, write_chain, write_run
 
 DT_NS = 16.0
-INFO = {"recipe": "fast", "peak": "FEP", "seed": 1, "seconds": 1.5, "device": "cpu"}
 # of the run's parameters: log_poles_ns are in the order of the recipe
 ERRORS = {
     "log_poles_ns.1": 0.02,
@@ -52,22 +49,18 @@ def write_response(
     **info: Any,
 ) -> Path:
     """A run folder; weights by index into the recipe's times (100 … 1600 ns; 4, 16 µs)."""
-    recipe = load_recipe("fast", overrides)
-    generator = ResponseGenerator(recipe.generator, dt_ns)
-    with torch.no_grad():
-        for weights, given in (
-            (generator.response.slow_weights, slow),
-            (generator.response.decay_weights, fast),
-        ):
-            for index, value in (given or {}).items():
-                weights[index] = value
+
+    def change(chain: ResponseGenerator) -> None:
+        chain.response.dt_ns.fill_(dt_ns)
+        for index, value in (slow or {}).items():
+            chain.response.slow_weights[index] = value
+        for index, value in (fast or {}).items():
+            chain.response.decay_weights[index] = value
         if noise_density is not None:
             samples = 2 * (len(noise_density) - 1)
-            generator.set_noise(BaselineNoise(noise_density, samples, dt_ns, 1000))
-    folder.mkdir(parents=True)
-    model = nn.ModuleDict({"ren": generator})
-    write_run(folder, model, recipe, INFO | {"dt_ns": dt_ns} | info)
-    return folder
+            chain.set_noise(BaselineNoise(noise_density, samples, dt_ns, 1000))
+
+    return write_chain(folder, *overrides, change=change, dt_ns=dt_ns, **info)
 
 
 def electronics(**fields: Any) -> Electronics:
@@ -314,7 +307,7 @@ def test_runs_that_cannot_be_described(run, tmp_path):
 
 
 def test_a_network_has_no_closed_form(tmp_path):
-    write_run(tmp_path, nn.Linear(1, 1), load_recipe("paper"), INFO | {"dt_ns": DT_NS})
+    write_run(tmp_path, nn.Linear(1, 1), load_recipe("paper"), FACTS)
     one_line(
         lambda: response(tmp_path),
         f"{tmp_path}: recipe paper trains a punet",
@@ -322,17 +315,13 @@ def test_a_network_has_no_closed_form(tmp_path):
     )
 
 
-def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, monkeypatch, capsys):
+def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, capsys):
     chain = tmp_path / "chain.yaml"
     chain.write_text(yaml.safe_dump(electronics().model_dump(mode="json")))
     runs = [run.rename(tmp_path / "a run of a long name [1]")]
     runs += [write_response(tmp_path / f"another run, {i}", fit=FIT) for i in range(4)]
-    words = ["cpunet", "response", *map(str, runs), "--truth", str(chain)]
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as stop:
-        main()
+    assert status_of("response", *runs, "--truth", chain) == 0
     printed = capsys.readouterr().out
-    assert stop.value.code == 0
     for text in ("a run of a long name [1]", "another run, 3", "mean ± spread", "known", "σ"):
         assert text in printed
     line = next(line for line in printed.splitlines() if "bandwidth pole 1" in line)
@@ -358,7 +347,7 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
     assert said.endswith("the detector")
     assert doubts(None) == doubts({}) == []
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
-    (said,) = response(early).content["runs"][0]["doubts"]
+    (said,) = response(early).runs[0].doubts
     assert said.startswith("60 % of the charge would arrive too early")
 
 

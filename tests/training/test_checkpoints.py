@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -89,16 +90,6 @@ def state(value: float = 0.0) -> dict:
     }
 
 
-def same_tree(a, b) -> bool:
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b) and a.dtype == b.dtype
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same_tree(a[k], b[k]) for k in a)
-    if isinstance(a, list):
-        return len(a) == len(b) and all(map(same_tree, a, b))
-    return a == b
-
-
 def kept(folder: Path, value: float = 0.0) -> UnfinishedRun:
     """A training that has stored a state."""
     run = unfinished(folder)
@@ -110,33 +101,30 @@ def kept(folder: Path, value: float = 0.0) -> UnfinishedRun:
 def test_a_state_comes_back(tmp_path):
     run = kept(tmp_path, 1.0)
     run.save(state(2.0))
-    assert same_tree(unfinished(tmp_path).begin(resume=True), state(2.0))
+    assert str(unfinished(tmp_path).begin(resume=True)) == str(state(2.0))
     assert sorted(p.name for p in tmp_path.iterdir()) == [CHECKPOINT, LOSSES, MARKER]
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff" * 100, None])
-def test_a_damaged_checkpoint_is_told(tmp_path, content):
-    kept(tmp_path)
-    path = tmp_path / CHECKPOINT
-    path.write_bytes(path.read_bytes()[:-200] if content is None else content)
-    with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with `force`"):
-        unfinished(tmp_path).begin(resume=True)
+def other_number(content: bytes) -> bytes:
+    """One bit of the weights is another; torch would load them."""
+    at = content.index(torch.ones(3).numpy().tobytes())
+    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
-def test_one_damaged_byte_of_the_weights_is_told(tmp_path):
+def code(_: bytes) -> bytes:
+    """An object that is not of plain data: nothing is executed."""
+    torch.save({"state": Path("x").open}, stream := io.BytesIO())
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda _: b"", lambda _: b"\xff" * 100, lambda c: c[:-200], other_number, code]
+)
+def test_a_damaged_checkpoint_is_told(tmp_path, damage):
     kept(tmp_path, 1.0)
     path = tmp_path / CHECKPOINT
-    content = bytearray(path.read_bytes())
-    content[content.index(torch.ones(3).numpy().tobytes())] ^= 1  # torch loads another number
-    path.write_bytes(content)
-    with pytest.raises(CpunetError, match="damaged"):
-        unfinished(tmp_path).begin(resume=True)
-
-
-def test_a_checkpoint_executes_nothing(tmp_path):
-    kept(tmp_path)
-    torch.save({"state": Path("x").open}, tmp_path / CHECKPOINT)
-    with pytest.raises(CpunetError, match="damaged"):
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with `force`"):
         unfinished(tmp_path).begin(resume=True)
 
 
@@ -236,7 +224,7 @@ def test_without_resume_nothing_is_lost(sets, recipe, out):
     assert content(beside(out)) == before
 
 
-def test_another_recipe_or_seed(sets, recipe, tiny, out, whole):
+def test_another_recipe_or_seed(sets, recipe, tiny, out):
     before = content(beside(out)).keys()
     other = recipe_of(tiny, "training.log_interval=1", "training.batch_size=5")
     with pytest.raises(
@@ -246,8 +234,6 @@ def test_another_recipe_or_seed(sets, recipe, tiny, out, whole):
     with pytest.raises(CpunetError, match=r"^resumed with another seed: 3 → 4; give"):
         work(sets, recipe, out, resume=True, seed=4)
     assert content(beside(out)).keys() == before
-    work(sets, recipe, out, resume=True)
-    assert content(out) == whole
 
 
 def test_a_full_disk_does_not_stop_the_training(sets, recipe, tmp_path, whole, caplog):

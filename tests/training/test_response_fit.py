@@ -197,10 +197,6 @@ def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> 
     assert fit == near.fit
 
 
-def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:
-    assert "ringing_mhz" not in near.response.describe()
-
-
 @pytest.mark.slow
 def test_a_ringing_is_found_with_few_pulses() -> None:
     """Derivatives far from it promise no more than a fifth of chi-square."""
