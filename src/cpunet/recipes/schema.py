@@ -351,13 +351,10 @@ class Recipe(Config):
         CpunetError
             If the recipe does not train a CycleGAN.
         """
-        if not (
-            isinstance(self.generator, PunetConfig)
-            and isinstance(self.training, TrainingConfig)
-            and self.discriminator is not None
-        ):
-            raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
-        return CycleGanSettings(self.generator, self.discriminator, self.training)
+        match self.generator, self.discriminator, self.training:
+            case PunetConfig() as generator, GruConfig() as judge, TrainingConfig() as training:
+                return CycleGanSettings(generator, judge, training)
+        raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
 
     @property
     def matching(self) -> MatchingSettings:
@@ -368,12 +365,12 @@ class Recipe(Config):
         CpunetError
             If the recipe does not match a response.
         """
-        if not (
-            isinstance(self.generator, ResponseConfig | LearnedConfig)
-            and isinstance(self.training, MatchingConfig)
-        ):
-            raise CpunetError(f"recipe {self.name}: does not match a response")
-        return MatchingSettings(self.generator, self.training)
+        match self.generator, self.training:
+            case (
+                ResponseConfig() | LearnedConfig()
+            ) as generator, MatchingConfig() as training:
+                return MatchingSettings(generator, training)
+        raise CpunetError(f"recipe {self.name}: does not match a response")
 
     @property
     def chain(self) -> ResponseConfig:
@@ -384,11 +381,9 @@ class Recipe(Config):
         CpunetError
             If the recipe has none.
         """
-        if not isinstance(self.generator, ResponseConfig):
-            raise CpunetError(
-                f"recipe {self.name}: fits no readout chain; give the recipe fast"
-            )
-        return self.generator
+        if isinstance(self.generator, ResponseConfig):
+            return self.generator
+        raise CpunetError(f"recipe {self.name}: fits no readout chain; give the recipe fast")
 
     @model_validator(mode="after")
     def _parts_belong_together(self) -> Recipe:

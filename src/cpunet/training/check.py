@@ -120,14 +120,13 @@ class CheckResult:
             raise CpunetError("there are no pulses of both sides to draw")
         names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
         sides = {name: self.sides[side] for name, side in names.items()}
+        axes = {
+            "Time from 10 to 50 % [ns]": _rise_ns,
+            "Current amplitude [1/sample]": _amplitudes,
+        }
         return sides_figure(
             {name: _of_height_one(one) for name, one in sides.items()},
-            {
-                "Time from 10 to 50 % [ns]": {n: _rise_ns(one) for n, one in sides.items()},
-                "Current amplitude [1/sample]": {
-                    n: _amplitudes(one) for n, one in sides.items()
-                },
-            },
+            {axis: {n: of(one) for n, one in sides.items()} for axis, of in axes.items()},
             self.sides["data"].dt_ns,
             {name: len(one.prepared) for name, one in sides.items()},
         )

@@ -211,20 +211,17 @@ class PulseSets:
         parted = energy_bands(sim_kev, data_kev, self.recipe.peaks)
         # in random order, so that any first part is representative
         self.parted = [
-            (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))
+            (band, [rng.permutation(len(rows)) for rows in (band.sim, band.data)])
             for band in parted
         ]
 
     def bands(self, most: int | None = None) -> list[Band]:
         """All pulses, or about `most` of each side, in the same proportions."""
-        n_sim, n_data = (
-            sum(len(order) for order in orders)
-            for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
-        )
+        totals = np.sum([[len(order) for order in orders] for _, orders in self.parted], axis=0)
         some = []
-        for band, sim_order, data_order in self.parted:
+        for band, orders in self.parted:
             chosen = []
-            for order, n in ((sim_order, n_sim), (data_order, n_data)):
+            for order, n in zip(orders, totals.tolist(), strict=True):
                 share = 1.0 if most is None else min(1.0, most / n)
                 kept = max(math.ceil(share * len(order)), min(MIN_OF_BAND, len(order)))
                 chosen.append(np.sort(order[:kept]))
