@@ -34,8 +34,8 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
-from cpunet.training.chain_description import beyond, diagnosis, stretched
 from cpunet.training.check import Level, compare_sides
+from cpunet.training.diagnosis import beyond, diagnosis, stretched
 from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned

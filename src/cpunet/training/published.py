@@ -86,7 +86,7 @@ def import_weights(
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
     length = load_recipe("paper").preparation.length
     networks = {part: _generator(path, length) for part, path in files.items()}
-    widths = {network.latent_mean.out_channels // 8 for network in networks.values()}
+    widths = {network.width for network in networks.values()}
     if len(widths) > 1:
         raise CpunetError(
             f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"

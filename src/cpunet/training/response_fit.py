@@ -111,7 +111,7 @@ class Fit:
         Energies compared, with the pulses of each side.
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
-        the data's, see `cpunet.training.chain_description`.
+        the data's, see `amplitude_shift`.
     drift
         What a U-Net before a learned readout gains, if one was trained.
     gains
