@@ -25,7 +25,7 @@ from cpunet.training.diagnosis import beyond, diagnosis, parts_off
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
-from synthetic import FACTS, status_of, write_chain, write_run
+from synthetic import FACTS, one_line, status_of, write_chain, write_run
 
 DT_NS = 16.0
 # of the run's parameters: log_poles_ns are in the order of the recipe
@@ -276,15 +276,6 @@ def test_every_parameter_has_a_row(also):
     run = SimpleNamespace(run=SimpleNamespace(name="run"), values=values, errors={})
     shown = str(Response([run]))
     assert len(shown.splitlines()) == 2 + len(values)
-
-
-def one_line(call: Any, *parts: str) -> None:
-    with pytest.raises(CpunetError) as error:
-        call()
-    text = str(error.value)
-    assert "\n" not in text
-    for part in parts:
-        assert part in text
 
 
 def test_runs_that_cannot_be_described(run, tmp_path):
