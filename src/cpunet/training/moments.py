@@ -116,8 +116,8 @@ class Moments:
     data: Readings
     values: Values
     names: tuple[str, ...]
-    left_out: int
-    slope_range: tuple[float, float]
+    left_out: int = 0
+    slope_range: tuple[float, float] = (-np.inf, np.inf)
     balance: Values | None = None
 
     @classmethod
@@ -161,8 +161,6 @@ class Moments:
             data=Readings(np.empty((0, 1)), np.empty(0), np.empty(0)),
             values=np.empty((0, 0)),
             names=_names(config),
-            left_out=0,
-            slope_range=(-np.inf, np.inf),
         )
         linear = plain._linear(aligned, slopes)
         centres = np.median(linear, axis=0)
