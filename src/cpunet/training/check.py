@@ -220,18 +220,13 @@ def check(
         _require_picture(picture)
         refuse_existing(picture, force=force or not alone)
     chosen = load_recipe(recipe, settings)
-    if alone:
-        result = _checked(both, chosen, peak)
-        if picture is not None and result.sides:
-            result.save(picture, force)
-        return result
-    findings = []
-    for name, pair in paired(*both).items():
+    findings: list[Finding] = []
+    for name, pair in ({"": both} if alone else paired(*both)).items():
         one = _checked(pair, chosen, peak)
         findings += [replace(finding, channel=name) for finding in one.findings]
         if picture is not None and one.sides:
-            one.save(picture.with_stem(f"{picture.stem}-{name}"), force)
-    return CheckResult(findings)
+            one.save(picture.with_stem(f"{picture.stem}-{name}") if name else picture, force)
+    return one if alone else CheckResult(findings)
 
 
 def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
