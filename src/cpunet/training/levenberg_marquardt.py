@@ -11,6 +11,8 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.training.moments import Values
 
+Tell = Callable[[float], None]
+
 # Far from the data all deviations would be clipped, so the first rounds have wider clips.
 FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
 # Decrease of chi-square, in units of chi-square per moment, below which a fit ends: a few
@@ -65,11 +67,7 @@ class Minimum(NamedTuple):
 
 
 def levenberg_marquardt(
-    problem: Problem,
-    steps: int,
-    listener: Callable[[float], None] | None,
-    *,
-    coarse: bool = True,
+    problem: Problem, steps: int, tell: Tell | None, *, coarse: bool = True
 ) -> Minimum:
     r"""Minimise a problem from its current parameters, and set them to the minimum.
 
@@ -86,7 +84,7 @@ def levenberg_marquardt(
         Problem with the parameters to be found.
     steps
         Maximum number of steps.
-    listener
+    tell
         Called with chi-square after each step.
     coarse
         Whether the start is far from the data.
@@ -128,8 +126,8 @@ def levenberg_marquardt(
             else:
                 jacobian, updates = problem.jacobian(tried, found), 0
             vector, residuals, cost = tried, found, cost - fall
-            if listener is not None:
-                listener(cost)
+            if tell is not None:
+                tell(cost)
             if fall < CONVERGED * max(1.0, cost / problem.moments):
                 if not updates:
                     break

@@ -161,8 +161,7 @@ def _generator(path: Path, length: int) -> PositionalUNet:
             "number of channels); give a file such as fep_REN.pt"
         )
     config = PunetConfig(name="punet", width=width, dropout=0.1)
-    with torch.device("meta"):
-        expected = PositionalUNet(config, length).state_dict()
+    network = PositionalUNet(config, length)
     named: State = {}
     for name, value in state.items():
         if name in MAPS:
@@ -173,11 +172,10 @@ def _generator(path: Path, length: int) -> PositionalUNet:
         if block in LAYERS and number.isdecimal():
             layer, rest = block, f"{number}.{rest}"
         named[f"{LAYERS.get(layer, layer)}.{rest}" if layer else name] = value
-    if wrong := differing(named, expected):
+    if wrong := differing(named, network.state_dict()):
         raise CpunetError(
             f"{path}: weights of another architecture: {len(wrong)} tensors differ, first "
             f"{wrong[0]}"
         )
-    network = PositionalUNet(config, length)
     network.load_state_dict(named)
     return network.eval()
