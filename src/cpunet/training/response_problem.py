@@ -51,6 +51,7 @@ class Parameters:
         named = [(n, p) for n, p in response.named_parameters() if p.numel()]
         self._parts = [part for _, part in named]
         self.labels = [n for n, p in named for _ in range(p.numel())]
+        self._names = [f"{n}.{i + 1}" for n, p in named for i in range(p.numel())]
         self.centre = self.vector()
         scales = [SCALES.get(name, (TIME_WIDTH, TIME_STEP)) for name in self.labels]
         self.widths, self.steps = np.array(scales).T.copy()
@@ -71,20 +72,13 @@ class Parameters:
 
     def set(self, vector: Values) -> None:
         """Set the parameters of the response from a vector."""
-        first = 0
-        for part in self._parts:
-            stop = first + part.numel()
-            part.data.copy_(torch.from_numpy(vector[first:stop]).view_as(part))
-            first = stop
+        values = torch.from_numpy(vector).split([part.numel() for part in self._parts])
+        for part, own in zip(self._parts, values, strict=True):
+            part.data.copy_(own.view_as(part))
 
     def by_name(self, values: Values) -> dict[str, float]:
         """Values of the parameters by name and number."""
-        counted: dict[str, int] = {}
-        named = {}
-        for label, value in zip(self.labels, values.tolist(), strict=True):
-            counted[label] = counted.get(label, 0) + 1
-            named[f"{label}.{counted[label]}"] = value
-        return named
+        return dict(zip(self._names, values.tolist(), strict=True))
 
 
 POLES = "log_poles_ns"
