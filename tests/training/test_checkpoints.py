@@ -42,22 +42,8 @@ def weights(model) -> dict[str, bytes]:
     return {name: value.numpy().tobytes() for name, value in model.state_dict().items()}
 
 
-def straight(sets, recipe):
-    records = []
-    return weights(train(*sets, recipe, seed=3, listener=records.extend)), records
-
-
 def unfinished(folder: Path, **facts: object) -> UnfinishedRun:
     return UnfinishedRun(folder, facts, {"device": "cpu"})
-
-
-def until(iteration: int, sets, recipe, folder: Path) -> list:
-    """Train up to an iteration; its state goes to a file, its records are returned."""
-    records, run = [], unfinished(folder)
-    run.begin(resume=False)
-    with interrupted_in(iteration), pytest.raises(KeyboardInterrupt):
-        train(*sets, recipe, seed=3, listener=records.extend, save=run.save)
-    return records
 
 
 @pytest.mark.parametrize(
@@ -70,8 +56,11 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
 )
 def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, variant, stop):
     recipe = recipe_of(tiny, *VARIANTS[variant])
-    expected, expected_records = straight(sets, recipe)
-    records = until(stop, sets, recipe, tmp_path)
+    expected_records, records, run = [], [], unfinished(tmp_path)
+    expected = weights(train(*sets, recipe, seed=3, listener=expected_records.extend))
+    run.begin(resume=False)
+    with interrupted_in(stop), pytest.raises(KeyboardInterrupt):
+        train(*sets, recipe, seed=3, listener=records.extend, save=run.save)
     state = unfinished(tmp_path).begin(resume=True)
     assert state["iteration"] == stop == len(records)
     torch.manual_seed(99)  # what happened in between does not matter

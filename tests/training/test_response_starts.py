@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes import load_recipe
@@ -48,7 +47,7 @@ def test_nothing_else_is_tried_for_another_detector(
     called: list[str] = []
     problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None, drift=None))
     cost = 20 * chi_square * response_fit.ANOTHER_DETECTOR
-    found = Fitted(cast(ResponseProblem, problem), cost, np.eye(1))
+    found = Fitted(problem, cost, np.eye(1))
 
     def replace(name: str, result: Any) -> None:
         monkeypatch.setattr(response_fit, name, lambda *_, **__: called.append(name) or result)
@@ -68,7 +67,7 @@ def test_nothing_else_is_tried_for_another_detector(
     recipe, noise = load_recipe("fast"), SimpleNamespace(dt_ns=16.0)
     sets = SimpleNamespace(bands=lambda _most=None: [], recipe=recipe, noise=noise)
     fitter = Fitter(recipe.matching.training)
-    _, fit = response_fit.fit_response(cast(PulseSets, sets), fitter)
+    _, fit = response_fit.fit_response(sets, fitter)
     assert called == expected
     assert fit == expected[-1]
 
@@ -117,7 +116,6 @@ RECIPE = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_
 @pytest.fixture(scope="module")
 def bands() -> list[Band]:
     sim, data, noise = measured_with(CHAIN)
-    assert isinstance(noise, BaselineNoise)
     rng = np.random.default_rng(0)
     return PulseSets(sim[:300], data[:300], noise, RECIPE, rng).bands()
 

@@ -94,11 +94,9 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
     slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
     if MAX_NEGATIVE <= slow <= MAX_SLOW:
         return []
-    how = (
-        "too early, which no readout does"
-        if slow < 0
-        else "late, as of slower pulses than simulated"
-    )
+    how = "late, as of slower pulses than simulated"
+    if slow < 0:
+        how = "too early, which no readout does"
     return [f"{100 * abs(slow):.0f} % of the charge would arrive {how}; see the fit"]
 
 

@@ -95,11 +95,7 @@ def fit_learned(
 
 
 def _from_afar(
-    config: LearnedConfig,
-    dt_ns: float,
-    far: Sequence[Band],
-    near: Sequence[Band],
-    fitter: Fitter,
+    config: LearnedConfig, dt_ns: float, far: list[Band], near: list[Band], fitter: Fitter
 ) -> tuple[LearnedResponse, Fitted]:
     """Fit a step response from the best of some bases, first by wide bins."""
     problems = []
