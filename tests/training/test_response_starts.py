@@ -27,7 +27,7 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from unpaired import CHAIN, DT_NS, measured_with
 
-SEARCHES = ["_with_more", "ringing_if_better", "free_decay_if_better"]  # of a hopeless fit
+SEARCHES = ["fit", "ringing_if_better", "free_decay_if_better"]  # of a hopeless fit
 DRIFT = ["drift_if_better", "drift_if_needed"]
 PHYSICS = "_with_wrong_physics"
 
@@ -46,13 +46,17 @@ def test_nothing_else_is_tried_for_another_detector(
     """If the onset is off, too; `chi_square` is in units of `response_fit.ANOTHER_DETECTOR`."""
     called: list[str] = []
     problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None, drift=None))
+    problem.of = lambda *_: problem
     cost = 20 * chi_square * response_fit.ANOTHER_DETECTOR
     found = Fitted(problem, cost, np.eye(1))
 
-    def replace(name: str, result: Any) -> None:
-        monkeypatch.setattr(response_fit, name, lambda *_, **__: called.append(name) or result)
+    def replace(name: str, result: Any, of: Any = response_fit) -> None:
+        monkeypatch.setattr(of, name, lambda *_, **__: called.append(name) or result)
 
-    for name in (*SEARCHES, *DRIFT):
+    recipe, noise = load_recipe("fast"), SimpleNamespace(dt_ns=16.0)
+    fitter = Fitter(recipe.matching.training)
+    replace("fit", found, fitter)
+    for name in (*SEARCHES[1:], *DRIFT):
         replace(name, found)
     for name in (PHYSICS, "_determined"):
         replace(name, name)
@@ -64,9 +68,7 @@ def test_nothing_else_is_tried_for_another_detector(
     }
     for name, answer in asked.items():
         monkeypatch.setattr(response_fit, name, lambda *_, answer=answer, **__: answer)
-    recipe, noise = load_recipe("fast"), SimpleNamespace(dt_ns=16.0)
     sets = SimpleNamespace(bands=lambda _most=None: [], recipe=recipe, noise=noise)
-    fitter = Fitter(recipe.matching.training)
     _, fit = response_fit.fit_response(sets, fitter)
     assert called == expected
     assert fit == expected[-1]

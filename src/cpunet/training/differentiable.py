@@ -11,7 +11,8 @@ its mean position.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -231,13 +232,9 @@ class DifferentiableSet:
                 def of(records: Tensor, noise: Tensor = noise) -> Tensor:
                     return functions(*self.readings(self.scaled(records) + noise))
 
-                def along(
-                    tangent: Tensor, of: Callable[[Tensor], Tensor] = of, clean: Tensor = clean
-                ) -> Any:
-                    return torch.func.jvp(of, (clean,), (tangent,))
-
+                along = partial(torch.func.jvp, of, (clean,))
                 # the values are the same along all directions
-                values, columns = torch.func.vmap(along, out_dims=(None, 0))(moved)  # type: ignore[arg-type]
+                values, columns = torch.func.vmap(along, out_dims=(None, 0))((moved,))  # type: ignore[arg-type]
                 yield first, values, columns, self.weights[first : first + BLOCK]
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:

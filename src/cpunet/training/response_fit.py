@@ -197,7 +197,8 @@ def fit_response(
             return response, fit
     elif found.per_moment > ANOTHER_DETECTOR and onset_is_off(found.problem):
         return response, _with_wrong_physics(found, fitter)
-    found = _extended(_with_more(found, sets.bands(CHECKED), fitter), fitter)
+    more = found.problem.of(response, sets.bands(CHECKED))
+    found = _extended(fitter.fit(more, coarse=False), fitter)
     response = found.problem.response
     if found.poor and onset_is_off(found.problem):
         return response, _with_wrong_physics(found, fitter)
@@ -256,12 +257,6 @@ def _determined(found: Fitted, bands: Sequence[Band], sets: PulseSets, fitter: F
         deviations = compared.deviations(compared.parameters.vector())
         fitter.count(float(deviations @ deviations))
     return described(compared, covariance, fitter)
-
-
-def _with_more(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fitted:
-    """Continue a fit with more pulses."""
-    more = found.problem.of(found.problem.response, bands)
-    return fitter.fit(more, coarse=False)
 
 
 def _with_wrong_physics(found: Fitted, fitter: Fitter) -> Fit:
