@@ -316,10 +316,9 @@ class ElectronicsResponse(Readout):
 
         A label is the name of the tensor and the place in it, as ``"slow_weights.1"``.
         """
-        poles = sorted(
-            enumerate(self.log_poles_ns.exp().tolist(), 1), key=lambda pole: -pole[1]
-        )
-        told = {f"pole_{i}_ns": (f"log_poles_ns.{k}", t) for i, (k, t) in enumerate(poles, 1)}
+        poles = enumerate(self.log_poles_ns.exp().tolist(), 1)
+        falling = enumerate(sorted(poles, key=lambda pole: -pole[1]), 1)
+        told = {f"pole_{i}_ns": (f"log_poles_ns.{k}", tau) for i, (k, tau) in falling}
         slow = zip(self.slow_ns.tolist(), self.slow_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(slow, 1):
             told[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
@@ -332,11 +331,12 @@ class ElectronicsResponse(Readout):
                 share = f"fast_decay_{i}_share"
             told[share] = f"decay_weights.{i}", weight
         if len(self.ringing):
-            times, weights = self.log_ringing.exp().tolist(), self.ringing.tolist()
-            for i, name in enumerate(("mhz", "damping_ns")):
-                told[f"ringing_{name}"] = f"log_ringing.{i + 1}", times[i]
-            for i, name in enumerate(("sine", "cosine")):
-                told[f"ringing_{name}"] = f"ringing.{i + 1}", weights[i]
+            mhz, damping_ns = self.log_ringing.exp().tolist()
+            sine, cosine = self.ringing.tolist()
+            told["ringing_mhz"] = "log_ringing.1", mhz
+            told["ringing_damping_ns"] = "log_ringing.2", damping_ns
+            told["ringing_sine"] = "ringing.1", sine
+            told["ringing_cosine"] = "ringing.2", cosine
         stretch = {} if self.drift is None else self.drift.describe()
         for i, (name, value) in enumerate(stretch.items(), 1):
             told[name] = f"drift.stretch.{i}", value

@@ -366,9 +366,7 @@ class Recipe(Config):
             If the recipe does not match a response.
         """
         match self.generator, self.training:
-            case (
-                ResponseConfig() | LearnedConfig()
-            ) as generator, MatchingConfig() as training:
+            case ResponseConfig() | LearnedConfig() as generator, MatchingConfig() as training:
                 return MatchingSettings(generator, training)
         raise CpunetError(f"recipe {self.name}: does not match a response")
 
@@ -403,11 +401,8 @@ class Recipe(Config):
                 f"the loss windows cover {covered} samples, a prepared pulse has {length}"
             )
         step = self.cyclegan.discriminator.samples_per_step
-        factors = {
-            "16 (the generators halve it four times)": 16,
-            f"samples_per_step ({step})": step,
-        }
-        for name, factor in factors.items():
+        halved = "16 (the generators halve it four times)"
+        for factor, name in ((16, halved), (step, f"samples_per_step ({step})")):
             if length % factor:
                 raise ValueError(
                     f"a prepared pulse has {length} samples, no multiple of {name}"

@@ -12,6 +12,7 @@ four times better than its mean.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -280,7 +281,7 @@ class Moments:
         errors += [0.0] * (len(self.names) - len(errors))
         return np.array(errors)
 
-    @property
+    @cached_property
     def quantities(self) -> FloatArray:
         """Stretches and components as a matrix, shape (samples, quantities)."""
         config, stretches = self.config, list(pairwise(self.config.segments))
@@ -289,7 +290,7 @@ class Moments:
             matrix[config.before + first : config.before + stop, column] = 1 / (stop - first)
         return np.concatenate([matrix, self.components], axis=1)
 
-    @property
+    @cached_property
     def offset(self) -> Values:
         """Components of the mean pulse."""
         return np.asarray(self.mean.astype(float) @ self.components)

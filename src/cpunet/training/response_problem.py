@@ -18,15 +18,15 @@ from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
 
-# Widths of the priors around the start, and steps of the finite differences.  Widths are wide
-# for times (in their logarithm); for weights such that half of the charge may be slow, and that
-# the main decay dominates.
+# Widths of the priors around the start, and steps of the finite differences: wide for times (in
+# their logarithm).
 TIME_WIDTH, TIME_STEP, WEIGHT_STEP = 1.0, 0.01, 0.002
 # The same for the stretch of the drift, and for its change per us.
 STRETCH_WIDTHS, STRETCH_STEPS = (0.1, 0.05), (0.003, 0.002)
 STRETCH = "drift.stretch"
 # Of a learned step response, whose coordinates have priors of width 1 around 0.
 COORDINATES, LONGEST = "coordinates", 2.0
+# The same of what is no time: half of the charge may be slow, and the main decay dominates.
 SCALES = {
     "decay_weights": (0.03, WEIGHT_STEP),
     "ringing": (0.3, WEIGHT_STEP),
