@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -232,7 +232,7 @@ class DifferentiableSet:
                 def of(records: Tensor, noise: Tensor = noise) -> Tensor:
                     return functions(*self.readings(self.scaled(records) + noise))
 
-                along = partial(torch.func.jvp, of, (clean,))
+                along: Any = partial(torch.func.jvp, of, (clean,))
                 # the values are the same along all directions
                 values, columns = torch.func.vmap(along, out_dims=(None, 0))((moved,))  # type: ignore[arg-type]
                 yield first, values, columns, self.weights[first : first + BLOCK]

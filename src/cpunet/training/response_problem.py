@@ -72,7 +72,8 @@ class Parameters:
 
     def set(self, vector: Values) -> None:
         """Set the parameters of the response from a vector."""
-        values = torch.from_numpy(vector).split([part.numel() for part in self._parts])
+        sizes = [part.numel() for part in self._parts]
+        values = torch.split(torch.from_numpy(vector), sizes)
         for part, own in zip(self._parts, values, strict=True):
             part.data.copy_(own.view_as(part))
 
