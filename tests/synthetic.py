@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
+from cpunet.errors import CpunetError
 from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
@@ -239,6 +240,15 @@ def digests(run: Path) -> list[str]:
     """What must not depend on how often, or on how many processes, a training was begun."""
     files = (run / name for name in ("weights.safetensors", "losses.jsonl"))
     return [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+
+
+def one_line(call: Callable[[], object], *parts: str) -> None:
+    """That a call is refused in one line, with these parts."""
+    with pytest.raises(CpunetError) as error:
+        call()
+    assert "\n" not in str(error.value)
+    for part in parts:
+        assert part in str(error.value)
 
 
 def require_drawn(figure: Figure) -> None:

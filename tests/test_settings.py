@@ -16,6 +16,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
+from synthetic import one_line
 
 KINDS = (Electronics, Recipe, Detector, SimulationSettings, Shift)
 TEXTS = {
@@ -80,10 +81,6 @@ def test_the_recipe_that_matches_a_response():
     # what is compared lies within a window, whose half maximum is before its middle
     assert training.before <= training.baseline[0] <= recipe.preparation.samples_before
     assert training.after <= recipe.preparation.samples_after
-    assert -training.before <= min(training.segments)
-    assert max(training.segments) <= training.after
-    assert list(training.segments) == sorted(set(training.segments))
-    assert training.squares <= training.components
     with pytest.raises(CpunetError, match=r"^recipe fast: does not train a CycleGAN$"):
         _ = recipe.cyclegan
 
@@ -96,15 +93,15 @@ def test_all_recipes_see_the_same_pulses():
 
 
 @pytest.mark.parametrize(
-    ("room", "other", "said"),
+    ("room", "said"),
     [
-        ("generator", "paper", "goes with training method cyclegan"),
-        ("training", "paper", "goes with training method cyclegan"),
-        ("discriminator", "paper", "a discriminator is needed for punet, and for it alone"),
+        ("generator", "goes with training method cyclegan"),
+        ("training", "goes with training method cyclegan"),
+        ("discriminator", "a discriminator is needed for punet, and for it alone"),
     ],
 )
-def test_parts_of_different_trainings_are_not_mixed(room, other, said):
-    fast, paper = (load_recipe(name).model_dump(mode="json") for name in ("fast", other))
+def test_parts_of_different_trainings_are_not_mixed(room, said):
+    fast, paper = (load_recipe(name).model_dump(mode="json") for name in ("fast", "paper"))
     for settings, part in ((fast, paper), (paper, fast)):
         with pytest.raises(CpunetError, match=f"mine: .*{said}"):
             checked(Recipe, settings | {room: part[room]}, "mine")
@@ -145,14 +142,6 @@ def test_values_are_overridden_in_turn():
     assert load_recipe("paper").training.batch_size == 32
 
 
-def message(name: str, *overrides: str) -> str:
-    with pytest.raises(CpunetError) as error:
-        load_recipe(name, overrides)
-    text = str(error.value)
-    assert "\n" not in text
-    return text
-
-
 @pytest.mark.parametrize(
     ("override", "part"),
     [
@@ -160,14 +149,14 @@ def message(name: str, *overrides: str) -> str:
         ("training.batch_size", "expected KEY=VALUE"),
         ("training.batch_size=[", "not YAML"),
         ("training.rate_generators=.nan", "training.rate_generators: "),
-        ("discriminator.value_range=[1, 0]", "discriminator: "),
+        ("discriminator.value_range=[1, 0]", "discriminator.value_range: must go from a lower"),
         ("discriminator.samples_per_step=7", "samples_per_step (7)"),
         ("preparation.samples_before=300", "the loss windows cover 800 samples"),
         ("preparation.baseline_samples=400", "baseline_samples must be fewer"),
     ],
 )
 def test_wrong_settings_are_named(override, part):
-    assert part in message("paper", override)
+    one_line(lambda: load_recipe("paper", [override]), part)
 
 
 @pytest.mark.parametrize(
@@ -182,7 +171,7 @@ def test_wrong_settings_are_named(override, part):
     ],
 )
 def test_wrong_settings_of_a_matching_are_named(override, part):
-    assert part in message("fast", override)
+    one_line(lambda: load_recipe("fast", [override]), part)
 
 
 def test_values_of_a_file_and_of_words(tmp_path: Path) -> None:

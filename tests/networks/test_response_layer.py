@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.fft
 import torch
 
 from cpunet.electronics.chain import Electronics, read_electronics
@@ -138,13 +137,6 @@ def test_decays_may_have_times_of_their_own():
     told = free.describe()
     assert told["fast_decay_1_us"] == pytest.approx(3)
     assert told["fast_decay_2_share"] == pytest.approx(0.03)
-
-
-@pytest.mark.parametrize("least", [1, 2, 7, 97, 1021, 2240, 5443, 8192, 10_001])
-def test_fast_lengths_are_the_least_even_ones(least):
-    # twice the least product of 2, 3 and 5 that is at least half of it
-    wanted = 2 * scipy.fft.next_fast_len(-(-least // 2), real=True)
-    assert fast_length(least) == wanted
 
 
 END = 400

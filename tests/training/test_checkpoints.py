@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -12,12 +13,7 @@ import torch
 from cpunet import outputs
 from cpunet.errors import CpunetError
 from cpunet.training.loop import train
-from cpunet.training.networks import (
-    CHECKPOINT,
-    MARKER,
-    UnfinishedRun,
-    unfinished_folder,
-)
+from cpunet.training.networks import CHECKPOINT, MARKER, UnfinishedRun, unfinished_folder
 from cpunet.training.run import LOSSES, WEIGHTS
 from synthetic import interrupted_in, nearly_full_disk
 
@@ -46,22 +42,8 @@ def weights(model) -> dict[str, bytes]:
     return {name: value.numpy().tobytes() for name, value in model.state_dict().items()}
 
 
-def straight(sets, recipe):
-    records = []
-    return weights(train(*sets, recipe, seed=3, listener=records.extend)), records
-
-
 def unfinished(folder: Path, **facts: object) -> UnfinishedRun:
     return UnfinishedRun(folder, facts, {"device": "cpu"})
-
-
-def until(iteration: int, sets, recipe, folder: Path) -> list:
-    """Train up to an iteration; its state goes to a file, its records are returned."""
-    records, run = [], unfinished(folder)
-    run.begin(resume=False)
-    with interrupted_in(iteration), pytest.raises(KeyboardInterrupt):
-        train(*sets, recipe, seed=3, listener=records.extend, save=run.save)
-    return records
 
 
 @pytest.mark.parametrize(
@@ -74,8 +56,11 @@ def until(iteration: int, sets, recipe, folder: Path) -> list:
 )
 def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, variant, stop):
     recipe = recipe_of(tiny, *VARIANTS[variant])
-    expected, expected_records = straight(sets, recipe)
-    records = until(stop, sets, recipe, tmp_path)
+    expected_records, records, run = [], [], unfinished(tmp_path)
+    expected = weights(train(*sets, recipe, seed=3, listener=expected_records.extend))
+    run.begin(resume=False)
+    with interrupted_in(stop), pytest.raises(KeyboardInterrupt):
+        train(*sets, recipe, seed=3, listener=records.extend, save=run.save)
     state = unfinished(tmp_path).begin(resume=True)
     assert state["iteration"] == stop == len(records)
     torch.manual_seed(99)  # what happened in between does not matter
@@ -94,16 +79,6 @@ def state(value: float = 0.0) -> dict:
     }
 
 
-def same_tree(a, b) -> bool:
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b) and a.dtype == b.dtype
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same_tree(a[k], b[k]) for k in a)
-    if isinstance(a, list):
-        return len(a) == len(b) and all(map(same_tree, a, b))
-    return a == b
-
-
 def kept(folder: Path, value: float = 0.0) -> UnfinishedRun:
     """A training that has stored a state."""
     run = unfinished(folder)
@@ -115,33 +90,30 @@ def kept(folder: Path, value: float = 0.0) -> UnfinishedRun:
 def test_a_state_comes_back(tmp_path):
     run = kept(tmp_path, 1.0)
     run.save(state(2.0))
-    assert same_tree(unfinished(tmp_path).begin(resume=True), state(2.0))
+    assert str(unfinished(tmp_path).begin(resume=True)) == str(state(2.0))
     assert sorted(p.name for p in tmp_path.iterdir()) == [CHECKPOINT, LOSSES, MARKER]
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff" * 100, None])
-def test_a_damaged_checkpoint_is_told(tmp_path, content):
-    kept(tmp_path)
-    path = tmp_path / CHECKPOINT
-    path.write_bytes(path.read_bytes()[:-200] if content is None else content)
-    with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with `force`"):
-        unfinished(tmp_path).begin(resume=True)
+def other_number(content: bytes) -> bytes:
+    """One bit of the weights is another; torch would load them."""
+    at = content.index(torch.ones(3).numpy().tobytes())
+    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
-def test_one_damaged_byte_of_the_weights_is_told(tmp_path):
+def code(_: bytes) -> bytes:
+    """An object that is not of plain data: nothing is executed."""
+    torch.save({"state": Path("x").open}, stream := io.BytesIO())
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda _: b"", lambda _: b"\xff" * 100, lambda c: c[:-200], other_number, code]
+)
+def test_a_damaged_checkpoint_is_told(tmp_path, damage):
     kept(tmp_path, 1.0)
     path = tmp_path / CHECKPOINT
-    content = bytearray(path.read_bytes())
-    content[content.index(torch.ones(3).numpy().tobytes())] ^= 1  # torch loads another number
-    path.write_bytes(content)
-    with pytest.raises(CpunetError, match="damaged"):
-        unfinished(tmp_path).begin(resume=True)
-
-
-def test_a_checkpoint_executes_nothing(tmp_path):
-    kept(tmp_path)
-    torch.save({"state": Path("x").open}, tmp_path / CHECKPOINT)
-    with pytest.raises(CpunetError, match="damaged"):
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with `force`"):
         unfinished(tmp_path).begin(resume=True)
 
 
@@ -241,7 +213,7 @@ def test_without_resume_nothing_is_lost(sets, recipe, out):
     assert content(beside(out)) == before
 
 
-def test_another_recipe_or_seed(sets, recipe, tiny, out, whole):
+def test_another_recipe_or_seed(sets, recipe, tiny, out):
     before = content(beside(out)).keys()
     other = recipe_of(tiny, "training.log_interval=1", "training.batch_size=5")
     with pytest.raises(
@@ -251,8 +223,6 @@ def test_another_recipe_or_seed(sets, recipe, tiny, out, whole):
     with pytest.raises(CpunetError, match=r"^resumed with another seed: 3 → 4; give"):
         work(sets, recipe, out, resume=True, seed=4)
     assert content(beside(out)).keys() == before
-    work(sets, recipe, out, resume=True)
-    assert content(out) == whole
 
 
 def test_a_full_disk_does_not_stop_the_training(sets, recipe, tmp_path, whole, caplog):

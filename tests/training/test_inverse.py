@@ -18,6 +18,7 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.training.inverse import fit_inverse
 from synthetic import drifting, two_sites
+from unpaired import crossing
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50, 50]", "generator.decay_us=60"])
 DT_NS = 16.0
@@ -65,13 +66,8 @@ def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> Flo
 
 def half_time(windows: FloatArray) -> np.ndarray:
     """Last interpolated crossing of half the height before the maximum."""
-    times = []
-    for window in windows:
-        level = 0.5 * window.max()
-        before = np.flatnonzero(window[: window.argmax()] < level)[-1]
-        low, high = window[before : before + 2]
-        times.append(before + (level - low) / (high - low))
-    return np.array(times)
+    unit = torch.from_numpy(windows / windows.max(axis=1, keepdims=True))
+    return crossing(unit, 0.5, unit.argmax(dim=1))[0].numpy()
 
 
 def at_half(windows: FloatArray) -> np.ndarray:

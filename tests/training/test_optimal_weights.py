@@ -15,13 +15,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.recipes import load_recipe
 from cpunet.training.moments import Moments, Values
-from cpunet.training.optimal_weights import (
-    Parts,
-    Sums,
-    WeightedMeans,
-    jackknife_bias,
-    refine,
-)
+from cpunet.training.optimal_weights import Parts, Sums, WeightedMeans, jackknife_bias, refine
 from cpunet.training.response_fit import amplitude_shift
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem, SmoothParameters
 from cpunet.training.translated import Noise, SimulatedSide

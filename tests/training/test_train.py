@@ -10,23 +10,13 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.loading import (
-    InputSet,
-    load_pulses,
-    require_same_sampling,
-)
+from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
-from synthetic import (
-    KEV,
-    SMALL_NETWORK,
-    Files,
-    write_files,
-    write_run,
-)
+from synthetic import KEV, SMALL_NETWORK, Files, write_files, write_run
 
 RECIPE = load_recipe(
     "paper",
@@ -83,15 +73,12 @@ def test_sets_of_different_sampling(sim_set, files):
     )
 
 
-def test_devices():
+def test_devices(monkeypatch):
     assert resolve_device("cpu") == "cpu"
     assert resolve_device("auto") in ("cpu", "cuda")
     for name in ("gpu", "", "CPU", "mps", "cudas", "cuda:-1", "cuda:"):
         with pytest.raises(CpunetError, match="is not known; use cpu, cuda or auto"):
             resolve_device(name)
-
-
-def test_a_gpu_beyond_the_last(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert resolve_device("cuda:1") == "cuda:1"

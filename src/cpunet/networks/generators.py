@@ -140,14 +140,10 @@ class LinearInverse(nn.Module):
         super().__init__()
         self.sizes = sizes
         n = sizes.before + sizes.after
-
-        def buffer(name: str, *shape: int) -> None:
+        # the first: half of the maximum, the same number for all windows
+        shapes = {"half_height": (), "mean_in": (n,), "mean_out": (n,), "weights": (n, n)}
+        for name, shape in shapes.items():
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
-
-        buffer("half_height")  # half of the maximum, the same number for all windows
-        buffer("mean_in", n)
-        buffer("mean_out", n)
-        buffer("weights", n, n)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Translate measured windows.

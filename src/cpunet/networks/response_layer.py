@@ -311,24 +311,40 @@ class ElectronicsResponse(Readout):
         return step
 
     @torch.no_grad()
+    def named(self) -> dict[str, tuple[str, float]]:
+        """Fitted parameters by name, with the unit at its end: label and value of each.
+
+        A label is the name of the tensor and the place in it, as ``"slow_weights.1"``.
+        """
+        poles = enumerate(self.log_poles_ns.exp().tolist(), 1)
+        falling = enumerate(sorted(poles, key=lambda pole: -pole[1]), 1)
+        told = {f"pole_{i}_ns": (f"log_poles_ns.{k}", tau) for i, (k, tau) in falling}
+        slow = zip(self.slow_ns.tolist(), self.slow_weights.tolist(), strict=True)
+        for i, (tau, weight) in enumerate(slow, 1):
+            told[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
+        told["decay_us"] = "log_decay_us.1", float(self.log_decay_us.exp())
+        fast = zip(self.fast_times_us.tolist(), self.decay_weights.tolist(), strict=True)
+        for i, (tau, weight) in enumerate(fast, 1):
+            share = f"decay_{tau:g}_us"
+            if self.config.free_decays:
+                told[f"fast_decay_{i}_us"] = f"log_fast_decays_us.{i}", tau
+                share = f"fast_decay_{i}_share"
+            told[share] = f"decay_weights.{i}", weight
+        if len(self.ringing):
+            mhz, damping_ns = self.log_ringing.exp().tolist()
+            sine, cosine = self.ringing.tolist()
+            told["ringing_mhz"] = "log_ringing.1", mhz
+            told["ringing_damping_ns"] = "log_ringing.2", damping_ns
+            told["ringing_sine"] = "ringing.1", sine
+            told["ringing_cosine"] = "ringing.2", cosine
+        stretch = {} if self.drift is None else self.drift.describe()
+        for i, (name, value) in enumerate(stretch.items(), 1):
+            told[name] = f"drift.stretch.{i}", value
+        return told
+
     def describe(self) -> dict[str, float]:
         """Fitted parameters by name, with the unit at the end of the name."""
-        poles = sorted(self.log_poles_ns.exp().tolist(), reverse=True)
-        told = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
-        slow = zip(self.slow_ns.tolist(), self.slow_weights.tolist(), strict=True)
-        told |= {f"slow_{tau:g}_ns": weight for tau, weight in slow}
-        told["decay_us"] = float(self.log_decay_us.exp())
-        times, weights = self.fast_times_us.tolist(), self.decay_weights.tolist()
-        if self.config.free_decays:
-            told |= {f"fast_decay_{i + 1}_us": tau for i, tau in enumerate(times)}
-            told |= {f"fast_decay_{i + 1}_share": weight for i, weight in enumerate(weights)}
-        else:
-            told |= {f"decay_{tau:g}_us": w for tau, w in zip(times, weights, strict=True)}
-        if len(self.ringing):
-            names = ("ringing_mhz", "ringing_damping_ns", "ringing_sine", "ringing_cosine")
-            values = [*self.log_ringing.exp().tolist(), *self.ringing.tolist()]
-            told |= dict(zip(names, values, strict=True))
-        return told if self.drift is None else told | self.drift.describe()
+        return {name: value for name, (_, value) in self.named().items()}
 
 
 def _spline(frequency: Tensor) -> Tensor:

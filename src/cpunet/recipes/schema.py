@@ -8,13 +8,22 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
 # parameters that stretch the simulated drift, see `cpunet.networks.response_layer`
 DriftTerms = Annotated[int, Field(ge=0, le=2)]
+
+
+def _rising(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError("must go from a lower to a higher value")
+    return ends
+
+
+_RangeKev = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 
 
 class PunetConfig(Config):
@@ -84,13 +93,7 @@ class GruConfig(Config):
     embedding_dim: Width
     hidden: Width
     samples_per_step: Samples
-    value_range: tuple[float, float] | None
-
-    @model_validator(mode="after")
-    def _range_is_not_empty(self) -> GruConfig:
-        if self.value_range is not None and not self.value_range[0] < self.value_range[1]:
-            raise ValueError("value_range must go from a lower to a higher value")
-        return self
+    value_range: Annotated[tuple[float, float], AfterValidator(_rising)] | None
 
 
 class PeakConfig(Config):
@@ -279,16 +282,8 @@ class ScoreConfig(Config):
     bootstraps: Annotated[int, Field(ge=2, le=100_000)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
     edge_samples: Samples
-    sideband_kev: tuple[Positive, Positive]
-    continuum_kev: dict[str, tuple[Positive, Positive]]
-
-    @model_validator(mode="after")
-    def _ranges_are_not_empty(self) -> ScoreConfig:
-        ranges = {"sideband_kev": self.sideband_kev, **self.continuum_kev}
-        for name, (low, high) in ranges.items():
-            if not low < high:
-                raise ValueError(f"{name} must go from a lower to a higher energy")
-        return self
+    sideband_kev: _RangeKev
+    continuum_kev: dict[str, _RangeKev]
 
 
 class SearchConfig(Config):
@@ -356,13 +351,10 @@ class Recipe(Config):
         CpunetError
             If the recipe does not train a CycleGAN.
         """
-        if not (
-            isinstance(self.generator, PunetConfig)
-            and isinstance(self.training, TrainingConfig)
-            and self.discriminator is not None
-        ):
-            raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
-        return CycleGanSettings(self.generator, self.discriminator, self.training)
+        match self.generator, self.discriminator, self.training:
+            case PunetConfig() as generator, GruConfig() as judge, TrainingConfig() as training:
+                return CycleGanSettings(generator, judge, training)
+        raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
 
     @property
     def matching(self) -> MatchingSettings:
@@ -373,12 +365,10 @@ class Recipe(Config):
         CpunetError
             If the recipe does not match a response.
         """
-        if not (
-            isinstance(self.generator, ResponseConfig | LearnedConfig)
-            and isinstance(self.training, MatchingConfig)
-        ):
-            raise CpunetError(f"recipe {self.name}: does not match a response")
-        return MatchingSettings(self.generator, self.training)
+        match self.generator, self.training:
+            case ResponseConfig() | LearnedConfig() as generator, MatchingConfig() as training:
+                return MatchingSettings(generator, training)
+        raise CpunetError(f"recipe {self.name}: does not match a response")
 
     @property
     def chain(self) -> ResponseConfig:
@@ -389,11 +379,9 @@ class Recipe(Config):
         CpunetError
             If the recipe has none.
         """
-        if not isinstance(self.generator, ResponseConfig):
-            raise CpunetError(
-                f"recipe {self.name}: fits no readout chain; give the recipe fast"
-            )
-        return self.generator
+        if isinstance(self.generator, ResponseConfig):
+            return self.generator
+        raise CpunetError(f"recipe {self.name}: fits no readout chain; give the recipe fast")
 
     @model_validator(mode="after")
     def _parts_belong_together(self) -> Recipe:
@@ -404,28 +392,19 @@ class Recipe(Config):
             )
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")
-        return self
-
-    @model_validator(mode="after")
-    def _networks_fit(self) -> Recipe:
-        if not isinstance(self.training, TrainingConfig):
+        if not network:
             return self
-        losses, length = self.training.losses, self.preparation.length
+        losses, length = self.cyclegan.training.losses, self.preparation.length
         covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
         if covered != length:
             raise ValueError(
                 f"the loss windows cover {covered} samples, a prepared pulse has {length}"
             )
-        if length % 16:
-            raise ValueError(
-                f"a prepared pulse has {length} samples, no multiple of 16 (the generators "
-                "halve it four times)"
-            )
-        if self.discriminator is not None:
-            step = self.discriminator.samples_per_step
-            if length % step:
+        step = self.cyclegan.discriminator.samples_per_step
+        halved = "16 (the generators halve it four times)"
+        for factor, name in ((16, halved), (step, f"samples_per_step ({step})")):
+            if length % factor:
                 raise ValueError(
-                    f"a prepared pulse has {length} samples, no multiple of samples_per_step "
-                    f"({step})"
+                    f"a prepared pulse has {length} samples, no multiple of {name}"
                 )
         return self

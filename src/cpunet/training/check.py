@@ -66,8 +66,6 @@ class Finding:
 
     Parameters
     ----------
-    what
-        What was checked, in two words.
     level
         How bad it is.
     text
@@ -78,7 +76,6 @@ class Finding:
         Channel of the data, of several.
     """
 
-    what: str
     level: Level
     text: str
     remedy: str = ""
@@ -123,14 +120,13 @@ class CheckResult:
             raise CpunetError("there are no pulses of both sides to draw")
         names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
         sides = {name: self.sides[side] for name, side in names.items()}
+        axes = {
+            "Time from 10 to 50 % [ns]": _rise_ns,
+            "Current amplitude [1/sample]": _amplitudes,
+        }
         return sides_figure(
             {name: _of_height_one(one) for name, one in sides.items()},
-            {
-                "Time from 10 to 50 % [ns]": {n: _rise_ns(one) for n, one in sides.items()},
-                "Current amplitude [1/sample]": {
-                    n: _amplitudes(one) for n, one in sides.items()
-                },
-            },
+            {axis: {n: of(one) for n, one in sides.items()} for axis, of in axes.items()},
             self.sides["data"].dt_ns,
             {name: len(one.prepared) for name, one in sides.items()},
         )
@@ -224,24 +220,19 @@ def check(
         _require_picture(picture)
         refuse_existing(picture, force=force or not alone)
     chosen = load_recipe(recipe, settings)
-    if alone:
-        result = _checked(both, chosen, peak)
-        if picture is not None and result.sides:
-            result.save(picture, force)
-        return result
-    findings = []
-    for name, pair in paired(*both).items():
+    findings: list[Finding] = []
+    for name, pair in ({"": both} if alone else paired(*both)).items():
         one = _checked(pair, chosen, peak)
         findings += [replace(finding, channel=name) for finding in one.findings]
         if picture is not None and one.sides:
-            one.save(picture.with_stem(f"{picture.stem}-{name}"), force)
-    return CheckResult(findings)
+            one.save(picture.with_stem(f"{picture.stem}-{name}") if name else picture, force)
+    return one if alone else CheckResult(findings)
 
 
 def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
     """Read both sides as in a training, and compare them."""
     if isinstance(pair, CpunetError):
-        return CheckResult([_refusal("sim pulses", pair)])
+        return CheckResult([_refusal(pair)])
     selection = parse_selection(peak, recipe.peaks)
     findings: list[Finding] = []
     sets: dict[str, InputSet] = {}
@@ -250,7 +241,7 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
         try:
             sets[side] = load_pulses(file, kind, recipe, selection, tell=False)
         except CpunetError as error:
-            findings.append(_refusal(f"{side} pulses", error))
+            findings.append(_refusal(error))
     if len(sets) < 2:
         return CheckResult(findings)
     return CheckResult([*findings, *compare_sides(sets["sim"], sets["data"], selection)], sets)
@@ -270,19 +261,15 @@ def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> 
         findings += [_count(one, side), *_left_out(one, side), *_lines(one, side, selection)]
     if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
         return findings  # too few to compare shapes
-    findings.append(_spread(sim, data))
-    findings.append(_amplitude(sim, data))
-    return findings
+    return [*findings, _spread(sim, data), _amplitude(sim, data)]
 
 
-def _judged(what: str, text: str, remedy: str, fine: bool) -> Finding:
-    if fine:
-        return Finding(what, Level.FINE, text)
-    return Finding(what, Level.WARNING, text, remedy)
+def _judged(text: str, remedy: str, fine: bool) -> Finding:
+    return Finding(Level.FINE, text) if fine else Finding(Level.WARNING, text, remedy)
 
 
-def _refusal(what: str, error: CpunetError) -> Finding:
-    return Finding(what, Level.ERROR, error.text, error.remedy)
+def _refusal(error: CpunetError) -> Finding:
+    return Finding(Level.ERROR, error.text, error.remedy)
 
 
 def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iterator[Finding]:
@@ -290,26 +277,25 @@ def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iter
     try:
         require_same_sampling(sim, data)
     except CpunetError as error:
-        yield _refusal("sampling", error)
+        yield _refusal(error)
     else:
-        yield Finding("sampling", Level.FINE, f"every {data.dt_ns:g} ns")
+        yield Finding(Level.FINE, f"every {data.dt_ns:g} ns")
     try:
         notes = require_both_sides(sim, data, selection)
     except CpunetError as error:
-        yield _refusal("energies", error)
+        yield _refusal(error)
     else:
-        for note in notes:
-            yield Finding("energies", Level.WARNING, note)
+        yield from (Finding(Level.WARNING, note) for note in notes)
 
 
 def _count(one: InputSet, side: str) -> Finding:
     n = len(one.prepared)
     text = f"{one.path.name}: {n} {side} pulses of {one.prepared.n_read} can be used"
     if n >= FEW:
-        return Finding("counts", Level.FINE, text)
+        return Finding(Level.FINE, text)
     level = Level.ERROR if n < MIN_PULSES else Level.WARNING
     remedy = f"{FEW} or more are better: more files, or more energies (`peak`)"
-    return Finding("counts", level, text, remedy)
+    return Finding(level, text, remedy)
 
 
 REMEDIES = {
@@ -338,7 +324,7 @@ def _left_out(one: InputSet, side: str) -> Iterator[Finding]:
         if n > LOST * selected:
             text = f"{one.path.name}: {100 * n / selected:.0f} % of the {side} pulses left out"
             remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
-            yield Finding("left out", Level.WARNING, f"{text} ({label})", remedy)
+            yield Finding(Level.WARNING, f"{text} ({label})", remedy)
 
 
 def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
@@ -355,7 +341,7 @@ def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Fin
         text += "" if fine else f", {off:+.1f} keV from where it should be"
         factor = line.energy_kev / found
         remedy = f"energies times {factor:.5f}, as by `kev_per_adc`, would put it right"
-        yield _judged("calibration", text, remedy, fine)
+        yield _judged(text, remedy, fine)
 
 
 def _spread(sim: InputSet, data: InputSet) -> Finding:
@@ -373,7 +359,7 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
         "no readout does that: another detector or bias, hits of another frame, or other "
         "energies; where the simulation is near, cpunet calibrate finds its physics"
     )
-    return _judged("drift times", text.format(*ranges), remedy, fine)
+    return _judged(text.format(*ranges), remedy, fine)
 
 
 def _amplitude(sim: InputSet, data: InputSet) -> Finding:
@@ -384,7 +370,7 @@ def _amplitude(sim: InputSet, data: InputSet) -> Finding:
     remedy = (
         "no readout makes pulses sharper: another detector, too wide a cloud, or other energies"
     )
-    return _judged("current amplitude", text, remedy, ratio < SHARPER)
+    return _judged(text, remedy, ratio < SHARPER)
 
 
 def _of_height_one(one: InputSet) -> FloatArray:

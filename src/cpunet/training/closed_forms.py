@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -21,7 +21,7 @@ from cpunet.electronics.readout import noise_power
 from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.training.response_problem import STRETCH, Parameters
+from cpunet.training.response_problem import Parameters
 
 Numbers = dict[str, float]
 
@@ -41,7 +41,7 @@ class Chain:
         Name in legends.
     whole, undecayed
         The chain, and the chain without its decays, whose step response ends at 1.
-    frequency_mhz, noise_kev2_per_mhz
+    noise
         Equally spaced frequencies from 0 in MHz and noise power density in keV²/MHz; None if
         unknown.
     """
@@ -49,8 +49,7 @@ class Chain:
     name: str
     whole: Exponentials
     undecayed: Exponentials
-    frequency_mhz: FloatArray | None = None
-    noise_kev2_per_mhz: FloatArray | None = None
+    noise: tuple[FloatArray, FloatArray] | None = None
 
 
 def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
@@ -101,9 +100,9 @@ def reaches_ns(chain: Chain, fraction: float) -> float:
 
 def noise_numbers(chain: Chain) -> Numbers:
     """RMS and corner of a chain's noise, see `chain_numbers`; empty if unknown."""
-    frequency, density = chain.frequency_mhz, chain.noise_kev2_per_mhz
-    if frequency is None or density is None:
+    if chain.noise is None:
         return {}
+    frequency, density = chain.noise
     # frequency 0 is the baseline; the last one represents half a step
     numbers = {
         "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
@@ -161,20 +160,15 @@ def true_chain_of(electronics: Electronics) -> Chain:
     endless = electronics.model_copy(
         update={"decays": (Decay(fraction=1, tau_us=_FOREVER_US),)}
     )
-    frequency = density = None
-    spectrum, dt_ns = electronics.noise.spectrum, electronics.dt_ns
-    if spectrum is not None:
-        samples = 2 * (NOISE_BINS - 1)
-        power = noise_power(spectrum, dt_ns, samples)
-        frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
-        density = electronics.noise.rms_kev**2 * power / frequency[1]
-    return Chain(
-        f"true response ({electronics.name})",
-        electronics.transfer,
-        endless.transfer,
-        frequency,
-        density,
-    )
+    name = f"true response ({electronics.name})"
+    chain = Chain(name, electronics.transfer, endless.transfer)
+    if electronics.noise.spectrum is None:
+        return chain
+    samples, dt_ns = 2 * (NOISE_BINS - 1), electronics.dt_ns
+    power = noise_power(electronics.noise.spectrum, dt_ns, samples)
+    frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
+    density = electronics.noise.rms_kev**2 * power / frequency[1]
+    return replace(chain, noise=(frequency, density))
 
 
 def with_noise(
@@ -187,14 +181,9 @@ def with_noise(
     tail_ns = reaches_ns(chain, preparation.align_fraction) + tail * noise.dt_ns
     height = preparation.tail_level / float(chain.whole.step(tail_ns))
     dt_us = 1e-3 * noise.dt_ns
-    return Chain(
-        chain.name,
-        chain.whole,
-        chain.undecayed,
-        np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float),
-        # both signs of the frequency
-        2 * dt_us * noise.density / height**2,
-    )
+    frequency = np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float)
+    # both signs of the frequency
+    return replace(chain, noise=(frequency, 2 * dt_us * noise.density / height**2))
 
 
 def true_parameters(electronics: Electronics) -> Numbers:
@@ -273,31 +262,12 @@ def propagated(
 
 
 def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
-    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
-    poles, decay = response.log_poles_ns.detach().exp(), response.log_decay_us.exp().item()
-    order = poles.argsort(descending=True).tolist()
-    sources = {
-        f"pole_{i + 1}_ns": (f"log_poles_ns.{k + 1}", float(poles[k]))
-        for i, k in enumerate(order)
-    }
-    sources["decay_us"] = ("log_decay_us.1", decay)
-    if len(response.ringing):
-        for i, value in enumerate(response.log_ringing.detach().exp().tolist()):
-            name = ("ringing_mhz", "ringing_damping_ns")[i]
-            sources[name] = (f"log_ringing.{i + 1}", value)
-    for i, tau in enumerate(response.slow_ns.tolist()):
-        sources[f"slow_{tau:g}_ns"] = (f"slow_weights.{i + 1}", 1.0)
-    if response.drift is not None:
-        for i, name in enumerate(response.drift.describe()):
-            sources[name] = (f"{STRETCH}.{i + 1}", 1.0)
-    free = response.config.free_decays
-    for i, tau in enumerate(response.fast_times_us.tolist()):
-        name = f"fast_decay_{i + 1}_share" if free else f"decay_{tau:g}_us"
-        sources[name] = (f"decay_weights.{i + 1}", 1.0)
-        if free:
-            sources[f"fast_decay_{i + 1}_us"] = (f"log_fast_decays_us.{i + 1}", tau)
+    """Errors of the fit under the names of `ElectronicsResponse.describe`.
+
+    The two weights of a ringing, which are told by its size, have none.
+    """
     return {
-        name: scale * float(errors[source])
-        for name, (source, scale) in sources.items()
-        if source in errors
+        name: (value if label.startswith("log_") else 1.0) * float(errors[label])
+        for name, (label, value) in response.named().items()
+        if label in errors and not label.startswith("ringing")
     }

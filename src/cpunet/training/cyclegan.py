@@ -59,26 +59,23 @@ class Outside:
     energy_kev: npt.NDArray[np.float64]
     preparation: PreparationConfig
 
-    def add_noise(self, records: Tensor, rows: Tensor) -> Tensor:
-        """Add noise to records of prepared height, and prepare them, shape (batch, 1, samples).
+    def noisy_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
+        """Add noise to windows as a network makes them, and prepare them like the data.
 
         Parameters
         ----------
-        records
-            Noise-free records with padding around the window, shape (batch, samples).
+        windows
+            Noise-free windows of prepared height, shape (batch, 1, samples).
         rows
             Indices of the simulated pulses.
         """
+        records = in_room(windows[:, 0], self.preparation)
         # seeded by torch, whose random state is part of a checkpoint
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
         energies = self.energy_kev[rows.cpu().numpy()]
         drawn = self.noise.draw(energies, records.shape[1], rng)
         noisy = records + torch.from_numpy(drawn).to(records)
         return as_measured(noisy, self.preparation, self.noise.dt_ns)
-
-    def noisy_windows(self, windows: Tensor, rows: Tensor) -> Tensor:
-        """Windows as a network makes them, (batch, 1, samples), with noise like the data."""
-        return self.add_noise(in_room(windows[:, 0], self.preparation), rows)
 
 
 def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:

@@ -11,6 +11,7 @@ its mean position.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,11 +57,9 @@ class DifferentiableReadings:
     def __init__(self, moments: Moments, last: int) -> None:
         self.moments, self.config = moments, moments.config
         self.window = w = moments.window(last)
-        matrix = np.concatenate([moments.stretches, moments.components], axis=1)
-        self.matrix = torch.from_numpy(matrix)
-        offset = moments.mean.astype(float) @ moments.components
-        self.offset = torch.zeros(matrix.shape[1])
-        self.offset[-len(offset) :] = torch.from_numpy(offset)
+        self.matrix = torch.from_numpy(moments.quantities)
+        self.offset = torch.zeros(self.matrix.shape[1])
+        self.offset[-len(moments.offset) :] = torch.from_numpy(moments.offset)
         self.centres, self.spreads, self.bins, self.bin_widths = (
             torch.from_numpy(values).float()
             for values in (
@@ -211,11 +210,7 @@ class DifferentiableSet:
         return torch.cat(out).double().numpy()
 
     def blocks(
-        self,
-        response: StepResponse,
-        functions: Functions,
-        *,
-        draws: int | None = None,
+        self, response: StepResponse, functions: Functions, *, draws: int | None = None
     ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
         """Functions of each pulse and their derivatives, block by block, draw by draw.
 
@@ -237,15 +232,9 @@ class DifferentiableSet:
                 def of(records: Tensor, noise: Tensor = noise) -> Tensor:
                     return functions(*self.readings(self.scaled(records) + noise))
 
-                def along(
-                    tangent: Tensor,
-                    of: Callable[[Tensor], Tensor] = of,
-                    clean: Tensor = clean,
-                ) -> Any:
-                    return torch.func.jvp(of, (clean,), (tangent,))
-
+                along: Any = partial(torch.func.jvp, of, (clean,))
                 # the values are the same along all directions
-                values, columns = torch.func.vmap(along, out_dims=(None, 0))(moved)  # type: ignore[arg-type]
+                values, columns = torch.func.vmap(along, out_dims=(None, 0))((moved,))  # type: ignore[arg-type]
                 yield first, values, columns, self.weights[first : first + BLOCK]
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:

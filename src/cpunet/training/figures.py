@@ -118,14 +118,14 @@ def response_figure(
         panels["step"].plot(long_ns, steps[-1], label=chain.name, **look)
         panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
         panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
-        if chain.frequency_mhz is None or chain.noise_kev2_per_mhz is None:
+        if chain.noise is None:
             continue
         # equidistant on the logarithmic axis: low frequencies individually, high ones averaged
-        stop = len(chain.frequency_mhz) - 1
+        stop = len(chain.noise[0]) - 1
         edges = np.unique(np.geomspace(1, stop, NOISE_BINS).astype(int))
         frequency, density = (
             np.add.reduceat(values[:stop], edges[:-1]) / np.diff(edges)
-            for values in (chain.frequency_mhz, chain.noise_kev2_per_mhz)
+            for values in chain.noise
         )
         panels["noise"].loglog(frequency, density, **look)
     if compared:

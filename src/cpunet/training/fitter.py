@@ -8,7 +8,7 @@ kept unless another gains beyond two errors by bootstrap.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -18,9 +18,11 @@ from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import Readout
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.levenberg_marquardt import Listener, levenberg_marquardt
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Rows, Values
 from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
+
+Listener = Callable[[int, float], None]
 
 # Chi-square per moment, with as many pulses as are used to search for the valley, below which a
 # fit has found the right one.  Outliers in the data and the ridge keep it above 1.
@@ -91,11 +93,8 @@ class Fitter:
         self, problem: ResponseProblem, *, coarse: bool = True, steps: int | None = None
     ) -> Fitted:
         """Fit from the current response; `coarse` if it is far from the data."""
-
-        def told(_step: int, chi_square: float) -> None:
-            self.count(chi_square)
-
-        found = levenberg_marquardt(problem, steps or self.training.steps, told, coarse=coarse)
+        steps = steps or self.training.steps
+        found = levenberg_marquardt(problem, steps, self.count, coarse=coarse)
         parameters = problem.parameters
         priors = np.diag(parameters.widths**-2.0)
         information = np.asarray(np.linalg.inv(found.covariance), float) - priors

@@ -9,6 +9,7 @@ import time
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -25,21 +26,19 @@ from cpunet.outputs import folder_written_aside
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
 from cpunet.pulses.channels import Pair, own_folder
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
-from cpunet.training.chain_description import beyond, diagnosis, stretched
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.fitter import Fitter
+from cpunet.training.diagnosis import beyond, diagnosis, stretched
+from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
-from cpunet.training.levenberg_marquardt import Listener
 from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
@@ -192,24 +191,21 @@ class Training:
     def _job(self, pair: Pair, folder: Path, init: Run | None, resume: bool) -> TrainingJob:
         """Read and prepare both sides, and warn of what makes a training on them doubtful."""
         recipe, selection = self.recipe, parse_selection(self.peak, self.recipe.peaks)
-        sim = load_pulses(pair[0], "simulated", recipe, selection)
-        data = load_pulses(pair[1], "measured", recipe, selection)
+
+        def read(energies: EnergySelection, tell: bool = True) -> tuple[InputSet, InputSet]:
+            sim = load_pulses(pair[0], "simulated", recipe, energies, tell=tell)
+            return sim, load_pulses(pair[1], "measured", recipe, energies, tell=tell)
+
+        sim, data = read(selection)
         require_same_sampling(sim, data)
         require_both_sides(sim, data, selection)
         for finding in compare_sides(sim, data, selection):
             if finding.level != Level.FINE:
                 log.warning(finding)
         away = continuum(recipe)
-        beside: Continuum | None = None
         there = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
-        if there >= MIN_PULSES and not selection.ranges_kev:
-
-            def beside() -> tuple[Pulses, Pulses]:
-                """Pulses of both sides away from all lines, read when a fit needs them."""
-                sim = load_pulses(pair[0], "simulated", recipe, away, tell=False)
-                data = load_pulses(pair[1], "measured", recipe, away, tell=False)
-                return sim.prepared.pulses, data.prepared.pulses
-
+        enough = there >= MIN_PULSES and not selection.ranges_kev
+        beside = partial(read, away, tell=False) if enough else None
         if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
             kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
             raise CpunetError(f"{init.name}: {kinds}; resample them")

@@ -35,13 +35,7 @@ from cpunet.networks.learned_response import DriftUNet, LearnedResponse, StepRes
 from cpunet.networks.response_layer import current_spectrum
 from cpunet.recipes.schema import LearnedConfig
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.fitter import (
-    Fitted,
-    Fitter,
-    HeldOutPulses,
-    compared,
-    split,
-)
+from cpunet.training.fitter import Fitted, Fitter, HeldOutPulses, compared, split
 from cpunet.training.levenberg_marquardt import FIRST_CLIPS
 from cpunet.training.moments import BLOCK, Values
 from cpunet.training.optimal_weights import refine
@@ -101,11 +95,7 @@ def fit_learned(
 
 
 def _from_afar(
-    config: LearnedConfig,
-    dt_ns: float,
-    far: Sequence[Band],
-    near: Sequence[Band],
-    fitter: Fitter,
+    config: LearnedConfig, dt_ns: float, far: list[Band], near: list[Band], fitter: Fitter
 ) -> tuple[LearnedResponse, Fitted]:
     """Fit a step response from the best of some bases, first by wide bins."""
     problems = []

@@ -11,7 +11,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.training.moments import Values
 
-Listener = Callable[[int, float], None]
+Tell = Callable[[float], None]
 
 # Far from the data all deviations would be clipped, so the first rounds have wider clips.
 FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
@@ -67,7 +67,7 @@ class Minimum(NamedTuple):
 
 
 def levenberg_marquardt(
-    problem: Problem, steps: int, listener: Listener | None, *, coarse: bool = True
+    problem: Problem, steps: int, tell: Tell | None, *, coarse: bool = True
 ) -> Minimum:
     r"""Minimise a problem from its current parameters, and set them to the minimum.
 
@@ -84,8 +84,8 @@ def levenberg_marquardt(
         Problem with the parameters to be found.
     steps
         Maximum number of steps.
-    listener
-        Called with step and chi-square.
+    tell
+        Called with chi-square after each step.
     coarse
         Whether the start is far from the data.
 
@@ -95,7 +95,7 @@ def levenberg_marquardt(
         If chi-square is not finite at the end.
     """
     parameters = problem.parameters
-    vector, taken = parameters.vector(), 0
+    vector = parameters.vector()
     rounds = [(clip, ROUNDS_EACH) for clip in FIRST_CLIPS if coarse]
     for clip, most in [*rounds, (None, steps - ROUNDS_EACH * len(rounds))]:
         problem.clip = clip
@@ -126,9 +126,8 @@ def levenberg_marquardt(
             else:
                 jacobian, updates = problem.jacobian(tried, found), 0
             vector, residuals, cost = tried, found, cost - fall
-            taken += 1
-            if listener is not None:
-                listener(taken, cost)
+            if tell is not None:
+                tell(cost)
             if fall < CONVERGED * max(1.0, cost / problem.moments):
                 if not updates:
                     break

@@ -12,6 +12,7 @@ four times better than its mean.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -116,8 +117,8 @@ class Moments:
     data: Readings
     values: Values
     names: tuple[str, ...]
-    left_out: int
-    slope_range: tuple[float, float]
+    left_out: int = 0
+    slope_range: tuple[float, float] = (-np.inf, np.inf)
     balance: Values | None = None
 
     @classmethod
@@ -147,42 +148,38 @@ class Moments:
         least = _least(log_amplitude[usable])
         aligned, slopes, log_amplitude = aligned[usable], slopes[usable], log_amplitude[usable]
         mean, components = _principal_components(aligned, config.components)
-        linear = _linear(aligned, slopes, mean, components, config)
-        centres = np.median(linear, axis=0)
-        spreads = SIGMA_PER_MAD * np.median(np.abs(linear - centres), axis=0)
         edges = np.quantile(log_amplitude, np.linspace(0.02, 0.995, config.amplitude_bins + 1))
-        drawn_up = cls(
+        plain = cls(
             config=config,
             preparation=preparation,
             level=level,
             mean=mean,
             components=components,
-            centres=centres,
-            spreads=np.maximum(spreads, 1e-9),
+            centres=np.zeros(1),
+            spreads=np.ones(1),
             amplitude_centres=0.5 * (edges[1:] + edges[:-1]),
             amplitude_widths=np.maximum(np.diff(edges), config.amplitude_width),
-            data=Readings(np.empty((0, len(centres))), np.empty(0), np.empty(0)),
+            data=Readings(np.empty((0, 1)), np.empty(0), np.empty(0)),
             values=np.empty((0, 0)),
             names=_names(config),
-            left_out=0,
-            slope_range=(-np.inf, np.inf),
         )
-        data = drawn_up._of_windows(windows, whole, window, least)
-        slopes = data.linear[:, -1] * drawn_up.spreads[-1] + drawn_up.centres[-1]
-        rounding = 1e-4 * drawn_up.spreads[-1]
+        linear = plain._linear(aligned, slopes)
+        centres = np.median(linear, axis=0)
+        spreads = SIGMA_PER_MAD * np.median(np.abs(linear - centres), axis=0)
+        scaled = replace(plain, centres=centres, spreads=np.maximum(spreads, 1e-9))
+        data = scaled.read_windows(windows, whole, window, least)
+        slopes = data.linear[:, -1] * scaled.spreads[-1] + centres[-1]
+        rounding = 1e-4 * scaled.spreads[-1]
         return replace(
-            drawn_up,
+            scaled,
             data=data,
-            values=drawn_up.functions(data),
+            values=scaled.functions(data),
             left_out=len(windows) - len(data),
             slope_range=(slopes.min() - rounding, slopes.max() + rounding),
         )
 
     def read(
-        self,
-        records: FloatArray,
-        last: int,
-        weights: Values | None = None,
+        self, records: FloatArray, last: int, weights: Values | None = None
     ) -> tuple[Readings, npt.NDArray[np.bool_]]:
         """Read records with noise.
 
@@ -202,8 +199,7 @@ class Moments:
             outside the range of the data.
         """
         aligned, slopes, log_amplitude = _aligned(records, self.window(last))
-        linear = _linear(aligned, slopes, self.mean, self.components, self.config)
-        linear = (linear - self.centres) / self.spreads
+        linear = self._linear(aligned, slopes)
         beyond = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
         counts = np.isfinite(linear).all(axis=1) & np.isfinite(log_amplitude)
         readings = Readings(
@@ -285,17 +281,35 @@ class Moments:
         errors += [0.0] * (len(self.names) - len(errors))
         return np.array(errors)
 
-    @property
-    def stretches(self) -> FloatArray:
-        """Means over stretches as a matrix, shape (samples, stretches)."""
-        return _segments(self.config, len(self.mean))
+    @cached_property
+    def quantities(self) -> FloatArray:
+        """Stretches and components as a matrix, shape (samples, quantities)."""
+        config, stretches = self.config, list(pairwise(self.config.segments))
+        matrix = np.zeros((len(self.mean), len(stretches)), np.float32)
+        for column, (first, stop) in enumerate(stretches):
+            matrix[config.before + first : config.before + stop, column] = 1 / (stop - first)
+        return np.concatenate([matrix, self.components], axis=1)
+
+    @cached_property
+    def offset(self) -> Values:
+        """Components of the mean pulse."""
+        return np.asarray(self.mean.astype(float) @ self.components)
 
     @property
     def slope(self) -> float:
         """Median slope per sample of the logarithm of the data's tails."""
         return float(self.centres[-1])
 
-    def _of_windows(
+    def _linear(self, aligned: FloatArray, slopes: Values) -> Values:
+        """Stretches, components and tail slope as in `Readings`."""
+        matrix = self.quantities
+        out = np.empty((len(aligned), matrix.shape[1]), np.float32)
+        project(aligned, matrix, out)
+        linear = np.concatenate([out, slopes[:, np.newaxis]], axis=1, dtype=float)
+        linear[:, -1 - self.components.shape[1] : -1] -= self.offset
+        return (linear - self.centres) / self.spreads
+
+    def read_windows(
         self, windows: FloatArray, whole: Rows, window: RecordWindow, least: float
     ) -> Readings:
         """Readings of the prepared measured pulses that are used."""
@@ -304,8 +318,7 @@ class Moments:
             block = windows[whole[first : first + BLOCK]]
             aligned, slopes, logs = _read_windows(block, window, self.preparation)
             usable = _single(aligned, self.config) & (logs > least)
-            of_block = _linear(aligned, slopes, self.mean, self.components, self.config)
-            linear.append(((of_block - self.centres) / self.spreads)[usable])
+            linear.append(self._linear(aligned, slopes)[usable])
             log_amplitude.append(logs[usable])
         logs = np.concatenate(log_amplitude)
         return Readings(np.concatenate(linear), logs, np.ones(len(logs)))
@@ -382,23 +395,6 @@ def _principal_components(aligned: FloatArray, n: int) -> tuple[FloatArray, Floa
     return mean, np.ascontiguousarray(scaled, np.float32)
 
 
-def _linear(
-    aligned: FloatArray,
-    slopes: Values,
-    mean: FloatArray,
-    components: FloatArray,
-    config: MatchingConfig,
-) -> Values:
-    """Stretches, components and tail slope, shape (pulses, quantities)."""
-    segments = _segments(config, aligned.shape[1])
-    matrix = np.concatenate([segments, components], axis=1)
-    out = np.empty((len(aligned), matrix.shape[1]), np.float32)
-    project(aligned, matrix, out)
-    linear = np.concatenate([out, slopes[:, np.newaxis]], axis=1, dtype=float)
-    linear[:, segments.shape[1] : -1] -= mean.astype(float) @ components
-    return linear
-
-
 def _names(config: MatchingConfig) -> tuple[str, ...]:
     edges = config.segments
     return (
@@ -409,12 +405,3 @@ def _names(config: MatchingConfig) -> tuple[str, ...]:
         "tail slope squared",
         *(f"current amplitude, bin {i + 1}" for i in range(config.amplitude_bins)),
     )
-
-
-def _segments(config: MatchingConfig, length: int) -> FloatArray:
-    """Means over stretches as a matrix, shape (samples, stretches)."""
-    edges = config.segments
-    matrix = np.zeros((length, len(edges) - 1), np.float32)
-    for column, (first, stop) in enumerate(pairwise(edges)):
-        matrix[config.before + first : config.before + stop, column] = 1 / (stop - first)
-    return matrix

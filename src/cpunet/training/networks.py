@@ -183,10 +183,7 @@ def unfinished_name(out: Path) -> Path:
 
 @contextmanager
 def unfinished_folder(
-    out: Path,
-    *inputs: Given,
-    resume: bool = False,
-    force: bool = False,
+    out: Path, *inputs: Given, resume: bool = False, force: bool = False
 ) -> Iterator[Path]:
     """Provide ``OUT.unfinished`` as a working folder; its content at the end becomes `out`.
 

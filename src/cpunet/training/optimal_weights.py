@@ -229,22 +229,24 @@ class ConditionalFunctions:
 
     def __call__(self, readings: Readings) -> Values:
         """Functions of each pulse, shape (pulses, functions)."""
-        values = self.moments.functions(readings)
-        first = len(self.moments.config.segments) - 1
-        components = values[:, first : first + self.moments.config.components]
-        bins = self.density(readings.log_amplitude)
+        values, components, bins = self._parts(readings)
         both = components[:, :, np.newaxis] * bins[:, np.newaxis, :]
         columns = components.shape[1] * bins.shape[1]  # given: a block of pulses can be empty
         return np.concatenate([values, bins, both.reshape(len(values), columns)], axis=1)
 
     def sum(self, readings: Readings) -> Values:
         """Weighted sum of the functions over pulses, without storing them for each pulse."""
+        values, components, bins = self._parts(readings)
+        bins = readings.weights[:, np.newaxis] * bins
+        both = components.T @ bins
+        return np.concatenate([readings.weights @ values, bins.sum(axis=0), both.ravel()])
+
+    def _parts(self, readings: Readings) -> tuple[Values, Values, Values]:
+        """The functions of the moments, the components among these, and the bins."""
         values = self.moments.functions(readings)
         first = len(self.moments.config.segments) - 1
         components = values[:, first : first + self.moments.config.components]
-        bins = readings.weights[:, np.newaxis] * self.density(readings.log_amplitude)
-        both = components.T @ bins
-        return np.concatenate([readings.weights @ values, bins.sum(axis=0), both.ravel()])
+        return values, components, self.density(readings.log_amplitude)
 
     def density(self, log_amplitude: Values) -> Values:
         """Bins of the current amplitude, shape (pulses, bins)."""

@@ -86,7 +86,7 @@ def import_weights(
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
     length = load_recipe("paper").preparation.length
     networks = {part: _generator(path, length) for part, path in files.items()}
-    widths = {network.latent_mean.out_channels // 8 for network in networks.values()}
+    widths = {network.width for network in networks.values()}
     if len(widths) > 1:
         raise CpunetError(
             f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
@@ -161,8 +161,7 @@ def _generator(path: Path, length: int) -> PositionalUNet:
             "number of channels); give a file such as fep_REN.pt"
         )
     config = PunetConfig(name="punet", width=width, dropout=0.1)
-    with torch.device("meta"):
-        expected = PositionalUNet(config, length).state_dict()
+    network = PositionalUNet(config, length)
     named: State = {}
     for name, value in state.items():
         if name in MAPS:
@@ -173,11 +172,10 @@ def _generator(path: Path, length: int) -> PositionalUNet:
         if block in LAYERS and number.isdecimal():
             layer, rest = block, f"{number}.{rest}"
         named[f"{LAYERS.get(layer, layer)}.{rest}" if layer else name] = value
-    if wrong := differing(named, expected):
+    if wrong := differing(named, network.state_dict()):
         raise CpunetError(
             f"{path}: weights of another architecture: {len(wrong)} tensors differ, first "
             f"{wrong[0]}"
         )
-    network = PositionalUNet(config, length)
     network.load_state_dict(named)
     return network.eval()

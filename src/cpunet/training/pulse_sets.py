@@ -19,6 +19,7 @@ from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.moments import MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
@@ -37,7 +38,7 @@ SINGLE = "single sites of the continuum"  # name of their band
 # Draws of the noise of single sites, of which there are few, for each of other pulses.
 MORE_DRAWS = 4
 
-Continuum = Callable[[], tuple[Pulses, Pulses]]
+Continuum = Callable[[], tuple[InputSet, InputSet]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,20 +211,17 @@ class PulseSets:
         parted = energy_bands(sim_kev, data_kev, self.recipe.peaks)
         # in random order, so that any first part is representative
         self.parted = [
-            (band, rng.permutation(len(band.sim)), rng.permutation(len(band.data)))
+            (band, [rng.permutation(len(rows)) for rows in (band.sim, band.data)])
             for band in parted
         ]
 
     def bands(self, most: int | None = None) -> list[Band]:
         """All pulses, or about `most` of each side, in the same proportions."""
-        n_sim, n_data = (
-            sum(len(order) for order in orders)
-            for orders in zip(*(parts[1:] for parts in self.parted), strict=True)
-        )
+        totals = np.sum([[len(order) for order in orders] for _, orders in self.parted], axis=0)
         some = []
-        for band, sim_order, data_order in self.parted:
+        for band, orders in self.parted:
             chosen = []
-            for order, n in ((sim_order, n_sim), (data_order, n_data)):
+            for order, n in zip(orders, totals.tolist(), strict=True):
                 share = 1.0 if most is None else min(1.0, most / n)
                 kept = max(math.ceil(share * len(order)), min(MIN_OF_BAND, len(order)))
                 chosen.append(np.sort(order[:kept]))
@@ -237,7 +235,7 @@ class PulseSets:
         """
         if self.continuum is None:
             return []
-        sim, data = self.continuum()
+        sim, data = (side.prepared.pulses for side in self.continuum())
         _, training = self.recipe.matching
         try:
             moments = Moments.of_data(data.waveforms, training, self.recipe.preparation)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,13 +20,7 @@ from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.settings import checked, read_json
 from cpunet.tables import text_table
 from cpunet.training.chain_description import DescribedChain, describe_chain
-from cpunet.training.closed_forms import (
-    Chain,
-    Numbers,
-    chain_numbers,
-    true_chain_of,
-    true_parameters,
-)
+from cpunet.training.closed_forms import Numbers, chain_numbers, true_chain_of, true_parameters
 from cpunet.training.run import Run, RunLike, as_run
 
 if TYPE_CHECKING:
@@ -36,9 +31,7 @@ log = logging.getLogger(__name__)
 
 MARKER = "response.json"
 RESPONSE = FolderKind(
-    name="response",
-    command="cpunet response",
-    own=r"response\.json|response\.png",
+    name="response", command="cpunet response", own=r"response\.json|response\.png"
 )
 _DPI = 150
 
@@ -77,34 +70,81 @@ class Response:
 
     Parameters
     ----------
-    content
-        ``runs``: for each run the content of a
-        `cpunet.training.chain_description.DescribedChain`.  ``mean`` and ``spread`` (standard
-        deviation) of several runs.  ``truth``: the same ``values`` of the true chain, the
-        ``difference`` of the run or of the mean of the runs from it, and ``sigma``, the
-        difference divided by the error or the spread, whichever is larger.  A quantity
-        without an error has no sigma: the runs share their data, so their spread shows how
-        well they agree, not how accurate they are.  Nor has one of `PARTS` of the chain.
     runs
         The chains of the runs.
     truth
-        True chain, if known.
+        True readout, if known.
     """
 
-    content: dict[str, Any]
     runs: list[DescribedChain]
-    truth: Chain | None = None
+    truth: Electronics | None = None
+
+    @cached_property
+    def mean(self) -> Numbers:
+        """Means of the quantities that all runs have."""
+        return self._of_all(np.mean)
+
+    @cached_property
+    def spread(self) -> Numbers:
+        """Their standard deviations; empty for a single run."""
+        return self._of_all(partial(np.std, ddof=1)) if len(self.runs) > 1 else {}
+
+    @cached_property
+    def true_values(self) -> Numbers:
+        """The same quantities of the true readout; empty if it is not known."""
+        if self.truth is None:
+            return {}
+        first, chain = self.runs[0].run, true_chain_of(self.truth)
+        numbers = chain_numbers(chain, first.recipe.preparation, first.dt_ns)
+        return true_parameters(self.truth) | numbers
+
+    @cached_property
+    def difference(self) -> Numbers:
+        """Difference of the run, or of the mean of the runs, from the truth."""
+        known, mean = self.true_values, self.mean
+        return {name: mean[name] - known[name] for name in known if name in mean}
+
+    @cached_property
+    def sigma(self) -> Numbers:
+        """Difference from the truth in units of the error or the spread, whichever is larger.
+
+        A quantity without an error has none: the runs share their data, so their spread shows
+        how well they agree, not how accurate they are.  Nor has one of `PARTS` of the chain.
+        """
+        found = {}
+        for name, apart in self.difference.items():
+            errors = [one.errors[name] for one in self.runs if name in one.errors]
+            if len(errors) == len(self.runs) and any(errors) and not PARTS.match(name):
+                found[name] = apart / max(self.spread.get(name, 0.0), float(np.mean(errors)))
+        return found
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """As ``response.json`` has it."""
+        content: dict[str, Any] = {"cpunet": cpunet.__version__}
+        content |= {"dt_ns": self.runs[0].run.dt_ns, "runs": [one.content for one in self.runs]}
+        if self.spread:
+            content |= {"mean": self.mean, "spread": self.spread}
+        if self.truth is not None:
+            content["truth"] = {
+                "name": self.truth.name,
+                "values": self.true_values,
+                "difference": self.difference,
+                "sigma": self.sigma,
+            }
+        return content
 
     @property
     def values(self) -> DataFrame:
         """A row per quantity, a column per run, and ``mean``, ``spread``, ``truth``."""
         from pandas import DataFrame
 
-        columns = {run["path"]: run["values"] for run in self.content["runs"]}
-        columns |= {n: self.content[n] for n in ("mean", "spread") if n in self.content}
-        if "truth" in self.content:
-            columns["truth"] = self.content["truth"]["values"]
-        return DataFrame(columns).reindex(_names(self.content))
+        columns = {one.run.name: one.values for one in self.runs}
+        if self.spread:
+            columns |= {"mean": self.mean, "spread": self.spread}
+        if self.truth is not None:
+            columns["truth"] = self.true_values
+        return DataFrame(columns).reindex(self._names)
 
     def plot(self) -> Figure:
         """Step and impulse response, tail and noise."""
@@ -112,7 +152,8 @@ class Response:
 
         first = self.runs[0].run
         tail_ns = first.recipe.preparation.samples_after * first.dt_ns
-        return response_figure([one.chain for one in self.runs], self.truth, tail_ns=tail_ns)
+        truth = None if self.truth is None else true_chain_of(self.truth)
+        return response_figure([one.chain for one in self.runs], truth, tail_ns=tail_ns)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Make a folder of ``response.json`` and ``response.png``.
@@ -129,22 +170,46 @@ class Response:
             self.plot().savefig(folder / "response.png", dpi=_DPI)
 
     def __str__(self) -> str:
-        head = ["", *(Path(run["path"]).name for run in self.content["runs"])]
-        if "mean" in self.content:
+        head = ["", *(Path(one.run.name).name for one in self.runs)]
+        if self.spread:
             head.append("mean ± spread")
-        if "truth" in self.content:
-            head += [self.content["truth"]["name"], "difference", "σ"]
-        rows = []
-        for name in _names(self.content):
-            _, label, unit = _row(name)
-            text = f"{label} [{unit}]" if unit else label
-            rows.append([text, *_cells(self.content, name, unit)])
-        return text_table(head, rows, title="Readout response")
+        if self.truth is not None:
+            head += [self.truth.name, "difference", "σ"]
+        return text_table(head, list(map(self._cells, self._names)), title="Readout response")
 
     def __repr__(self) -> str:
-        truth = "" if self.truth is None else f", beside {self.content['truth']['name']}"
+        truth = "" if self.truth is None else f", beside {self.truth.name}"
         names = ", ".join(Path(one.run.name).name for one in self.runs)
         return f"<{type(self).__name__} of {names}{truth}>"
+
+    def _of_all(self, statistic: Callable[[list[float]], Any]) -> Numbers:
+        """A statistic of each quantity that all runs have."""
+        columns = [one.values for one in self.runs]
+        names = [name for name in columns[0] if all(name in column for column in columns)]
+        return {name: float(statistic([c[name] for c in columns])) for name in names}
+
+    @property
+    def _names(self) -> list[str]:
+        """Quantities that any run or the truth has, in the order of `ROWS`."""
+        sources = [*(one.values for one in self.runs), self.true_values]
+        names = {name: None for source in sources for name in source}
+        return sorted(names, key=lambda name: _row(name)[0])
+
+    def _cells(self, name: str) -> list[str]:
+        """A row of the table."""
+        _, label, unit = _row(name)
+        scale = 100.0 if unit == "%" else 1.0
+        # beside several runs there is no room for errors, and the spread says more
+        errors = {} if self.spread else self.runs[0].errors
+        cells = [f"{label} [{unit}]" if unit else label]
+        cells += (_number(one.values.get(name), scale, errors.get(name)) for one in self.runs)
+        if self.spread:
+            cells.append(_number(self.mean.get(name), scale, self.spread.get(name)))
+        if self.truth is not None:
+            true, sigma = self.true_values.get(name), self.sigma.get(name)
+            cells += [_number(true, scale), _difference(self.difference.get(name), true, unit)]
+            cells.append("" if sigma is None else f"{sigma:+.1f}")
+        return cells
 
 
 def response(
@@ -187,19 +252,9 @@ def response(
         place = str(truth) if isinstance(truth, str | Path) else None
         refuse_existing(Path(out), place, *(run.folder for run in known), force=force)
     electronics = _electronics(truth)
-    first, preparation = known[0], known[0].recipe.preparation
-    chains = [describe_chain(run) for run in known]
+    result = Response([describe_chain(run) for run in known], electronics)
     _require_alike(known, electronics)
-    content: dict[str, Any] = {"cpunet": cpunet.__version__, "dt_ns": first.dt_ns}
-    content |= {"runs": [one.content for one in chains]} | _summary(chains)
-    true_chain = None
-    if electronics is not None:
-        true_chain = true_chain_of(electronics)
-        values = true_parameters(electronics)
-        values |= chain_numbers(true_chain, preparation, first.dt_ns)
-        content["truth"] = {"name": electronics.name} | _compared(content, values)
-    result = Response(content, chains, true_chain)
-    for one in chains:
+    for one in result.runs:
         for doubt in one.doubts:
             log.warning(f"{Path(one.run.name).name}: {doubt}")
     if out is not None:
@@ -216,32 +271,6 @@ def _electronics(truth: str | Path | Electronics | None) -> Electronics | None:
     path = Path(truth) / "stand.json"
     content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
     return checked(Electronics, content.get("electronics"), f"{path}: electronics")
-
-
-def _summary(chains: Sequence[DescribedChain]) -> dict[str, Numbers]:
-    """Mean and spread of several chains."""
-    if len(chains) < 2:
-        return {}
-    names = [n for n in chains[0].values if all(n in one.values for one in chains)]
-    columns = {name: [one.values[name] for one in chains] for name in names}
-    return {
-        "mean": {name: float(np.mean(column)) for name, column in columns.items()},
-        "spread": {name: float(np.std(column, ddof=1)) for name, column in columns.items()},
-    }
-
-
-def _compared(told: Mapping[str, Any], values: Numbers) -> dict[str, Numbers]:
-    """Truth, and the difference of the run or of the mean of the runs from it."""
-    runs = told["runs"]
-    found: Numbers = told.get("mean", runs[0]["values"])
-    spread: Numbers = told.get("spread", {})
-    difference = {n: found[n] - true for n, true in values.items() if n in found}
-    sigma = {}
-    for name, apart in difference.items():
-        errors = [run["errors"][name] for run in runs if name in run["errors"]]
-        if len(errors) == len(runs) and any(errors) and not PARTS.match(name):
-            sigma[name] = apart / max(spread.get(name, 0.0), float(np.mean(errors)))
-    return {"values": values, "difference": difference, "sigma": sigma}
 
 
 def _require_alike(runs: Sequence[Run], truth: Electronics | None) -> None:
@@ -265,15 +294,6 @@ def _require_alike(runs: Sequence[Run], truth: Electronics | None) -> None:
         )
 
 
-def _names(told: dict[str, Any]) -> list[str]:
-    """Quantities that any run or the truth has, in the order of `ROWS`."""
-    sources = [run["values"] for run in told["runs"]]
-    if "truth" in told:
-        sources.append(told["truth"]["values"])
-    names = {name: None for source in sources for name in source}
-    return sorted(names, key=lambda name: _row(name)[0])
-
-
 def _row(name: str) -> tuple[int, str, str]:
     """Place, label and unit of a quantity in `ROWS`."""
     return next(
@@ -281,23 +301,6 @@ def _row(name: str) -> tuple[int, str, str]:
         for place, (pattern, (text, unit)) in enumerate(ROWS.items())
         if re.fullmatch(pattern, name)
     )
-
-
-def _cells(told: dict[str, Any], name: str, unit: str) -> list[str]:
-    """A row of the table."""
-    runs, truth = told["runs"], told.get("truth")
-    scale = 100.0 if unit == "%" else 1.0
-    # beside several runs there is no room for errors, and the spread says more
-    errors = runs[0]["errors"] if len(runs) == 1 else {}
-    cells = [_number(run["values"].get(name), scale, errors.get(name)) for run in runs]
-    if "mean" in told:
-        cells.append(_number(told["mean"].get(name), scale, told["spread"].get(name)))
-    if truth is not None:
-        true, apart = truth["values"].get(name), truth["difference"].get(name)
-        cells += [_number(true, scale), _difference(apart, true, unit)]
-        sigma = truth["sigma"].get(name)
-        cells.append("" if sigma is None else f"{sigma:+.1f}")
-    return cells
 
 
 def _number(value: float | None, scale: float, error: float | None = None) -> str:
@@ -311,7 +314,7 @@ def _number(value: float | None, scale: float, error: float | None = None) -> st
 
 def _difference(apart: float | None, true: float | None, unit: str) -> str:
     """Relative, but of shares in percentage points."""
-    if apart is None or (not true and unit != "%"):
+    if apart is None:
         return ""
     if unit == "%":
         return f"{100 * apart:+.2f} pp"

@@ -111,7 +111,7 @@ class Fit:
         Energies compared, with the pulses of each side.
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
-        the data's, see `cpunet.training.chain_description`.
+        the data's, see `amplitude_shift`.
     drift
         What a U-Net before a learned readout gains, if one was trained.
     gains
@@ -137,20 +137,16 @@ class Fit:
         """Remaining difference between translation and data, in a sentence."""
         shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
         off = abs(shift) >= 2 * error
-        size = f"the current amplitude is off by {shift:+.2f} ± {error:.2f} %"
-        if not off:
-            size = f"the current amplitude is right to {abs(shift) + error:.2f} %"
-        per = self.chi_square / self.moments
+        right = f"right to {abs(shift) + error:.2f} %"
+        size = f"off by {shift:+.2f} ± {error:.2f} %" if off else right
+        per, why = self.chi_square / self.moments, "as by chance"
         if self.poor:
-            # a shift that is small compared with its error does not make the shape right
-            more = f"; {size}" if off else ""
-            return f"chi-square is {per:.1f} per moment, too much for chance{more}"
-        if per > GOOD_FIT:
-            return (
-                f"chi-square is {per:.1f} per moment, of a misfit that only so many pulses "
-                f"tell; {size}"
-            )
-        return f"chi-square is {per:.1f} per moment, as by chance; {size}"
+            why = "too much for chance"
+        elif per > GOOD_FIT:
+            why = "of a misfit that only so many pulses tell"
+        # a shift that is small compared with its error does not make the shape right
+        more = f"; the current amplitude is {size}" if off or not self.poor else ""
+        return f"chi-square is {per:.1f} per moment, {why}{more}"
 
     @property
     def poor(self) -> bool:
@@ -201,7 +197,8 @@ def fit_response(
             return response, fit
     elif found.per_moment > ANOTHER_DETECTOR and onset_is_off(found.problem):
         return response, _with_wrong_physics(found, fitter)
-    found = _extended(_with_more(found, sets.bands(CHECKED), fitter), fitter)
+    more = found.problem.of(response, sets.bands(CHECKED))
+    found = _extended(fitter.fit(more, coarse=False), fitter)
     response = found.problem.response
     if found.poor and onset_is_off(found.problem):
         return response, _with_wrong_physics(found, fitter)
@@ -260,12 +257,6 @@ def _determined(found: Fitted, bands: Sequence[Band], sets: PulseSets, fitter: F
         deviations = compared.deviations(compared.parameters.vector())
         fitter.count(float(deviations @ deviations))
     return described(compared, covariance, fitter)
-
-
-def _with_more(found: Fitted, bands: Sequence[Band], fitter: Fitter) -> Fitted:
-    """Continue a fit with more pulses."""
-    more = found.problem.of(found.problem.response, bands)
-    return fitter.fit(more, coarse=False)
 
 
 def _with_wrong_physics(found: Fitted, fitter: Fitter) -> Fit:

@@ -18,15 +18,21 @@ from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
 
-# Widths of the priors around the start: wide for times (in their logarithm); for weights such
-# that half of the charge may be slow, and that the main decay dominates.
-TIME_WIDTH, WEIGHT_WIDTH, DECAY_WIDTH, RINGING_WIDTH = 1.0, 0.1, 0.03, 0.3
-TIME_STEP, WEIGHT_STEP = 0.01, 0.002  # steps of the finite differences
+# Widths of the priors around the start, and steps of the finite differences: wide for times (in
+# their logarithm).
+TIME_WIDTH, TIME_STEP, WEIGHT_STEP = 1.0, 0.01, 0.002
 # The same for the stretch of the drift, and for its change per us.
 STRETCH_WIDTHS, STRETCH_STEPS = (0.1, 0.05), (0.003, 0.002)
 STRETCH = "drift.stretch"
 # Of a learned step response, whose coordinates have priors of width 1 around 0.
 COORDINATES, LONGEST = "coordinates", 2.0
+# The same of what is no time: half of the charge may be slow, and the main decay dominates.
+SCALES = {
+    "decay_weights": (0.03, WEIGHT_STEP),
+    "ringing": (0.3, WEIGHT_STEP),
+    "slow_weights": (0.1, WEIGHT_STEP),
+    COORDINATES: (1.0, WEIGHT_STEP),
+}
 
 
 class Parameters:
@@ -45,14 +51,10 @@ class Parameters:
         named = [(n, p) for n, p in response.named_parameters() if p.numel()]
         self._parts = [part for _, part in named]
         self.labels = [n for n, p in named for _ in range(p.numel())]
+        self._names = [f"{n}.{i + 1}" for n, p in named for i in range(p.numel())]
         self.centre = self.vector()
-        widths = {
-            "decay_weights": DECAY_WIDTH,
-            "ringing": RINGING_WIDTH,
-            "slow_weights": WEIGHT_WIDTH,
-            COORDINATES: 1.0,
-        }
-        self.widths = np.array([widths.get(name, TIME_WIDTH) for name in self.labels])
+        scales = [SCALES.get(name, (TIME_WIDTH, TIME_STEP)) for name in self.labels]
+        self.widths, self.steps = np.array(scales).T.copy()
         if response.decay_known is not None:
             self.widths[self.labels.index("log_decay_us")] = response.decay_known
         learned = np.array([name == COORDINATES for name in self.labels])
@@ -60,8 +62,6 @@ class Parameters:
         self.longest = np.where(learned, LONGEST, self.widths)
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
-        times = [label.startswith("log") for label in self.labels]
-        self.steps = np.where(times, TIME_STEP, WEIGHT_STEP)
         stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
         self.widths[stretched] = STRETCH_WIDTHS[: len(stretched)]
         self.steps[stretched] = STRETCH_STEPS[: len(stretched)]
@@ -72,20 +72,14 @@ class Parameters:
 
     def set(self, vector: Values) -> None:
         """Set the parameters of the response from a vector."""
-        first = 0
-        for part in self._parts:
-            stop = first + part.numel()
-            part.data.copy_(torch.from_numpy(vector[first:stop]).view_as(part))
-            first = stop
+        sizes = [part.numel() for part in self._parts]
+        values = torch.split(torch.from_numpy(vector), sizes)
+        for part, own in zip(self._parts, values, strict=True):
+            part.data.copy_(own.view_as(part))
 
     def by_name(self, values: Values) -> dict[str, float]:
         """Values of the parameters by name and number."""
-        counted: dict[str, int] = {}
-        named = {}
-        for label, value in zip(self.labels, values.tolist(), strict=True):
-            counted[label] = counted.get(label, 0) + 1
-            named[f"{label}.{counted[label]}"] = value
-        return named
+        return dict(zip(self._names, values.tolist(), strict=True))
 
 
 POLES = "log_poles_ns"

@@ -158,70 +158,46 @@ def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
     free = config.model_copy(
         update={"free_decays": True, "fast_decays_us": FAST_DECAYS_US[:1], "slow_ns": slow}
     )
-    decay, found = fitter.decay, []
+    found = []
     for with_slow in (False, True):  # either may end in another valley
-        starts = [
-            _free_decay_start(problem, free, us, share, decay, with_slow)
-            for us, share in _decays(problem, decay)
-        ]
+        starts = _free_decay_starts(problem, free, fitter.decay, with_slow)
         best = min(starts, key=lambda start: start.cost)
         found.append(fitter.fit(best, coarse=not with_slow))
     return min(found, key=lambda fit: fit.cost)
 
 
-def _free_decay_start(
-    problem: ResponseProblem,
-    config: ResponseConfig,
-    fast_us: float,
-    share: float,
-    decay: KnownDecay | None,
-    with_slow: bool,
-) -> ResponseProblem:
-    """The comparison for a fast and a main decay that together match the data's tails.
+def _free_decay_starts(
+    problem: ResponseProblem, config: ResponseConfig, decay: KnownDecay | None, with_slow: bool
+) -> Iterator[ResponseProblem]:
+    """Comparisons for fast and main decays that together match the data's tails.
 
-    The bandwidth found without the fast decay, and perhaps the slow parts, are about right if
-    the tails are.
+    Fits that start from tails of another slope get lost, and a share of 0 does not constrain
+    the time.  If the main decay is known, the share follows from how much steeper the tails
+    are.  The bandwidth found without the fast decay, and perhaps the slow parts, are about
+    right if the tails are.
     """
-    dt_ns, slope = float(problem.response.dt_ns), problem.slope
-    if decay is None:
-        slope += 1e-3 * dt_ns * share * _fast_slope(problem, fast_us)
-    response = ElectronicsResponse(config, dt_ns)
-    set_decay(response, slope, decay)
-    response.log_poles_ns.data.copy_(problem.response.log_poles_ns.data)
-    if with_slow:
-        kept = [tau in config.slow_ns for tau in problem.response.config.slow_ns]
-        response.slow_weights.data.copy_(problem.response.slow_weights.data[kept])
-    if response.drift is not None and problem.response.drift is not None:
-        response.drift.load_state_dict(problem.response.drift.state_dict())
-    response.log_fast_decays_us.data.fill_(math.log(fast_us))
-    response.decay_weights.data.fill_(share)
-    return problem.of(response)
-
-
-def _decays(
-    problem: ResponseProblem, decay: KnownDecay | None
-) -> Iterator[tuple[float, float]]:
-    """Times and shares of a fast decay that a fit may start from; no share is 0.
-
-    A share of 0 does not constrain the time, and fits that start from tails of another slope
-    get lost.  If the main decay is known, the share follows from how much steeper the tails
-    are.
-    """
-    for us in FAST_DECAYS_US:
-        if decay is None:
-            yield from ((us, share) for share in SHARES)
-        else:
-            steeper = -problem.slope / (1e-3 * float(problem.response.dt_ns)) - 1 / decay.us
-            share = steeper / _fast_slope(problem, us)
-            yield us, min(max(share, MIN_SHARE), MAX_SHARE)
-
-
-def _fast_slope(problem: ResponseProblem, fast_us: float) -> float:
-    """Increase of the slope of the tails by a fast decay with a share of 1, per us."""
-    preparation = problem.bands[0].moments.preparation
-    us = 1e-3 * float(problem.response.dt_ns)
-    middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * us
-    return math.exp(-middle_us / fast_us) / fast_us
+    known, preparation = problem.response, problem.bands[0].moments.preparation
+    dt_ns, dt_us = float(known.dt_ns), 1e-3 * float(known.dt_ns)
+    middle_us = (preparation.samples_after - 0.5 * preparation.decay_fit_samples) * dt_us
+    for fast_us in FAST_DECAYS_US:
+        # increase of the slope of the tails by a share of 1, per us
+        steeper = math.exp(-middle_us / fast_us) / fast_us
+        shares: Sequence[float] = SHARES
+        if decay is not None:
+            share = (-problem.slope / dt_us - 1 / decay.us) / steeper
+            shares = (min(max(share, MIN_SHARE), MAX_SHARE),)
+        for share in shares:
+            response = ElectronicsResponse(config, dt_ns)
+            set_decay(response, problem.slope + dt_us * share * steeper, decay)
+            response.log_poles_ns.data.copy_(known.log_poles_ns.data)
+            if with_slow:
+                kept = [tau in config.slow_ns for tau in known.config.slow_ns]
+                response.slow_weights.data.copy_(known.slow_weights.data[kept])
+            if response.drift is not None and known.drift is not None:
+                response.drift.load_state_dict(known.drift.state_dict())
+            response.log_fast_decays_us.data.fill_(math.log(fast_us))
+            response.decay_weights.data.fill_(share)
+            yield problem.of(response)
 
 
 def ringing_if_better(found: Fitted, fitter: Fitter) -> Fitted:

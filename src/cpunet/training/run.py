@@ -37,6 +37,7 @@ from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
+from cpunet.tables import aligned
 from cpunet.training.loop import Record
 
 if TYPE_CHECKING:
@@ -173,9 +174,9 @@ class Run(InfoPart):
             raise CpunetError(
                 f"{folder / WEIGHTS}: no readable weights; train again"
             ) from error
-        given = {"recipe": recipe, "weights": weights, "folder": folder}
+        facts |= {"recipe": recipe, "weights": weights, "folder": folder}
         try:
-            return cls.model_validate(facts | given)
+            return cls.model_validate(facts)
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             key = ".".join(map(str, first["loc"]))
@@ -304,13 +305,12 @@ class Run(InfoPart):
             If a run of networks contains no losses.
         """
         from cpunet.training.chain_description import describe_chain
-        from cpunet.training.figures import response_figure
+        from cpunet.training.response import Response
         from cpunet.validation.run_figures import loss_curves
 
         if self.recipe.generator.name != "response":
             return loss_curves(self.records)
-        tail_ns = self.recipe.preparation.samples_after * self.dt_ns
-        return response_figure([describe_chain(self).chain], tail_ns=tail_ns)
+        return Response([describe_chain(self)]).plot()
 
     def translate(
         self, pulses: Any, out: str | Path | None = None, **how: Any
@@ -335,9 +335,7 @@ class Run(InfoPart):
         return summary(self)
 
     def __str__(self) -> str:
-        lines = self.summary()
-        width = max(len(topic) for topic, _ in lines)
-        return "\n".join(f"{topic:<{width}}  {text}" for topic, text in lines)
+        return aligned(self.summary())
 
     def __repr__(self) -> str:
         per = None if self.fit is None else self.fit.chi_square_per_moment

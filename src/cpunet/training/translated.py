@@ -41,7 +41,8 @@ SPECTRA_BYTES = 2**27  # of pulse spectra that are cached between responses
 # larger, none are removed: the response is still far off.
 MAX_CUT = 0.2
 
-# Sums over pulses, and the total weight of these.
+# Weighted sums over a block of pulses; sums over pulses, and the total weight of these.
+Summed = Callable[[Readings], tuple[Values, ...]]
 Total = tuple[tuple[Values, ...], float]
 
 
@@ -171,12 +172,7 @@ class SimulatedSide:
         return SimulatedSide(self.sim[rows], noise, self.moments, self.weights[rows])
 
     def sums(
-        self,
-        response: Readout,
-        of: Callable[[Readings], tuple[Values, ...]],
-        *,
-        cut: bool = True,
-        draws: int | None = None,
+        self, response: Readout, of: Summed, *, cut: bool = True, draws: int | None = None
     ) -> Total:
         """Sums over all pulses and draws of noise, and the weight of the pulses used.
 
@@ -202,7 +198,7 @@ class SimulatedSide:
     def sums_of_blocks(
         self,
         response: Readout,
-        of: Callable[[Readings], tuple[Values, ...]],
+        of: Summed,
         *,
         size: int = BLOCK,
         cut: bool = True,
