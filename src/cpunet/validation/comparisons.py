@@ -351,6 +351,13 @@ def _finite(values: Values) -> Values:
 ByMethod = dict[str, float | None]
 
 
+@dataclass(frozen=True)
+class Missing:
+    """Reason why something is not scored."""
+
+    missing: str
+
+
 class Compared(TypedDict):
     """Result of `compare` for one parameter."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -290,6 +290,15 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str
             f"{file}: holds no scores by peak", "give a report of cpunet validate"
         )
     return content
+
+
+def as_stored(results: Any) -> Any:
+    """Results ready for JSON, see `plain`, without the fields of objects that are None."""
+    if is_dataclass(results):
+        results = {name: one for name, one in vars(results).items() if one is not None}
+    if isinstance(results, Mapping):
+        return {name: as_stored(one) for name, one in results.items()}
+    return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
 
 
 class _Figures(Mapping[str, "Figure"]):

@@ -37,10 +37,9 @@ from cpunet.training.job import match
 from cpunet.training.loop import train
 from cpunet.training.networks import differences, outside_noise
 from cpunet.training.run import Run, resolve_device
-from cpunet.translation.forms import drawn_kev, wanted_tails
-from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import null_distances, resampled_twice, wasserstein
+from cpunet.validation.methods import like_data
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -321,14 +320,7 @@ class HeldOut:
         CpunetError
             If pulses cannot be translated.
         """
-        generator = ren.seeded(self.seed)
-        tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
-        windows = ren.apply(
-            self.sim.waveforms,
-            energy_kev=self.sim.energy_kev,
-            generator=generator,
-            tails_kev=drawn_kev(tails, len(self.sim), generator),
-        )
+        windows = like_data(ren, self.sim, ren.seeded(self.seed))
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MAX_LOST:
             raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")
