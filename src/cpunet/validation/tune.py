@@ -10,6 +10,8 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -134,36 +136,26 @@ def tune(
     given = {key: _in_journal(space[key], value) for key, value in own.items()}
     if not study.trials and None not in given.values():
         study.enqueue_trial(given, {UNCHANGED: True})
-    states = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
-
-    def objective(trial: Trial) -> float:
-        # trials have numbers of their own, so processes do not draw the same random ones
-        study.sampler = optuna.samplers.GPSampler(
-            seed=(seed + trial.number) % 2**32,
-            n_startup_trials=STARTS,
-            warn_independent_sampling=False,
-        )
-        values = {key: _suggested(trial, key, own[key], space[key]) for key in space}
-        try:
-            return held_out.score(held_out.train(with_values(recipe, values), seed, device))
-        except CpunetError as error:
-            trial.set_user_attr(REASON, str(error))
-            log.info(f"trial {trial.number} failed: {error}")
-            raise
-
-    done = len(study.get_trials(states=states))
+    ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
     with stage("Trials", trials) as bar:
-        if done:
-            bar.update(done)
-        if done < trials:
-            study.optimize(
-                objective,
-                catch=CpunetError,
-                callbacks=[
-                    optuna.study.MaxTrialsCallback(trials, states),
-                    lambda *_: bar.update(1),
-                ],
+        while (done := len(study.get_trials(states=ended))) < trials:
+            bar.update(done - bar.n)
+            trial = study.ask()
+            # trials have numbers of their own, so processes do not draw the same random ones
+            study.sampler = optuna.samplers.GPSampler(
+                seed=(seed + trial.number) % 2**32,
+                n_startup_trials=STARTS,
+                warn_independent_sampling=False,
             )
+            values = {key: _suggested(trial, key, own[key], space[key]) for key in space}
+            try:
+                ren = held_out.train(with_values(recipe, values), seed, device)
+                study.tell(trial, held_out.score(ren))
+            except CpunetError as error:
+                trial.set_user_attr(REASON, str(error))
+                log.info(f"trial {trial.number} failed: {error}")
+                study.tell(trial, state=ended[1])
+        bar.update(done - bar.n)
     _write(out, study, recipe, space)
     return study
 
@@ -220,12 +212,12 @@ def value_of(recipe: Recipe, key: str) -> Any:
     CpunetError
         If the recipe has none of that name.
     """
-    node: Any = recipe.model_dump(mode="json")
-    for part in key.split("."):
-        if not isinstance(node, dict) or part not in node:
-            raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
-        node = node[part]
-    return node
+    try:
+        return reduce(getitem, key.split("."), recipe.model_dump(mode="json"))
+    except (LookupError, TypeError):
+        raise CpunetError(
+            f"recipe {recipe.name}: search.{key}: there is no such setting"
+        ) from None
 
 
 def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
@@ -239,32 +231,27 @@ def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
     settings = recipe.model_dump(mode="json") | {"search": None}
     for key, value in values.items():
         *parents, last = key.split(".")
-        node = settings
-        for parent in parents:
-            node = node[parent]
-        node[last] = value
+        reduce(getitem, parents, settings)[last] = value
     source = ", ".join(f"{key} = {value}" for key, value in values.items())
     return checked(Recipe, settings, f"recipe {recipe.name}, search, {source}")
 
 
 def _in_journal(config: SearchConfig, value: Any) -> Any:
     """A value as the journal has it, choices as JSON; None if the space does not contain it."""
-    if config.low is None or config.high is None:
-        choices = config.choices or ()  # a setting of 4.0 is the choice 4
+    if (choices := config.choices) is not None:  # a setting of 4.0 is the choice 4
         return json.dumps(choices[choices.index(value)]) if value in choices else None
-    within = isinstance(value, int | float) and config.low <= value <= config.high
-    return value if within else None
+    number = isinstance(value, int | float)
+    return value if number and config.low <= value <= config.high else None
 
 
 def _suggested(trial: Trial, key: str, own: Any, config: SearchConfig) -> Any:
     """The value of a setting proposed for a trial; an integer if all that is given is."""
-    low, high = config.low, config.high
-    if low is None or high is None:
-        labels = [json.dumps(choice) for choice in config.choices or ()]
-        return json.loads(str(trial.suggest_categorical(key, labels)))
-    if all(type(number) is int for number in (own, low, high)):
-        return trial.suggest_int(key, int(low), int(high), log=config.log)
-    return trial.suggest_float(key, low, high, log=config.log)
+    if config.choices is not None:
+        return json.loads(trial.suggest_categorical(key, [*map(json.dumps, config.choices)]))
+    ends: Any = config.low, config.high
+    if all(type(number) is int for number in (own, *ends)):
+        return trial.suggest_int(key, *ends, log=config.log)
+    return trial.suggest_float(key, *ends, log=config.log)
 
 
 @dataclass(frozen=True, eq=False)
