@@ -12,7 +12,6 @@ from cpunet.validation.a_over_e import (
     ae_survival,
     peak_survival,
     sideband_survival,
-    survival_by_range,
     survival_table,
 )
 from cpunet.validation.ae_energy import ae_energy_figure, against_energy, site_fit
@@ -87,20 +86,6 @@ def test_table_of_a_method_that_agrees_and_one_that_does_not():
     assert table["DEP"].survival is None
     assert sep.cut is None
     assert table["DEP"].cut["good"] == pytest.approx(0.9 * (10 + ndtri(0.1)), abs=0.1)
-
-
-def test_sigma_of_agreeing_sets_is_standard_normal():
-    rng = np.random.default_rng(5)
-    sigmas = [
-        survival_table(
-            by_peak(data=peaks(rng, 300, 300), ren=peaks(rng, 500, 700)),
-            bootstraps=40,
-            seed=rng,
-        )["SEP"].sigma["ren"]
-        for _ in range(200)
-    ]
-    assert np.mean(sigmas) == pytest.approx(0, abs=0.25)
-    assert np.std(sigmas) == pytest.approx(1, abs=0.15)
 
 
 def test_table_says_what_does_not_exist():
@@ -178,20 +163,6 @@ def test_without_events_there_is_a_reason(cut, peak, sidebands, reason):
     found = peak_survival(np.ones(4), energies, cut, peak, sidebands)
     assert reason in found.missing
     assert found.survival is None
-
-
-def test_every_range_and_method_with_its_own_cut():
-    amplitude = {"data": np.array([0.4, 0.6]), "ren": np.array([0.4, 0.6])}
-    energy = dict.fromkeys(amplitude, np.array([10.0, 10.0]))
-    table = survival_by_range(
-        amplitude,
-        energy,
-        {"data": 0.5, "ren": 0.3},
-        {"line": ((9, 11), [(20, 30)]), "continuum": ((5, 15), [])},
-    )
-    assert list(table) == ["line", "continuum"]
-    assert table["line"]["data"].survival == 50
-    assert table["continuum"]["ren"].survival == 100
 
 
 def drifted(rng, n, slope=-1e-5):

@@ -106,12 +106,13 @@ class CurrentLibrary:
         """The current of the grid point nearest to a position, shape (samples,)."""
         i = int(np.abs(self.r_mm - r_mm).argmin())
         j = int(np.abs(self.z_mm - z_mm).argmin())
-        stored = self._stored[angle][i, j]
-        return stored if self._basis is None else np.asarray(stored @ self._basis)
+        return self._whole(self._stored[angle][i, j])
 
     def currents(self, angle: int = 0) -> Floats:
         """All templates of an azimuth, shape (r, z, samples)."""
-        stored = self._stored[angle]
+        return self._whole(self._stored[angle])
+
+    def _whole(self, stored: Floats) -> Floats:
         return stored if self._basis is None else np.asarray(stored @ self._basis)
 
     def for_reboost(self, angle: int = 0) -> Any:

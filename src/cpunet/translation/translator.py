@@ -95,15 +95,26 @@ class Translator:
     """A trained generator with the preparation that it was trained on.
 
     Use `REN.of` with a run, or `REN.load` with its folder.
+
+    Attributes
+    ----------
+    backend
+        Network, readout chain or inverse.
+    recipe, dt_ns
+        Recipe of the run, and sampling period in ns.
+    needs_energies
+        Whether the noise depends on the energies.
+    tails
+        Pile-up tails as learned by the run; None if it has no information.
     """
 
     part: ClassVar[str]
     takes: ClassVar[Kind]
 
     def __init__(self, backend: Backend, recipe: Recipe, dt_ns: float) -> None:
-        self.backend = backend
-        self.recipe = recipe
-        self.dt_ns = dt_ns
+        self.backend, self.recipe, self.dt_ns = backend, recipe, dt_ns
+        self.needs_energies = backend.needs_energies
+        self.tails: DrawnTails | None = backend.tails
 
     @classmethod
     def of(cls, run: Run, device: str = "cpu") -> Self:
@@ -261,16 +272,6 @@ class Translator:
                 f"{what} sampled every {dt_ns:g} ns, the run was trained on {self.dt_ns:g} ns; "
                 "resample the pulses"
             )
-
-    @property
-    def tails(self) -> DrawnTails | None:
-        """Pile-up tails as learned by the run; None if it has no information."""
-        return self.backend.tails
-
-    @property
-    def needs_energies(self) -> bool:
-        """Whether the noise depends on the energies."""
-        return self.backend.needs_energies
 
     def apply(
         self,

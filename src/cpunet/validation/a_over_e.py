@@ -308,36 +308,6 @@ def peak_survival(
     return replace(found, survival=survival, survival_std=std)
 
 
-def survival_by_range(
-    amplitude: Mapping[str, Values],
-    energy_kev: Mapping[str, Values],
-    cuts: Mapping[str, float],
-    ranges: Mapping[str, tuple[Range, Sequence[Range]]],
-) -> dict[str, dict[str, RangeSurvival]]:
-    """`peak_survival` of every line and range, by method.
-
-    Parameters
-    ----------
-    amplitude, energy_kev, cuts
-        Amplitudes, energies in keV and cut by method; each method has its own cut (see
-        `ae_survival`), NaN if it has none.
-    ranges
-        Range and sidebands of each gamma line in keV, by name; a continuum has no sidebands.
-
-    Returns
-    -------
-    dict
-        Results of `peak_survival` by name and method.
-    """
-    return {
-        name: {
-            method: peak_survival(values, energy_kev[method], cuts[method], span, sidebands)
-            for method, values in amplitude.items()
-        }
-        for name, (span, sidebands) in ranges.items()
-    }
-
-
 def sideband_survival(
     peak_pass: int, peak: int, side_pass: int, side: int, scale: float
 ) -> tuple[float, float]:

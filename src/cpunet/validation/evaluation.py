@@ -33,7 +33,7 @@ from cpunet.validation.a_over_e import (
     RangeSurvival,
     SurvivalRow,
     ae_against_drift_time,
-    survival_by_range,
+    peak_survival,
     survival_table,
 )
 from cpunet.validation.ae_energy import AgainstEnergy, against_energy
@@ -258,14 +258,17 @@ def _range_survivals(
     """A/E survival of gamma lines, sideband-subtracted, and of continua, after known cuts."""
     if isinstance(ae_survival, Missing):
         return Missing(f"there is no A/E cut: {ae_survival.missing}")
-    cuts = ae_survival[DEP].cut or {}
-    return survival_by_range(
-        {method: values for method, values in amplitudes.items() if method in cuts},
-        energies,
-        cuts,
-        {name: line for name, line in _lines(recipe).items() if name != DEP}
-        | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
-    )
+    cuts = ae_survival[DEP].cut or {}  # each method has its own
+    ranges = {name: line for name, line in _lines(recipe).items() if name != DEP}
+    ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
+    return {
+        name: {
+            method: peak_survival(values, energies[method], cuts[method], span, sidebands)
+            for method, values in amplitudes.items()
+            if method in cuts
+        }
+        for name, (span, sidebands) in ranges.items()
+    }
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:

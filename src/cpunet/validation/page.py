@@ -25,6 +25,7 @@ from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
 from cpunet.validation.side_by_side import peak_figure
+from cpunet.validation.verdicts import Metrics
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
 AE_ENERGY = "A over E and energy"  # figure with a section of its own
@@ -43,7 +44,7 @@ PLACES = {
 
 def write_page(
     folder: Path,
-    metrics: Mapping[str, Any],
+    metrics: Metrics,
     figures: Mapping[str, Callable[[], Figure]],
     notes: Sequence[str],
 ) -> None:

@@ -18,7 +18,7 @@ from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.settings import plain, read_json
 from cpunet.tables import text_table
-from cpunet.validation.verdicts import judged_scores
+from cpunet.validation.verdicts import Metrics, judged_scores
 
 if TYPE_CHECKING:
     import hist
@@ -62,7 +62,7 @@ class Report:
         Paragraphs for the top of the page.
     """
 
-    metrics: Mapping[str, Any]
+    metrics: Metrics
     values: Mapping[str, Mapping[str, Mapping[str, Values]]] = field(default_factory=dict)
     folder: Path | None = None
     drawn: Mapping[str, Callable[[], Any]] | None = None
@@ -276,7 +276,7 @@ class Report:
         return ["peak", "parameter", *shown], rows
 
 
-def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str, Any]:
+def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:
     """Read a ``metrics.json``; `remedy` says what to do if that fails.
 
     Raises

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,9 +12,14 @@ from matplotlib.figure import Figure
 from cpunet.errors import CpunetError
 from cpunet.plotting import GROUP, colours, label, panels, styled
 from cpunet.tables import NO_VALUE
-from cpunet.validation.verdicts import judged_scores, methods_of, number, part, summary
-
-Metrics = Mapping[str, Any]
+from cpunet.validation.verdicts import (
+    Metrics,
+    judged_scores,
+    methods_of,
+    number,
+    part,
+    summary,
+)
 
 FEW = 8  # runs whose scores fit beside each other; more have an overview and panels
 CEILING = " (ceiling)"
@@ -131,7 +136,7 @@ def score_figure(
     return figure
 
 
-def peak_figure(peak: str, scores: Mapping[str, Any]) -> Figure:
+def peak_figure(peak: str, scores: Metrics) -> Figure:
     """Draw the IoU of each parameter of a peak, and the AUC of the classifier, by method."""
     methods = [m for m in scores["two_sample"] if m != "ren"] + ["ren"]
     rows = _score_rows(peak, [(scores, method) for method in methods])

@@ -17,6 +17,7 @@ from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, as_run
 from cpunet.validation.compare import compared
 from cpunet.validation.report import REPORT, Report
+from cpunet.validation.verdicts import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +168,7 @@ def _of_channel(
     return folder
 
 
-def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str]:
+def _notes(run: Run, metrics: Metrics, truth: Path | None) -> list[str]:
     notes = [
         f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
