@@ -362,8 +362,7 @@ def finished(out: Path, wanted: dict[str, Any]) -> Counts:
             continue
         other = f"another {what}"
         if what == "options":
-            theirs = found[what]
-            names = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
-            other = f"other options ({', '.join(names)})"
+            names = ", ".join(n for n in value if found[what].get(n, ...) != value[n])
+            other = f"other options ({names})"
         raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
     return Counts(**found["counts"])
