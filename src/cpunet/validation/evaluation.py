@@ -21,7 +21,7 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.parameters import Values, current_amplitude
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
@@ -130,7 +130,11 @@ def evaluate(
     device, recipe, trained_on = resolve_device(device), run.recipe, run.peak
     ren, iren = REN.of(run, device), IREN.of(run, device)
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
-    sim_set, data_set = _load_both(ren, sim, data, names, max_pulses)
+    selection = _selected(recipe, names)
+    sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
+    data_set = load_pulses(data, "measured", recipe, selection, max_pulses=max_pulses)
+    require_same_sampling(sim_set, data_set)
+    ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
     responses = None if truth is None else true_responses(truth, sim_set)
     baseline_methods = fit_baseline_methods(
         sim_set,
@@ -196,7 +200,15 @@ def evaluate(
             name: slice_table(of_peak.slices, data_set.dt_ns)
             for name, of_peak in details.items()
         },
-        "noise": {name: _sizes(peaks[name].noise or {}) for name in details},
+        # numbers of the noise beside each other; its spectrum is with the scores
+        "noise": {
+            name: {
+                method: {k: v for k, v in found.items() if not k.startswith("power")}
+                for method, found in (peaks[name].noise or {}).items()
+                if method != "frequency_mhz"
+            }
+            for name in details
+        },
         "baseline_methods": {
             "fits": {
                 name: method.describe() for name, method in baseline_methods.methods.items()
@@ -221,32 +233,12 @@ def evaluate(
     )
 
 
-def _sizes(noise: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers of the noise that are shown beside each other, without its spectrum."""
-    return {
-        method: {k: v for k, v in found.items() if not k.startswith("power")}
-        for method, found in noise.items()
-        if method != "frequency_mhz"
-    }
-
-
-def _load_both(
-    ren: REN,
-    sim: PulseFile,
-    data: PulseFile,
-    names: list[str],
-    max_pulses: int,
-) -> tuple[InputSet, InputSet]:
-    # the peaks, with all sidebands and continua
-    chosen = parse_selection(",".join(names), ren.recipe.peaks)
-    more = [band for _, bands in _lines(ren.recipe).values() for band in bands]
-    more += ren.recipe.scores.continuum_kev.values()
-    selection = replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
-    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, max_pulses=max_pulses)
-    data_set = load_pulses(data, "measured", ren.recipe, selection, max_pulses=max_pulses)
-    require_same_sampling(sim_set, data_set)
-    ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
-    return sim_set, data_set
+def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
+    """Energies of the peaks, with all sidebands and continua."""
+    chosen = parse_selection(",".join(names), recipe.peaks)
+    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    more += recipe.scores.continuum_kev.values()
+    return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
 def _range_survivals(
