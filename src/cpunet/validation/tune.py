@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import yaml
-from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs, written_aside
@@ -35,10 +35,9 @@ from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, checked
-from cpunet.training.job import match
-from cpunet.training.loop import train
-from cpunet.training.networks import differences, outside_noise
-from cpunet.training.run import Run, resolve_device
+from cpunet.training.job import TrainingJob
+from cpunet.training.networks import differences
+from cpunet.training.run import resolve_device
 from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import null_distances, resampled_twice, wasserstein
 from cpunet.validation.methods import like_data
@@ -327,17 +326,10 @@ class HeldOut:
         CpunetError
             If the training fails.
         """
-        model: nn.Module
-        if recipe.training.method == "matching":
-            found = match(self.fit_sim, self.fit_data, recipe, seed, lambda *_step: None)
-            model, recipe = found.model, found.recipe
-        else:
-            sides = (self.fit_sim, self.fit_data)
-            outside, _ = outside_noise(*sides, recipe)
-            sim, data = (side.prepared.pulses.waveforms for side in sides)
-            model = train(sim, data, recipe, seed=seed, device=device, outside=outside)
-        facts = {"dt_ns": self.sim.dt_ns, "peak": "", "seconds": 0.0}
-        return REN.of(Run.of(model, recipe, seed=seed, device=device, **facts), device)
+        sides = self.fit_sim, self.fit_data
+        with TemporaryDirectory() as folder:
+            job = TrainingJob(recipe, "", seed, device, *sides, Path(folder))
+            return REN.of(job.trained(None), device)
 
 
 def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
