@@ -27,6 +27,7 @@ import cpunet
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.legend.currents import WINDOW, WINDOWS
 from cpunet.legend.library_files import (
     IdealLibrary,
     chosen_libraries,
@@ -42,7 +43,6 @@ from cpunet.training.run import RunLike, as_run
 
 Values = npt.NDArray[np.float64]
 
-WINDOW, WINDOWS = 48, 3  # width in ns and number of the moving averages of a current
 AROUND_NS = 500  # compared range on either side of the maximum
 START_NS = (40.0, 60.0)  # initial sigma and tau
 LONGEST_NS = 500.0

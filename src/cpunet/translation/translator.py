@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
+from cpunet.electronics.drawn_pile_up import Columns, DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
@@ -222,7 +222,6 @@ class Translator:
         noise: bool = True,
         generator: torch.Generator | None = None,
         tails_kev: Energies | None = None,
-        piled: InTracePileUp | None = None,
     ) -> TranslatedPulses:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
@@ -237,16 +236,14 @@ class Translator:
             Random generator of the noise.
         tails_kev
             Pile-up tails under each pulse in keV, shape ``(n,)``.
-        piled
-            Piled-up pulses within the records.
 
         Raises
         ------
         CpunetError
             If the sampling period is not that of the training.
         """
-        known = Drawn(pulses.energy_kev, noise, generator, tails_kev, piled)
-        return self.translate_drawn(pulses, known)
+        drawn = Drawn(pulses.energy_kev, noise, generator, tails_kev)
+        return self.translate_drawn(pulses, drawn)
 
     def translate_drawn(self, pulses: Pulses, drawn: Drawn) -> TranslatedPulses:
         """Like `translate_pulses`, with all that is drawn."""

@@ -216,12 +216,7 @@ def ae_survival(
     return cut, float(cuts.std(ddof=1)), peaks
 
 
-def survival_table(
-    ae: ByPeak,
-    *,
-    bootstraps: int = BOOTSTRAPS,
-    seed: int | np.random.Generator = 0,
-) -> dict[str, SurvivalRow] | Missing:
+def survival_table(ae: ByPeak, seed: int = 0) -> dict[str, SurvivalRow] | Missing:
     """Survival of each peak in data and simulations, each after its own cut.
 
     Since each dataset has its own cut, a wrong scale of A/E alone makes no difference.
@@ -231,8 +226,8 @@ def survival_table(
     ae
         A/E by peak and method, the measured ones under ``"data"``.  Methods that lack a peak
         are left out.
-    bootstraps, seed
-        Number and seed of the bootstraps for the errors of the cuts.
+    seed
+        Seed of the bootstraps for the errors of the cuts.
     """
     if DEP not in ae:
         return Missing(f"the data lack peak {DEP}; the A/E cut needs it")
@@ -245,7 +240,6 @@ def survival_table(
         method: ae_survival(
             ae[DEP][method],
             {name: of_peak[method] for name, of_peak in ae.items() if name != DEP},
-            bootstraps=bootstraps,
             seed=rng,
         )
         for method in methods
