@@ -226,7 +226,6 @@ def _about_peak(current: Values) -> Values:
 
 log = logging.getLogger(__name__)
 
-WHOLE = "cpunet.yaml"
 LEGEND_PARS = FolderKind(
     name="legend-pars",
     command="cpunet export legend",

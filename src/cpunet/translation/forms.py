@@ -31,8 +31,6 @@ HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_SAMPLES = 20  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
-Floats = npt.NDArray[np.float64]
-
 
 class Windows:
     """Prepared windows: baseline at 0, tail at 0.80; NaN for rejected pulses.
