@@ -37,7 +37,12 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
-from cpunet.validation.methods import PairedScores, Responses, pair_squares, scores_of_squares
+from cpunet.validation.methods import (
+    PairedScores,
+    pair_squares,
+    scores_of_squares,
+    true_responses,
+)
 from cpunet.validation.report import Report
 
 Values = npt.NDArray[np.float64]
@@ -190,8 +195,7 @@ def small_sides() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
 
 def prepared_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:
     """The noise-free response of each simulated pulse in use, prepared like data."""
-    blocks = Responses(path, sim).blocks()
-    return np.concatenate([finish(block, config, dt_ns=sim.dt_ns).windows for block in blocks])
+    return finish(true_responses(path, sim), config, dt_ns=sim.dt_ns).windows
 
 
 class Files(NamedTuple):

@@ -155,20 +155,6 @@ def test_files_of_hits_are_described(tmp_path):
     assert info(csv, frame=units).values[""]["extents_mm"]["x"] == [30, 30]
 
 
-def test_measured_traces_are_described(reference_data: Path):
-    """A bench detector: what its digitiser was set to, and what is seen by eye."""
-    told = info(reference_data / "real" / "th228.fcio").values["traces"]
-    assert told["looked_at"] == 1000
-    low, middle, high = told["trigger_sample"]
-    assert low <= middle <= high
-    assert middle == pytest.approx(911, abs=3)
-    assert 700 < told["baseline_samples"] < middle
-    assert told["decay_us"] == pytest.approx(78.9, rel=0.03)
-    assert told["saturated_percent"] == pytest.approx(0.2)
-    assert told["noise_adc"] == pytest.approx(15, abs=2)
-    assert told["noise_kev"] is None
-
-
 def test_the_properties_are_those_that_were_made():
     """Noise, decay, trigger and saturation of traces made here."""
     rng, n, length, at = np.random.default_rng(4), 60, 1600, 700

@@ -118,8 +118,7 @@ def test_memory_and_file_have_the_same_pulses(home, run, tmp_path):
     assert np.array_equal(*same, equal_nan=True)
     assert (kept.codes.tolist(), kept.counts) == (stored.codes.tolist(), stored.counts)
     assert kept.rejections == {"energy_unknown": 1}
-    assert not kept.valid[3]
-    assert kept.valid.sum() == N - 1
+    assert np.flatnonzero(~kept.valid).tolist() == [3]
     assert stored.path == tmp_path / "t.lh5"
     assert "energy unknown" in stored._repr_html_()
     assert "data:image/png" not in stored._repr_html_()  # a file may be large
@@ -146,8 +145,6 @@ def test_raw_traces(home, run):
     assert made.counts.saturated is not None
     with pytest.raises(cpunet.CpunetError, match="raw traces in ADC have no parameters"):
         made.hist()
-    twice = run.translate(home / "sim.lh5", realisations=2)
-    assert len(twice.pulses) == twice.counts.read == 2 * N
     back = run.translate(home / "raw.lh5", inverse=True, noise=False)
     assert back.counts.translated > N // 2
 

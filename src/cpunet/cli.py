@@ -38,48 +38,34 @@ from cpunet.translation.options import Adc
 
 log = logging.getLogger(__name__)
 
-# The public function of a command, and what it does.
+# What a command does. Its public function has the same name, or one of these.
 COMMANDS = {
-    "demo": (
-        "demo",
-        "Simulate, digitise, train, translate and validate on a stand with a known answer.",
-    ),
-    "check": (
-        "check",
-        "Say whether simulated and measured pulses can be compared, and what to do if not.",
-    ),
-    "export legend": (
-        "export_legend",
-        "Export a readout chain as parameters for LEGEND's simulation chain.",
-    ),
-    "export onnx": ("export_onnx", "Export the deterministic part of a run as ONNX."),
-    "import": ("import_weights", "Make a run of the weights that the authors published."),
-    "info": ("info", "Say what is in a file, detector, run or report."),
-    "response": (
-        "response",
-        "Say in terms of physics what readout was learned, beside the truth if it is known.",
-    ),
-    "library make": ("make_library", "Simulate the charge pulse of every place in a detector."),
-    "library translate": (
-        "translate_library",
-        "Translate a library of charge pulses with a trained run, without noise.",
-    ),
-    "simulate": (
-        "simulate",
-        "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
-    ),
-    "stand": (
-        "make_stand",
-        "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
-    ),
-    "train": ("train", "Train REN and IREN on simulated and measured pulses, unpaired."),
-    "translate": (
-        "translate",
-        "Translate pulses with a trained run, keeping the rows and columns of their files.",
-    ),
-    "calibrate": ("calibrate", "Calibrate the detector and its electronics together."),
-    "validate": ("validate", "Score a run per peak and write a report."),
-    "compare": ("compare", "Put the scores of several validations beside each other."),
+    "demo": "Simulate, digitise, train, translate and validate on a stand with a known answer.",
+    "check": "Say whether simulated and measured pulses can be compared, and what to do if "
+    "not.",
+    "export legend": "Export a readout chain as parameters for LEGEND's simulation chain.",
+    "export onnx": "Export the deterministic part of a run as ONNX.",
+    "import": "Make a run of the weights that the authors published.",
+    "info": "Say what is in a file, detector, run or report.",
+    "response": "Say in terms of physics what readout was learned, beside the truth if it is "
+    "known.",
+    "library make": "Simulate the charge pulse of every place in a detector.",
+    "library translate": "Translate a library of charge pulses with a trained run, without "
+    "noise.",
+    "simulate": "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
+    "stand": "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
+    "train": "Train REN and IREN on simulated and measured pulses, unpaired.",
+    "translate": "Translate pulses with a trained run, keeping the rows and columns of their "
+    "files.",
+    "calibrate": "Calibrate the detector and its electronics together.",
+    "validate": "Score a run per peak and write a report.",
+    "compare": "Put the scores of several validations beside each other.",
+}
+FUNCTIONS = {
+    "import": "import_weights",
+    "library make": "make_library",
+    "library translate": "translate_library",
+    "stand": "make_stand",
 }
 
 GROUPS = {
@@ -127,9 +113,10 @@ def _made() -> App:
     )
     for group in GROUPS.values():
         made.command(group)
-    for name, (function, told) in COMMANDS.items():
+    for name, told in COMMANDS.items():
         *group_of, word = name.split()
         place = GROUPS[group_of[0]] if group_of else made
+        function = FUNCTIONS.get(name) or name.replace(" ", "_")
         place.command(f"{cpunet.HOMES[function]}:{function}", name=word, help=told)
     return made
 

@@ -171,7 +171,7 @@ def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Pa
     amplitudes = currents[:6, 3:11][inner][..., PEAK].astype(float)
     assert amplitudes.min() < 1 < amplitudes.max()
     numbers = told["V01"]
-    assert (numbers["templates"], numbers["translated"]) == (96, 2 * int(inner.sum()))
+    assert (numbers.templates, numbers.translated) == (96, 2 * int(inner.sum()))
     assert json.loads(h5py.File(tmp_path / "psl.lh5")["V01"].attrs["cpunet"])["rings"] == 3
 
 
@@ -204,9 +204,9 @@ def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: 
     assert few.told["rank"] == 8
     np.testing.assert_array_equal(whole.drift_time_ns[45], few.drift_time_ns[45])
     apart = few.currents(45) - whole.currents(45)
-    assert np.nanmax(np.abs(apart)) == pytest.approx(told["loss"]["largest"], rel=1e-3)
-    assert 0 < told["loss"]["largest"] < 0.02
-    assert told["loss"]["a_over_e_percent"] < 0.5
+    assert np.nanmax(np.abs(apart)) == pytest.approx(told.loss["largest"], rel=1e-3)
+    assert 0 < told.loss["largest"] < 0.02
+    assert told.loss["a_over_e_percent"] < 0.5
     np.testing.assert_array_equal(few.template(2.2, 3.9), few.currents(0)[2, 7])
     assert (tmp_path / "few.lh5").stat().st_size < (tmp_path / "whole.lh5").stat().st_size / 3
     assert expand_library(tmp_path / "few.lh5", tmp_path / "again.lh5") == ["V01"]
@@ -234,7 +234,7 @@ def test_components_of_a_detector_are_its_own(
         for name in ("V02", "V03", "V04"):
             file.copy("V01", name)
     beside = translate_library(chain, source, tmp_path / "beside.lh5", low_rank=8).numbers
-    assert beside["V01"]["loss"] == alone["V01"]["loss"]
+    assert beside["V01"].loss == alone["V01"].loss
 
 
 def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None:
@@ -329,7 +329,7 @@ def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
 def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "ideal.lh5", without(charge(), np.s_[2, 3]))
     told = translate_library(chain, source, tmp_path / "psl.lh5").numbers
-    assert told["V01"]["healed"] == 2
+    assert told["V01"].healed == 2
     times = read_library(tmp_path / "psl.lh5").drift_time_ns[0]
     whole = write(tmp_path / "whole.lh5", charge())
     translate_library(chain, whole, tmp_path / "psl2.lh5")
@@ -422,7 +422,7 @@ def test_a_over_e_of_geant4_events_at_the_nodes(
     at_nodes = replace(
         hits, x_mm=r_mm[i][nearest], y_mm=np.zeros(len(nearest)), z_mm=z_mm[j][nearest]
     )
-    mode = told[name]["mode_per_ns"]
+    mode = told[name].mode_per_ns
     full = full_a_over_e(chain, detector, at_nodes, mode)
     found = a_over_e_of_reboost(tmp_path / "psl.lh5", at_nodes, 0.0)
     apart = 100 * (found / full - 1)
@@ -444,7 +444,7 @@ def test_a_over_e_of_all_geant4_events(
     r, phi = np.hypot(hits.x_mm, hits.y_mm), np.arctan2(hits.y_mm, hits.x_mm)
     turned = replace(hits, x_mm=r, y_mm=np.zeros(len(r)))
     for these, azimuth, within, median in ((turned, 0.0, 0.99, 0.01), (hits, phi, 0.8, 0.12)):
-        full = full_a_over_e(chain, detector, these, numbers["mode_per_ns"])
+        full = full_a_over_e(chain, detector, these, numbers.mode_per_ns)
         found = a_over_e_of_reboost(tmp_path / "psl.lh5", these, azimuth)
         apart = 100 * (found / full - 1)
         assert np.isfinite(apart).all()

@@ -203,13 +203,6 @@ def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:
     np.testing.assert_allclose(back.max(axis=1), 1, atol=1e-6)
 
 
-def test_gain_and_offset_are_no_part_of_a_measured_pulse(iren) -> None:
-    traces = responded(5, seed=3)
-    np.testing.assert_allclose(
-        iren.translate(300 * traces + 5000), iren.translate(traces), atol=1e-3
-    )
-
-
 def test_no_pulses_at_all(ren, iren) -> None:
     none = np.zeros((0, 225), np.float32)
     assert ren.translate(none, energy_kev=np.zeros(0)).shape == (0, 800)

@@ -240,42 +240,26 @@ def browser() -> str:
     return found
 
 
-def run_page(page: Path, width: int = 1280, height: int = 900) -> tuple[dict[str, Any], str]:
+def run_page(page: Path, width: int) -> tuple[dict[str, Any], str]:
     """Open a page, and return what it wrote into ``<pre id="selftest">``, and the log."""
+    switches = (
+        "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking "
+        "--disable-component-update --disable-dev-shm-usage --enable-logging=stderr "
+        f"--window-size={width},900 --virtual-time-budget=10000 --dump-dom"
+    ).split()
     for _ in range(ATTEMPTS):
-        dom, log = _opened(page, width, height)
-        found = re.search(r'<pre id="selftest"[^>]*>(.*?)</pre>', dom, re.DOTALL)
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+            done = subprocess.run(
+                [browser(), *switches, f"--user-data-dir={profile}", page.resolve().as_uri()],
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE_S,
+                check=False,
+            )
+        found = re.search(r'<pre id="selftest"[^>]*>(.*?)</pre>', done.stdout, re.DOTALL)
         if found:
-            return json.loads(html.unescape(found[1])), log
-    raise AssertionError(f"the page did not report:\n{dom[-500:]}\n{log[-2000:]}")
-
-
-def _opened(page: Path, width: int, height: int) -> tuple[str, str]:
-    """Return the page's DOM after a while, and the browser's log."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        done = subprocess.run(
-            [
-                browser(),
-                "--headless",
-                "--no-sandbox",
-                "--disable-gpu",
-                "--no-first-run",
-                "--disable-background-networking",
-                "--disable-component-update",
-                "--disable-dev-shm-usage",
-                "--enable-logging=stderr",
-                f"--user-data-dir={profile}",
-                f"--window-size={width},{height}",
-                "--virtual-time-budget=10000",
-                "--dump-dom",
-                page.resolve().as_uri(),
-            ],
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
-    return done.stdout, done.stderr
+            return json.loads(html.unescape(found[1])), done.stderr
+    raise AssertionError(f"the page did not report:\n{done.stdout[-500:]}\n{done.stderr}")
 
 
 SELFTEST = """<script>

@@ -106,12 +106,13 @@ class CurrentLibrary:
         """The current of the grid point nearest to a position, shape (samples,)."""
         i = int(np.abs(self.r_mm - r_mm).argmin())
         j = int(np.abs(self.z_mm - z_mm).argmin())
-        stored = self._stored[angle][i, j]
-        return stored if self._basis is None else np.asarray(stored @ self._basis)
+        return self._whole(self._stored[angle][i, j])
 
     def currents(self, angle: int = 0) -> Floats:
         """All templates of an azimuth, shape (r, z, samples)."""
-        stored = self._stored[angle]
+        return self._whole(self._stored[angle])
+
+    def _whole(self, stored: Floats) -> Floats:
         return stored if self._basis is None else np.asarray(stored @ self._basis)
 
     def for_reboost(self, angle: int = 0) -> Any:
@@ -220,7 +221,7 @@ def merge_libraries(
     """
     paths, out = [*map(Path, sources)], Path(out)
     refuse_existing(out, *paths, force=force)
-    first: dict[str, tuple[Path, tuple[float, float, int]]] = {}
+    first: dict[str, tuple[Path, str]] = {}
     with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
         for path in paths:
             with opened(path) as file:
@@ -240,10 +241,8 @@ def merge_libraries(
                     other, (known_path, known) = next(iter(first.items()))
                     if axis != known:
                         raise CpunetError(
-                            f"{path}: {name} has {axis[2]} samples of {axis[0]:g} ns from "
-                            f"{axis[1]:g} ns, {other} of {known_path} {known[2]} of "
-                            f"{known[0]:g} ns from {known[1]:g} ns; translate both with one "
-                            "version"
+                            f"{path}: {name} has {axis}, {other} of {known_path} {known}; "
+                            "translate both with one version"
                         )
                     _copy(file[name], made.h5)
     return sorted(first)
@@ -258,11 +257,12 @@ def _copy(group: h5py.Group, made: h5py.File) -> None:
     describe(copy.parent)
 
 
-def _time_axis(group: h5py.Group) -> tuple[float, float, int]:
-    """Period, first time and number of samples."""
+def _time_axis(group: h5py.Group) -> str:
+    """Number of samples, period and first time, as text."""
     waveforms = (name for name in group if name.startswith("waveform_"))
     array = _COMPONENTS if _COMPONENTS in group else next(waveforms)
-    return group["dt"][()].item(), group["t0"][()].item(), int(group[array].shape[-1])
+    dt_ns, t0_ns = (group[name][()].item() for name in ("dt", "t0"))
+    return f"{group[array].shape[-1]} samples of {dt_ns:g} ns from {t0_ns:g} ns"
 
 
 def expand_library(source: str | Path, out: str | Path, *, force: bool = False) -> list[str]:

@@ -27,6 +27,7 @@ import cpunet
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.legend.currents import WINDOW, WINDOWS
 from cpunet.legend.library_files import (
     IdealLibrary,
     chosen_libraries,
@@ -42,7 +43,6 @@ from cpunet.training.run import RunLike, as_run
 
 Values = npt.NDArray[np.float64]
 
-WINDOW, WINDOWS = 48, 3  # width in ns and number of the moving averages of a current
 AROUND_NS = 500  # compared range on either side of the maximum
 START_NS = (40.0, 60.0)  # initial sigma and tau
 LONGEST_NS = 500.0
@@ -78,6 +78,38 @@ class Equivalent:
     current_error_percent: float
     late_charge_percent: float
     ae_error_percent: float
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of A/E: their RMS and the largest, in percent."""
+
+    rms_percent: float
+    largest_percent: float
+
+    @classmethod
+    def of(cls, ratios: Values) -> Errors:
+        """Errors of ratios of A/E that are 1 without any."""
+        apart = 100 * (ratios - 1)
+        return cls(float(apart.std()), float(np.abs(apart).max()))
+
+
+@dataclass(frozen=True)
+class OnLibrary:
+    """Errors of A/E by a kernel, relative to its chain, for the templates of a library.
+
+    Attributes
+    ----------
+    library, templates
+        Name of the library, and number of its templates.
+    single_site, two_sites
+        Of single templates, and of pairs.
+    """
+
+    library: str
+    templates: int
+    single_site: Errors
+    two_sites: Errors
 
 
 def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
@@ -194,7 +226,6 @@ def _about_peak(current: Values) -> Values:
 
 log = logging.getLogger(__name__)
 
-WHOLE = "cpunet.yaml"
 LEGEND_PARS = FolderKind(
     name="legend-pars",
     command="cpunet export legend",
@@ -315,7 +346,8 @@ def export_legend(
         equivalent: dict[str, Any] = asdict(nearest)
         if library is not None:
             wanted = () if detector is None else (detector,)
-            equivalent["of_library"] = _of_library(library, wanted, known, undecayed, nearest)
+            found = _of_library(library, wanted, known, undecayed, nearest)
+            equivalent["of_library"] = asdict(found)
     whole = {
         "made_of": {
             "cpunet": cpunet.__version__,
@@ -381,7 +413,7 @@ def _of_library(
     known: str | None,
     undecayed: Exponentials,
     nearest: Equivalent,
-) -> dict[str, Any]:
+) -> OnLibrary:
     """Errors of A/E by the kernel, relative to the chain, for templates of a detector."""
     with opened(source) as file:
         held = chosen_libraries(file, source, wanted, known)
@@ -400,11 +432,6 @@ def _of_library(
     share = rng.random((n, 1), np.float32)
     two_sites = share * charge + (1 - share) * charge[rng.permutation(n)]
     alone = ae_ratios(charge, undecayed, nearest)
+    pairs = ae_ratios(two_sites, undecayed, nearest)
     usual = float(np.median(alone))  # divided out, since A/E is calibrated
-    return {"library": library.path, "templates": n} | {
-        name: {"rms_percent": float(apart.std()), "largest_percent": float(np.abs(apart).max())}
-        for name, apart in (
-            ("single_site", 100 * (alone / usual - 1)),
-            ("two_sites", 100 * (ae_ratios(two_sites, undecayed, nearest) / usual - 1)),
-        )
-    }
+    return OnLibrary(library.path, n, Errors.of(alone / usual), Errors.of(pairs / usual))

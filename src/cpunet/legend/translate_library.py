@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +107,48 @@ STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
 @dataclass(frozen=True)
+class LibraryNumbers:
+    """What was counted and measured of a translated library.
+
+    Attributes
+    ----------
+    templates, translated
+        Grid points times angles, and those with a template.
+    padded, healed
+        Filled grid points, and those of them inside the crystal.
+    mode_per_ns
+        A/E by which currents are divided.
+    delay_ns
+        Time that is subtracted from drift times.
+    rank, loss
+        Number of components and their errors, see `Loss`; None for whole templates.
+    """
+
+    templates: int
+    translated: int
+    padded: int
+    healed: int
+    mode_per_ns: float
+    delay_ns: float
+    rank: int | None = None
+    loss: dict[str, float] | None = None
+
+    def __str__(self) -> str:
+        healed = f", {self.healed} of them within it" if self.healed else ""
+        text = (
+            f"{self.translated} of {self.templates} templates translated, {self.padded} added "
+            f"about the crystal{healed}; A/E is most often {self.mode_per_ns:.4g}/ns"
+        )
+        if loss := self.loss:
+            text += (
+                f"\n{self.rank} components: samples within {loss['largest']:.1e} of the most "
+                f"frequent A/E (RMS {loss['rms']:.1e}), A/E within "
+                f"{loss['a_over_e_percent']:.2g} % (RMS {loss['a_over_e_rms_percent']:.2g} %)"
+            )
+        return text
+
+
+@dataclass(frozen=True)
 class TranslatedLibrary:
     """A library that was translated.
 
@@ -115,31 +157,14 @@ class TranslatedLibrary:
     path
         The file.
     numbers
-        By name of the library: ``templates`` (grid points times angles), ``translated``,
-        ``padded``, ``healed`` (filled grid points inside the crystal that had no template),
-        ``mode_per_ns`` (A/E by which currents are divided), and ``loss`` of the components.
+        What was counted, by name of the library.
     """
 
     path: Path
-    numbers: dict[str, Any]
+    numbers: dict[str, LibraryNumbers]
 
     def __str__(self) -> str:
-        lines = []
-        for name, one in self.numbers.items():
-            healed = f", {one['healed']} of them within it" if one["healed"] else ""
-            lines.append(
-                f"{self.path}: {name}: {one['translated']} of {one['templates']} templates "
-                f"translated, {one['padded']} added about the crystal{healed}; A/E is most "
-                f"often {one['mode_per_ns']:.4g}/ns"
-            )
-            if loss := one.get("loss"):
-                lines.append(
-                    f"{one['rank']} components: samples within {loss['largest']:.1e} of the "
-                    f"most frequent A/E (RMS {loss['rms']:.1e}), A/E within "
-                    f"{loss['a_over_e_percent']:.2g} % (RMS "
-                    f"{loss['a_over_e_rms_percent']:.2g} %)"
-                )
-        return "\n".join(lines)
+        return "\n".join(f"{self.path}: {name}: {one}" for name, one in self.numbers.items())
 
 
 def translate_library(
@@ -205,7 +230,7 @@ def translate_library(
     run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
     translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
-    numbers: dict[str, Any] = {}
+    numbers: dict[str, LibraryNumbers] = {}
     with opened(source) as given:
         names = chosen_libraries(given, source, detector, known_detector(run))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
@@ -214,20 +239,82 @@ def translate_library(
             for one in ideal:
                 looked = _look(translate, one, given[one.path], source)
                 group = made.h5.require_group(one.path)
-                job = _Writing(looked, one, rings, low_rank)
-                numbers[one.path] = job.write(given[one.path], group, made_from)
+                found = looked.write(given[one.path], group, rings, low_rank)
+                told = {k: v for k, v in asdict(found).items() if v is not None}
+                content = {"cpunet": cpunet.__version__, "rings": rings} | made_from | told
+                group.attrs[TOLD] = json.dumps(content)
+                describe(group)
+                numbers[one.path] = found
     return TranslatedLibrary(out, numbers)
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Looked:
-    """Results of a first pass over all templates of a library, and their translator."""
+    """Results of a first pass over all templates of a library, which a second pass writes."""
 
     translate: TemplateTranslator
+    library: IdealLibrary
     delay_ns: float
     mode: float
     kept: Floats
-    inside: dict[str, npt.NDArray[np.bool_]] = field(default_factory=dict)
+    inside: dict[str, npt.NDArray[np.bool_]]
+
+    def write(
+        self, given: h5py.Group, group: h5py.Group, rings: int, rank: int | None
+    ) -> LibraryNumbers:
+        """Write currents, and drift times within the crystal and beside it."""
+        library = self.library
+        r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
+        z_mm = padded_axis(library.z_mm, rings, rings)
+        basis = None if rank is None else components(self.kept, rank)
+        made = NewLibrary.begin(group, r_mm, z_mm, PERIOD_NS, basis)
+        padded = healed = 0
+        loss = Loss()
+        for angle, mask in self.inside.items():
+            values, drift_times = made.arrays(angle)
+            times = np.full((len(r_mm), len(z_mm)), np.nan)
+            with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
+                for rows, currents, when in self._rows(given[f"waveform_{angle}"], rings, bar):
+                    values[rows] = made.stored(currents, loss)
+                    times[rows] = when
+            times = continued(times, rings)
+            drift_times[...] = times
+            padded += int(np.isfinite(times).sum() - mask.sum())
+            inner = np.isfinite(times[: len(mask), rings:][:, : mask.shape[1]])
+            healed += int((inner & ~mask & enclosed(mask)).sum())
+        return LibraryNumbers(
+            templates=library.n_templates,
+            translated=sum(int(mask.sum()) for mask in self.inside.values()),
+            padded=padded,
+            healed=healed,
+            mode_per_ns=self.mode,
+            delay_ns=self.delay_ns,
+            rank=None if basis is None else len(basis),
+            loss=None if basis is None else loss.told(),
+        )
+
+    def _rows(
+        self, given: h5py.Dataset, rings: int, bar: Stage
+    ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
+        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
+        n_r, n_z, _ = given.shape
+        for first in range(0, n_r + rings, ROWS):
+            last = min(first + ROWS, n_r + rings)
+            # a padded grid point depends only on rows at most `rings` away
+            low, high = max(0, first - rings), min(last + rings, n_r)
+            shape = (last + rings - low, n_z + 2 * rings)
+            currents = np.full((*shape, LENGTH), np.nan, np.float32)
+            times = np.full(shape, np.nan)
+            if high > low:
+                charge = _charge(given[low:high])
+                there = ~np.isnan(charge[:, :, 0])
+                of_these, when = currents_about_peak(self.translate(charge[there]))
+                inner = (slice(0, high - low), slice(rings, rings + n_z))
+                currents[inner][there] = of_these / np.float32(self.mode)
+                times[inner][there] = when - self.delay_ns
+            own = slice(first - low, last - low)
+            yield slice(first, last), with_rings(currents, rings)[own], times[own]
+            bar.update(last - first)
 
 
 def _look(
@@ -243,107 +330,31 @@ def _look(
     moving = not_ending = 0
     with stage(f"A/E of {library.path}", library.n_templates) as bar:
         for angle in library.angles:
-            mask = np.zeros((len(library.r_mm), len(library.z_mm)), bool)
-            for first, block in _blocks(given[f"waveform_{angle}"], library, source):
+            masks = []
+            for block in _blocks(given[f"waveform_{angle}"], library, source):
                 there = ~np.isnan(block[:, :, 0])
                 templates = block[there]
                 currents, times = currents_about_peak(translate(templates))
                 good = np.isfinite(times)
                 there[there] = good
-                mask[first : first + len(block)] = there
+                masks.append(there)
                 moving += int(good.sum())
                 not_ending += n_not_ending(templates[good])
                 amplitudes.append(currents[good, PEAK].astype(float))
                 kept.append(currents[good][rng.random(int(good.sum())) < share])
                 bar.update(block.shape[0] * block.shape[1])
-            inside[angle] = mask
+            inside[angle] = np.concatenate(masks)
     require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
     require_complete(inside, library, source)
     mode = most_frequent(np.concatenate(amplitudes))
     some = np.concatenate(kept)
     if len(some) > MAX_TEMPLATES:
         some = some[np.sort(rng.choice(len(some), MAX_TEMPLATES, replace=False))]
-    return _Looked(
-        translate, float(delay[0]) - STEP_SAMPLE, mode, some / np.float32(mode), inside
-    )
+    delay_ns = float(delay[0]) - STEP_SAMPLE
+    return _Looked(translate, library, delay_ns, mode, some / np.float32(mode), inside)
 
 
-@dataclass(frozen=True, eq=False)
-class _Writing:
-    """Second pass, which writes one library."""
-
-    looked: _Looked
-    library: IdealLibrary
-    rings: int
-    rank: int | None
-
-    def write(
-        self, given: h5py.Group, group: h5py.Group, made_from: dict[str, str]
-    ) -> dict[str, Any]:
-        looked, library = self.looked, self.library
-        r_mm = padded_axis(library.r_mm, 0, self.rings)  # none at negative radii
-        z_mm = padded_axis(library.z_mm, self.rings, self.rings)
-        basis = None if self.rank is None else components(looked.kept, self.rank)
-        made = NewLibrary.begin(group, r_mm, z_mm, PERIOD_NS, basis)
-        padded = healed = 0
-        loss = Loss()
-        for angle in library.angles:
-            values, drift_times = made.arrays(angle)
-            mask = looked.inside[angle]
-            times = np.full((len(r_mm), len(z_mm)), np.nan)
-            with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
-                for rows, currents, when in self._rows(given[f"waveform_{angle}"], bar):
-                    values[rows] = made.stored(currents, loss)
-                    times[rows] = when
-            times = continued(times, self.rings)
-            drift_times[...] = times
-            padded += int(np.isfinite(times).sum() - mask.sum())
-            inner = np.isfinite(times[: len(mask), self.rings :][:, : mask.shape[1]])
-            healed += int((inner & ~mask & enclosed(mask)).sum())
-        numbers: dict[str, Any] = {
-            "templates": library.n_templates,
-            "translated": sum(int(mask.sum()) for mask in looked.inside.values()),
-            "padded": padded,
-            "healed": healed,
-            "mode_per_ns": looked.mode,
-            "delay_ns": looked.delay_ns,
-        }
-        if basis is not None:
-            numbers["rank"] = len(basis)
-            numbers["loss"] = loss.told()
-        content = {"cpunet": cpunet.__version__, "rings": self.rings} | made_from | numbers
-        group.attrs[TOLD] = json.dumps(content)
-        describe(group)
-        return numbers
-
-    def _rows(
-        self, given: h5py.Dataset, bar: Stage
-    ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
-        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
-        n_r, n_z, _ = given.shape
-        rings, looked = self.rings, self.looked
-        for first in range(0, n_r + rings, ROWS):
-            last = min(first + ROWS, n_r + rings)
-            # a padded grid point depends only on rows at most `rings` away
-            low, high = max(0, first - rings), min(last + rings, n_r)
-            shape = (last + rings - low, n_z + 2 * rings)
-            currents = np.full((*shape, LENGTH), np.nan, np.float32)
-            times = np.full(shape, np.nan)
-            if high > low:
-                charge = _charge(given[low:high])
-                there = ~np.isnan(charge[:, :, 0])
-                of_these, when = currents_about_peak(looked.translate(charge[there]))
-                inner = (slice(0, high - low), slice(rings, rings + n_z))
-                currents[inner][there] = of_these / np.float32(looked.mode)
-                times[inner][there] = when - looked.delay_ns
-            own = slice(first - low, last - low)
-            yield slice(first, last), with_rings(currents, rings)[own], times[own]
-            bar.update(last - first)
-
-
-def _blocks(
-    given: h5py.Dataset, library: IdealLibrary, source: Path
-) -> Iterator[tuple[int, Floats]]:
+def _blocks(given: h5py.Dataset, library: IdealLibrary, source: Path) -> Iterator[Floats]:
     """Rows of charge templates; raise an error if only a part of a template is NaN."""
     for first in range(0, given.shape[0], ROWS):
         values = np.asarray(given[first : first + ROWS], np.float32)
@@ -357,7 +368,7 @@ def _blocks(
                 f"{library.z_mm[j]:g} mm; simulate the library again, with longer records if "
                 "charge was late"
             )
-        yield first, _charge(values)
+        yield _charge(values)
 
 
 def _charge(values: npt.NDArray[Any]) -> Floats:

@@ -12,7 +12,13 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
-from cpunet.electronics.finishing import PADDING_BEFORE, extended, finish, with_room
+from cpunet.electronics.finishing import (
+    PADDING_BEFORE,
+    extended,
+    finish,
+    record_length,
+    with_room,
+)
 from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator, Sizes
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
@@ -75,6 +81,10 @@ class Backend(ABC):
     ----------
     network : torch.nn.Module
         Module with the weights.
+    config : PreparationConfig
+        Preparation of the pulses that it gives.
+    dt_ns : float
+        Their sampling period in ns.
     needs_energies : bool
         Whether the noise depends on the energies.
     chain : ResponseGenerator or None
@@ -86,6 +96,8 @@ class Backend(ABC):
     """
 
     network: nn.Module
+    config: PreparationConfig
+    dt_ns: float
     needs_energies: bool = False
     chain: ResponseGenerator | None = None
     noise: BaselineNoise | None = None
@@ -103,6 +115,38 @@ class Backend(ABC):
 
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
         """Noise-free traces of any length, with 99.9 % at sample `n_pre`; of a chain only."""
+        raise NotImplementedError
+
+    def finished(
+        self, windows: FloatArray, records: FloatArray, drawn: Drawn
+    ) -> tuple[FloatArray, Codes]:
+        """Records with noise in proportion to 1/energy and other pulses, prepared like data.
+
+        `windows` are those of which `shapes` makes the other pulses.
+        """
+        energy_kev, piled = drawn.energy_kev, drawn.piled
+        seed, added = drawn.seed(self.device), None
+        if drawn.others and energy_kev is not None:
+            added = np.zeros(records.shape)
+            if drawn.tails_kev is not None and self.tails is not None:
+                left = drawn.tails_kev * self.tails.height / energy_kev
+                added += left[:, np.newaxis] * self.tails.decay(records.shape[1])
+            if piled is not None and len(piled.row):
+                # with shapes of the same batch; early ones need longer records
+                shapes = self.shapes(windows[piled.partner], piled.reach(self.dt_ns))
+                added += piled.added(shapes, energy_kev, self.dt_ns, records.shape[1])
+        return finish(
+            records,
+            self.config,
+            dt_ns=self.dt_ns,
+            noise=self.noise if drawn.noise else None,
+            energy_kev=energy_kev if drawn.noise else None,
+            seed=seed,
+            added=added,
+        )[:2]
+
+    def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
+        """Records in prepared units, longer by `reach`, for piled-up pulses."""
         raise NotImplementedError
 
 
@@ -130,38 +174,24 @@ class NetworkBackend(Backend):
         kept: KeptNoise | None = None,
         tails: DrawnTails | None = None,
     ) -> None:
-        self.network, self.config, self.kept = network.eval(), config, kept
+        self.network, self.config = network.eval(), config
         if kept is not None:
-            self.needs_energies, self.noise, self.tails = True, kept.noise, tails
+            self.dt_ns, self.noise, self.tails = kept.noise_dt_ns, kept.noise, tails
+            self.needs_energies = True
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Run the network; add noise in proportion to 1/energy, and prepare like data."""
         batch = torch.from_numpy(windows).to(self.device)
         out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
         clean: FloatArray = out[:, 0].cpu().numpy()
-        energy_kev, piled = drawn.energy_kev, drawn.piled
-        if self.kept is None or energy_kev is None or not drawn.noise:
+        if self.noise is None or not drawn.noise:
             return clean, np.zeros(len(windows), np.uint8)
-        seed = drawn.seed(self.device)
-        dt_ns = self.kept.noise_dt_ns
-        records = with_room(clean, self.config, dt_ns)
-        added = None
-        if drawn.others:
-            added = _left(self.tails, records, energy_kev, drawn.tails_kev)
-        if piled is not None and added is not None:
-            length = records.shape[1] + piled.reach(dt_ns)
-            before = PADDING_BEFORE + self.config.samples_before
-            shapes = extended(clean[piled.partner], self.config, dt_ns, length, before)
-            added += piled.added(shapes, energy_kev, dt_ns, records.shape[1])
-        return finish(
-            records,
-            self.config,
-            dt_ns=dt_ns,
-            noise=self.noise,
-            energy_kev=energy_kev,
-            seed=seed,
-            added=added,
-        )[:2]
+        return self.finished(clean, with_room(clean, self.config, self.dt_ns), drawn)
+
+    def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
+        length = record_length(self.config.length) + reach
+        before = PADDING_BEFORE + self.config.samples_before
+        return extended(windows, self.config, self.dt_ns, length, before)
 
 
 class ResponseBackend(Backend):
@@ -178,22 +208,7 @@ class ResponseBackend(Backend):
     def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
-        energy_kev, piled = drawn.energy_kev, drawn.piled
-        seed = drawn.seed(self.device)
-        added = None
-        if drawn.others and energy_kev is not None:
-            added = _left(self.tails, records, energy_kev, drawn.tails_kev)
-            if piled is not None and len(piled.row):
-                added += self._piled(windows, energy_kev, piled, records.shape[1])
-        return finish(
-            records,
-            self.config,
-            dt_ns=self.dt_ns,
-            noise=self.noise if drawn.noise else None,
-            energy_kev=energy_kev if drawn.noise else None,
-            seed=seed,
-            added=added,
-        )[:2]
+        return self.finished(windows, records, drawn)
 
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
         """Noise-free traces of prepared simulated windows, with 99.9 % at sample `n_pre`."""
@@ -219,16 +234,11 @@ class ResponseBackend(Backend):
         pulses = Pulses.of(records, dt_ns=self.dt_ns)
         return records, prepare(pulses, config, "measured")
 
-    def _piled(
-        self, windows: FloatArray, energy_kev: Energies, piled: InTracePileUp, length: int
-    ) -> npt.NDArray[np.float64]:
-        """Piled-up pulses with shapes of the same batch, at each sample in prepared units."""
-        # early piled-up pulses need longer records
-        reach = ((0, 0), (0, piled.reach(self.dt_ns)))
-        shapes, clean = self._clean(np.pad(windows[piled.partner], reach, mode="edge"))
-        scale = np.full(len(shapes), np.median(clean.scale))
+    def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
+        records, clean = self._clean(np.pad(windows, ((0, 0), (0, reach)), mode="edge"))
+        scale = np.full(len(records), np.median(clean.scale))
         scale[clean.index] = clean.scale
-        return piled.added(shapes / scale[:, np.newaxis], energy_kev, self.dt_ns, length)
+        return records / scale[:, np.newaxis]
 
 
 class InverseBackend(Backend):
@@ -273,16 +283,3 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
         return ResponseBackend(response, preparation)
     inverse = LinearInverse(Sizes.of(preparation.length, recipe.matching.training))
     return InverseBackend(run.fill(part, inverse, device), preparation, run.dt_ns)
-
-
-def _left(
-    tails: DrawnTails | None,
-    records: FloatArray,
-    energy_kev: Energies,
-    tails_kev: Energies | None,
-) -> npt.NDArray[np.float64]:
-    """Pile-up tails at each sample of the records, in prepared units."""
-    if tails_kev is None or tails is None:
-        return np.zeros(records.shape)
-    left = tails_kev * tails.height / energy_kev
-    return np.asarray(left[:, np.newaxis] * tails.decay(records.shape[1]))

@@ -20,7 +20,6 @@ from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import Rejection
 from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
@@ -29,16 +28,14 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import (
     AdcTraces,
-    Formed,
     Windows,
     adc_scale,
     interleaved,
-    joined,
     wanted_pile_up,
     wanted_tails,
 )
 from cpunet.translation.options import TranslateOptions
-from cpunet.translation.translator import IREN, REN, Translator
+from cpunet.translation.translator import IREN, REN, TranslatedPulses, Translator
 
 log = logging.getLogger(__name__)
 
@@ -67,12 +64,10 @@ class Counts:
     skipped: int = 0
 
     @classmethod
-    def of(cls, formed: Formed, *, adc: bool) -> Counts:
+    def of(cls, block: TranslatedPulses) -> Counts:
         """Count the rows of a block."""
-        codes = np.bincount(formed.codes)
-        rejected = {Rejection(int(c)).label: int(codes[c]) for c in np.flatnonzero(codes) if c}
-        saturated = int(formed.saturated.sum()) if adc else None
-        return cls(len(formed.codes), int(codes[Rejection.ACCEPTED]), rejected, saturated)
+        saturated = None if block.saturated is None else int(block.saturated.sum())
+        return cls(len(block.codes), int(block.valid.sum()), block.rejections, saturated)
 
     def __add__(self, other: Counts) -> Counts:
         known = [n for n in (self.saturated, other.saturated) if n is not None]
@@ -113,7 +108,7 @@ class FileTranslation:
 
     def warn(self) -> None:
         """Say what the user should know of the output."""
-        if isinstance(self.form, AdcTraces) and self.form.fills_in:
+        if self.form.fills_in:
             log.warning(
                 f"a network knows windows of {self.form.config.length} samples alone; beyond "
                 "them stand baseline and decay without noise"
@@ -165,11 +160,11 @@ class FileTranslation:
         counts, times = Counts(), self.options.realisations
         give_back_large_arrays()
         with self.writer(out, force=force) as writer:
-            for formed in self._blocks(pulses, noise_key):
-                first, given = counts.read // times, len(formed.codes) // times
-                columns = {**formed.columns, **others.read(first, given, times)}
-                writer.append(formed.pulses, columns)
-                counts += self._counts(formed)
+            for block in self._blocks(pulses, noise_key):
+                first, given = counts.read // times, len(block.codes) // times
+                columns = {**block.columns, **others.read(first, given, times)}
+                writer.append(block.pulses, columns)
+                counts += Counts.of(block)
             self._require_some(source, counts)
             if source_print(source) != before:
                 raise CpunetError(
@@ -181,7 +176,7 @@ class FileTranslation:
             writer.annotate(TRANSLATION, json.dumps(record, default=np.generic.item), file=True)
         return counts
 
-    def in_memory(self, source: PulseFile) -> tuple[Formed, Counts]:
+    def in_memory(self, source: PulseFile) -> tuple[TranslatedPulses, Counts]:
         """Translated pulses of a file, and their counts, as those of `__call__`.
 
         Raises
@@ -190,9 +185,9 @@ class FileTranslation:
             If the source cannot be used, or no pulse can be translated.
         """
         blocks = list(self._blocks(self.opened(source), None))
-        counts = sum((self._counts(block) for block in blocks), Counts())
+        counts = sum(map(Counts.of, blocks), Counts())
         self._require_some(source, counts)
-        return joined(blocks), counts
+        return TranslatedPulses.joined(blocks), counts
 
     def opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate.
@@ -223,17 +218,14 @@ class FileTranslation:
             force=force,
         )
 
-    def _form(self) -> Windows | AdcTraces:
+    def _form(self) -> Windows:
         adc = self.options.adc
         tails = wanted_tails(self.translator, self.options.tails, raw=adc is not None)
         pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
-        if adc is None or not isinstance(self.translator, REN):
+        if adc is None:
             return Windows(self.translator, tails, pile_up)
         scale = adc_scale(self.run, self.translator, adc)
         return AdcTraces(self.translator, *scale, adc, tails, pile_up)
-
-    def _counts(self, formed: Formed) -> Counts:
-        return Counts.of(formed, adc=self.options.adc is not None)
 
     def _require_some(self, source: PulseFile, counts: Counts) -> None:
         if not counts.translated:
@@ -243,7 +235,7 @@ class FileTranslation:
                 f"({reasons}); are these {self.translator.takes} pulses?"
             )
 
-    def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[Formed]:
+    def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[TranslatedPulses]:
         """Translate block by block; the noise depends only on the order of the pulses."""
         with stage("Translating", pulses.n_pulses) as bar:
             for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
@@ -371,8 +363,7 @@ def finished(out: Path, wanted: dict[str, Any]) -> Counts:
             continue
         other = f"another {what}"
         if what == "options":
-            theirs = found[what]
-            names = [n for n in theirs | value if theirs.get(n, ...) != value.get(n, ...)]
-            other = f"other options ({', '.join(names)})"
+            names = ", ".join(n for n in value if found[what].get(n, ...) != value[n])
+            other = f"other options ({names})"
         raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
     return Counts(**found["counts"])

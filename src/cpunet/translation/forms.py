@@ -9,63 +9,31 @@ baseline before them and with the decay fitted to their end after them, both wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_pile_up import Columns, DrawnPileUp, DrawnTails, InTracePileUp
+from cpunet.electronics.drawn_pile_up import Columns, DrawnPileUp, DrawnTails
 from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import PADDING_BEFORE, record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection, prepare
 from cpunet.training.run import Run
+from cpunet.translation.backends import Drawn
 from cpunet.translation.options import LEARNED, NONE, Adc
-from cpunet.translation.translator import BATCH, REN, Translator
+from cpunet.translation.translator import BATCH, TranslatedPulses, Translator
 
 HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_SAMPLES = 20  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
-Floats = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Formed:
-    """Translated pulses in the form of the output, with the rows of the input.
-
-    Parameters
-    ----------
-    pulses
-        Traces of shape (n, samples).
-    codes
-        A `Rejection` for each row.
-    saturated
-        Mask of the rows that reach an end of the digitiser's range, shape (n,).
-    truth
-        What is known of each trace, arrays of shape (n,) with their units: ``tails_kev``
-        with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
-        pulses, see `InTracePileUp.largest`; ``realisation`` with several.
-    """
-
-    pulses: Pulses
-    codes: Codes
-    saturated: npt.NDArray[np.bool_]
-    truth: Columns = field(default_factory=dict)
-
-    @property
-    def columns(self) -> Columns:
-        """Columns to be stored beside the pulses."""
-        return {"rejection": (self.codes, ""), **self.truth}
-
 
 class Windows:
     """Prepared windows: baseline at 0, tail at 0.80; NaN for rejected pulses.
-
-    As `AdcTraces` it tells ``samples`` and ``units``, type and units of the stored samples, and
-    ``t0_ns``, the time of the first one from where a pulse reaches 99.9 % of its maximum.
 
     Parameters
     ----------
@@ -75,10 +43,22 @@ class Windows:
         Distribution of the pile-up tails; None for none.
     pile_up
         Rate and energies of piled-up pulses; None for none.
+
+    Attributes
+    ----------
+    samples, units
+        Type and units of the stored samples.
+    n_pre, length
+        Samples of a trace before a pulse without noise reaches 99.9 % of its maximum, and all.
+    record
+        The same of the record within which pulses pile up.
+    fills_in
+        Whether traces are padded with baseline and decay without noise.
     """
 
     samples: npt.DTypeLike = np.float32
     units = ""
+    fills_in = False
 
     def __init__(
         self,
@@ -87,34 +67,37 @@ class Windows:
         pile_up: DrawnPileUp | None = None,
     ) -> None:
         self.translator, self.tails, self.pile_up = translator, tails, pile_up
-        self.t0_ns = -translator.recipe.preparation.samples_before * translator.dt_ns
+        self.config = config = translator.recipe.preparation
+        self.n_pre, self.length = config.samples_before, config.length
+        self.record = PADDING_BEFORE + self.n_pre, record_length(self.length)
+
+    @property
+    def t0_ns(self) -> float:
+        """Time of the first sample from where a pulse reaches 99.9 % of its maximum."""
+        return -self.n_pre * self.translator.dt_ns
 
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
-    ) -> Formed:
+    ) -> TranslatedPulses:
         """Translate pulses, keeping their rows."""
-        left = drawn_kev(self.tails, len(pulses), generator)
-        piled = None
-        if self.pile_up is not None:  # within the records that are prepared to windows
-            config = self.translator.recipe.preparation
-            before, length = (
-                PADDING_BEFORE + config.samples_before,
-                record_length(config.length),
-            )
-            piled = self.pile_up.draw(len(pulses), before, length, rng_of(generator))
-        done = self.translator.translate_pulses(
-            pulses, noise=noise, generator=generator, tails_kev=left, piled=piled
-        )
-        saturated = np.zeros(len(pulses), bool)
-        return Formed(done.pulses, done.codes, saturated, truth_of(left, piled))
+        left, piled = drawn_kev(self.tails, len(pulses), generator), None
+        truth: Columns = {} if left is None else {"tails_kev": (left, "keV")}
+        if self.pile_up is not None:
+            piled = self.pile_up.draw(len(pulses), *self.record, rng_of(generator))
+            truth |= piled.columns()
+        known = Drawn(pulses.energy_kev, noise, generator, left, piled)
+        return replace(self._translated(pulses, known), truth=truth)
+
+    def _translated(self, pulses: Pulses, known: Drawn) -> TranslatedPulses:
+        return self.translator.translate_drawn(pulses, known)
 
 
-class AdcTraces:
+class AdcTraces(Windows):
     """Raw traces in ADC counts; 0 for rejected pulses.
 
     Parameters
     ----------
-    ren
+    translator
         Trained run.
     per_kev, baseline
         ADC counts per prepared unit and keV, and baseline in ADC counts, see `adc_scale`.
@@ -138,58 +121,48 @@ class AdcTraces:
 
     def __init__(
         self,
-        ren: REN,
+        translator: Translator,
         per_kev: float,
         baseline: float,
         adc: Adc,
         tails: DrawnTails | None = None,
         pile_up: DrawnPileUp | None = None,
     ) -> None:
-        self.ren, self.tails, self.pile_up = ren, tails, pile_up
+        super().__init__(translator, tails, pile_up)
         self.per_kev, self.baseline = per_kev, baseline
-        self.config = ren.recipe.preparation
-        if pile_up is not None and ren.backend.chain is None:
+        chain = translator.backend.chain
+        if pile_up is not None and chain is None:
             raise CpunetError(
                 "a network knows no shapes beyond its windows, so it gives no raw traces with "
                 "piled-up pulses; leave out `pile_up_khz` or `adc`"
             )
-        self.length = self.config.length if adc.length is None else adc.length
-        self.n_pre = self.config.samples_before if adc.n_pre is None else adc.n_pre
+        before, window = self.n_pre, self.length
+        self.length = window if adc.length is None else adc.length
+        self.n_pre = before if adc.n_pre is None else adc.n_pre
         if not 0 <= self.n_pre < self.length:
             raise CpunetError(
                 f"`n_pre` {self.n_pre} is not within a trace of {self.length} samples; "
                 "give less, or a longer `length`"
             )
-        self.t0_ns = -self.n_pre * ren.dt_ns
+        self.record = self.n_pre, self.length
+        beyond = self.n_pre > before or self.length - self.n_pre > window - before
+        self.fills_in = chain is None and beyond
 
-    @property
-    def fills_in(self) -> bool:
-        """Whether traces are padded with baseline and decay without noise."""
-        before = self.n_pre - self.config.samples_before
-        after = self.length - self.n_pre - self.config.samples_after
-        return self.ren.backend.chain is None and max(before, after) > 0
-
-    def __call__(
-        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
-    ) -> Formed:
-        """Translate pulses, keeping their rows; pulses without energy are rejected."""
-        left = drawn_kev(self.tails, len(pulses), generator)
-        piled = None
-        if self.pile_up is not None:
-            piled = self.pile_up.draw(len(pulses), self.n_pre, self.length, rng_of(generator))
-        if self.ren.backend.chain is not None:
-            windows, codes = self._of_chain(pulses, noise, generator, piled)
+    def _translated(self, pulses: Pulses, known: Drawn) -> TranslatedPulses:
+        """Traces of all pulses; those without energy are rejected."""
+        if self.translator.backend.chain is not None:
+            windows, codes = self._of_chain(pulses, known)
         else:
-            done = self.ren.translate_pulses(pulses, noise=noise, generator=generator)
+            done = self.translator.translate_drawn(pulses, replace(known, tails_kev=None))
             codes = done.codes.copy()
             windows = extended(
-                done.pulses.waveforms, self.config, self.ren.dt_ns, self.length, self.n_pre
+                done.pulses.waveforms, self.config, pulses.dt_ns, self.length, self.n_pre
             )
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
-        if left is not None and self.tails is not None:
+        if known.tails_kev is not None and self.tails is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
-                heights = left * self.tails.height / pulses.energy_kev
+                heights = known.tails_kev * self.tails.height / pulses.energy_kev
             decay = self.tails.decay(self.length, lead_us=0.0)
             windows += heights[:, np.newaxis] * decay
         windows[codes != Rejection.ACCEPTED] = np.nan
@@ -197,15 +170,9 @@ class AdcTraces:
         traces, saturated = to_adc(windows, scale, self.baseline)
         # single precision represents 16-bit integers exactly
         whole = pulses.with_waveforms(traces.astype(np.float32))
-        return Formed(whole, codes, saturated, truth_of(left, piled))
+        return TranslatedPulses(whole, codes, saturated)
 
-    def _of_chain(
-        self,
-        pulses: Pulses,
-        noise: bool,
-        generator: torch.Generator | None,
-        piled: InTracePileUp | None,
-    ) -> tuple[FloatArray, Codes]:
+    def _of_chain(self, pulses: Pulses, known: Drawn) -> tuple[FloatArray, Codes]:
         """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
         prepared = prepare(pulses, self.config, "simulated")
         traces = np.full((len(pulses), self.length), np.nan, np.float32)
@@ -214,47 +181,36 @@ class AdcTraces:
         kept = usable[prepared.index]
         index = prepared.index[kept]
         windows = prepared.pulses.waveforms[kept]
-        backend, rng = self.ren.backend, rng_of(generator)
+        backend, piled = self.translator.backend, known.piled
+        dt_ns, rng = pulses.dt_ns, rng_of(known.generator)
         for first in range(0, len(windows), BATCH):
             rows = index[first : first + BATCH]
             batch = windows[first : first + BATCH]
             levels, codes[rows] = backend.levels(batch, self.n_pre, self.length)
             energies = pulses.energy_kev[rows]
-            if noise and backend.noise is not None:
+            if known.noise and backend.noise is not None:
                 levels += backend.noise.draw(energies, self.length, rng)
             if piled is not None and len((other := piled.of_rows(rows)).row):
                 # early piled-up pulses need longer traces
-                reached = self.length + other.reach(self.ren.dt_ns)
+                reached = self.length + other.reach(dt_ns)
                 shapes, _ = backend.levels(batch[other.partner], self.n_pre, reached)
                 shapes = np.nan_to_num(shapes)
-                levels += other.added(shapes, energies, self.ren.dt_ns, self.length)
+                levels += other.added(shapes, energies, dt_ns, self.length)
             traces[rows] = levels
         return traces, codes
 
 
-def joined(blocks: list[Formed]) -> Formed:
-    """The rows of all blocks."""
-    return Formed(
-        Pulses.concatenate([block.pulses for block in blocks]),
-        np.concatenate([block.codes for block in blocks]),
-        np.concatenate([block.saturated for block in blocks]),
-        {
-            name: (np.concatenate([block.truth[name][0] for block in blocks]), units)
-            for name, (_, units) in blocks[0].truth.items()
-        },
-    )
-
-
-def interleaved(realisations: list[Formed]) -> Formed:
+def interleaved(realisations: Sequence[TranslatedPulses]) -> TranslatedPulses:
     """Realisations of the same pulses as numbered rows: all of a pulse, then of the next."""
     if len(realisations) == 1:
         return realisations[0]
     number, given = len(realisations), len(realisations[0].codes)
     rows = np.arange(number * given).reshape(number, given).T.ravel()
-    whole = joined(realisations)
+    whole = TranslatedPulses.joined(realisations)
     truth = {name: (values[rows], units) for name, (values, units) in whole.truth.items()}
     truth["realisation"] = (np.tile(np.arange(number), given), "")
-    return Formed(whole.pulses[rows], whole.codes[rows], whole.saturated[rows], truth)
+    saturated = None if whole.saturated is None else whole.saturated[rows]
+    return TranslatedPulses(whole.pulses[rows], whole.codes[rows], saturated, truth)
 
 
 def to_adc(
@@ -290,12 +246,12 @@ def to_adc(
     return counts.clip(0, HIGHEST).astype(np.uint16), saturated
 
 
-def adc_scale(run: Run, ren: REN, adc: Adc) -> tuple[float, float]:
+def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]:
     """ADC counts per prepared unit and keV, and baseline: as given, or those of the data.
 
     Parameters
     ----------
-    run, ren
+    run, translator
         The run, and its translator.
     adc
         Height of a fast pulse above the baseline per keV, and baseline, if they are given.
@@ -316,7 +272,7 @@ def adc_scale(run: Run, ren: REN, adc: Adc) -> tuple[float, float]:
     if cuts is not None and cuts.amplitude >= MIN_ADC:
         known_gain = None if peak is None else cuts.amplitude / peak.energy_kev
         known_baseline = {one.name: one.centre for one in cuts.windows}.get("baseline")
-    per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(ren)
+    per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(translator)
     level = known_baseline if baseline is None else baseline
     if per_kev is None:
         raise CpunetError(
@@ -327,12 +283,12 @@ def adc_scale(run: Run, ren: REN, adc: Adc) -> tuple[float, float]:
     return per_kev, level
 
 
-def _height(ren: REN) -> float:
+def _height(translator: Translator) -> float:
     """Maximum, in prepared units, of a fast pulse without noise."""
-    config = ren.recipe.preparation
+    config = translator.recipe.preparation
     time = np.arange(config.length) - config.samples_before
     ramp = np.clip(time / RISE_SAMPLES + 1, 0, 1).astype(np.float32)
-    height = float(ren.apply(ramp[np.newaxis], noise=False).max())
+    height = float(translator.apply(ramp[np.newaxis], noise=False).max())
     if not (np.isfinite(height) and height > 0):
         raise CpunetError("the run cannot translate a fast pulse; train again")
     return height
@@ -343,12 +299,6 @@ def drawn_kev(
 ) -> npt.NDArray[np.float64] | None:
     """Pile-up tails of `n` pulses in keV, drawn from the random generator of the noise."""
     return None if tails is None else tails.draw_kev(n, rng_of(generator))
-
-
-def truth_of(left: npt.NDArray[np.float64] | None, piled: InTracePileUp | None) -> Columns:
-    """Columns on tails and on piled-up pulses, as far as there are any."""
-    truth: Columns = {} if left is None else {"tails_kev": (left, "keV")}
-    return truth if piled is None else truth | piled.columns()
 
 
 def rng_of(generator: torch.Generator | None) -> np.random.Generator:

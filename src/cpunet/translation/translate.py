@@ -5,9 +5,9 @@ from __future__ import annotations
 import glob
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,6 @@ def translate(
         pile_up_khz,
     )
     files = list(_files(pulses, read, run))
-    how: dict[str, Any] = {"device": device, "resume": resume, "force": force}
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
     if out is None:
@@ -141,15 +140,15 @@ def translate(
         job.warn()
         kept, counts = job.in_memory(files[0])
         return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
+    to_files = _ToFiles(options, device, resume, force)
     if channels:
         if len(files) > 1:
             raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
-        return _of_channels(run, files[0], Path(out), options, **how)
+        return to_files.of_channels(run, files[0], Path(out))
     run = as_run(run)
     if several:
-        counts = translate_files(run, files, Path(out), options, jobs=jobs, **how)
-        return Translation(run.name, run.recipe, counts, adc, Path(out))
-    return _to_file(run, files[0], Path(out), options, **how)
+        return to_files.several(run, files, Path(out), jobs)
+    return to_files.one(run, files[0], Path(out))
 
 
 def _files(
@@ -167,99 +166,116 @@ def _files(
         yield from (pulse_file(name, read) for name in names)
 
 
-def _to_file(
-    run: Run, source: PulseFile, out: Path, options: TranslateOptions, device: str, **how: Any
-) -> Translation:
-    job = FileTranslation(run, options, device)
-    job.warn()
-    return Translation(
-        run.name, run.recipe, job(source, out, **how), options.adc is not None, out
-    )
+@dataclass(frozen=True)
+class _ToFiles:
+    """How to translate files into files; see `cpunet.translate`."""
 
+    options: TranslateOptions
+    device: str
+    resume: bool
+    force: bool
 
-def _of_channels(
-    runs: RunLike, source: PulseFile, out: Path, options: TranslateOptions, **how: Any
-) -> Outcome[Translation]:
-    """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
+    def one(
+        self, run: Run, source: PulseFile, out: Path, noise_key: str | None = None
+    ) -> Translation:
+        job = FileTranslation(run, self.options, self.device)
+        job.warn()
+        counts = job(source, out, noise_key=noise_key, resume=self.resume, force=self.force)
+        return Translation(run.name, run.recipe, counts, self.options.adc is not None, out)
 
-    A single table, such as a simulation that serves all channels, is translated with each
-    run.  The noise depends on the seed and the name of the channel, so that of channels
-    differs.
-    """
-    channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
-    if len(channels) == 1 and not isinstance(runs, Run):
-        own = (own_folder(Path(runs), name, INFO).is_dir() for name in channels)
-        if not any(own):
-            (single,) = channels.values()
-            trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
-            channels = dict.fromkeys(trained, single) or channels
-    return each_channel(channels, out, partial(_of_channel, runs, options, how))
+    def of_channels(self, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:
+        """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
 
+        A single table, such as a simulation that serves all channels, is translated with each
+        run.  The noise depends on the seed and the name of the channel, so that of channels
+        differs.
+        """
+        channels: dict[str, Pair] = {n: (one, one) for n, one in channels_of(source).items()}
+        if len(channels) == 1 and not isinstance(runs, Run):
+            own = (own_folder(Path(runs), name, INFO).is_dir() for name in channels)
+            if not any(own):
+                (single,) = channels.values()
+                trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
+                channels = dict.fromkeys(trained, single) or channels
+        return each_channel(channels, out, partial(self.of_channel, runs))
 
-def _of_channel(
-    runs: RunLike,
-    options: TranslateOptions,
-    how: Mapping[str, Any],
-    name: str,
-    pair: Pair,
-    place: Path,
-) -> Translation:
-    run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-    target = place.with_name(f"{name}.lh5")
-    return _to_file(as_run(run), pair[0], target, options, noise_key=name, **how)
+    def of_channel(self, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
+        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
+        return self.one(as_run(run), pair[0], place.with_name(f"{name}.lh5"), name)
 
+    def several(
+        self, run: Run, sources: Sequence[PulseFile], out: Path, jobs: int
+    ) -> Translation:
+        """Translate files into files of the same names in a folder.
 
-def translate_files(
-    run: Run,
-    sources: Sequence[PulseFile],
-    out: Path,
-    options: TranslateOptions,
-    *,
-    jobs: int,
-    device: str,
-    **how: bool,
-) -> Counts:
-    """Translate files into files of the same names in a folder.
+        The output depends on the seed and the name of a file, not on the number of processes
+        or on the other files.  A file that cannot be translated does not stop the others.
 
-    The output depends on the seed and the name of a file, not on the number of processes or on
-    the other files.  A file that cannot be translated does not stop the others.
+        Raises
+        ------
+        CpunetError
+            Before the translation, if the run cannot be used, or outputs exist (without
+            `resume` or `force`) or would have the same names; at the end, if files failed.
+        """
+        tasks = [(source, out / _name(source.path)) for source in sources]
+        if out.exists() and not out.is_dir():
+            raise CpunetError(f"{out}: is a file, but several outputs need a folder")
+        self._check(tasks, run.folder)
+        FileTranslation(run, self.options, self.device).warn()  # what is wrong is said once
+        done: list[Counts] = []
+        failed: list[str] = []
+        with (
+            stage("Translating", len(tasks)) as bar,
+            closing(outcomes(partial(self.work, run), tasks, jobs, once=True)) as found,
+        ):
+            for (source, target), outcome in found:
+                bar.update()
+                if isinstance(outcome, CpunetError):
+                    text = str(outcome)
+                    named = str(source.path) in text or str(target) in text
+                    failed.append(text if named else f"{source.path}: {text}")
+                    log.error(failed[-1])
+                else:
+                    done.append(outcome)
+        if failed:
+            others = f"; {len(done)} are in {out}" if done else ""
+            raise CpunetError(
+                f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{others}; "
+                "continue with `resume`"
+            )
+        counts = replace(sum(done, Counts()), files=len(done))
+        return Translation(run.name, run.recipe, counts, self.options.adc is not None, out)
 
-    For the parameters see `cpunet.translate`; `how` are its ``resume`` and ``force``.
+    def work(self, run: Run) -> Callable[[Task], Counts]:
+        """Return a function that translates a file after the other."""
+        translation = FileTranslation(run, self.options, self.device)
+        how = {"resume": self.resume, "force": self.force}
+        return lambda task: translation(task[0], task[1], noise_key=task[1].name, **how)
 
-    Raises
-    ------
-    CpunetError
-        Before the translation, if the run cannot be used, or outputs exist (without `resume`
-        or `force`) or would have the same names; at the end, if files failed.
-    """
-    tasks = [(source, out / _name(source.path)) for source in sources]
-    if out.exists() and not out.is_dir():
-        raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-    _check(tasks, run.folder, **how)
-    make = partial(_work_of, run, options, device, how)
-    FileTranslation(run, options, device).warn()  # what cannot be used is refused once
-    done: list[Counts] = []
-    failed: list[str] = []
-    with (
-        stage("Translating", len(tasks)) as bar,
-        closing(outcomes(make, tasks, jobs, once=True)) as found,
-    ):
-        for (source, target), outcome in found:
-            bar.update()
-            if isinstance(outcome, CpunetError):
-                text = str(outcome)
-                named = str(source.path) in text or str(target) in text
-                failed.append(text if named else f"{source.path}: {text}")
-                log.error(failed[-1])
-            else:
-                done.append(outcome)
-    if failed:
-        others = f"; {len(done)} are in {out}" if done else ""
-        raise CpunetError(
-            f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{others}; "
-            "continue with `resume`"
-        )
-    return replace(sum(done, Counts()), files=len(done))
+    def _check(self, tasks: Sequence[Task], run: Path | None) -> None:
+        """Raise a `CpunetError` if an output is an input, exists, or has the name of another.
+
+        Thousands of files are compared by their identity, and not each with each other.
+        """
+        several = [name for name, n in Counter(out.name for _, out in tasks).items() if n > 1]
+        if several:
+            raise CpunetError(
+                f"{len(several)} names occur twice among the files, as {several[0]}; "
+                "translate these into folders of their own"
+            )
+        shared = next((s.energy for s, _ in tasks if s.energy and ":" in s.energy), None)
+        if shared is not None and len(tasks) > 1:
+            raise CpunetError(
+                f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
+                "translate them one by one"
+            )
+        inputs = {_identity(source.path) for source, _ in tasks} - {None}
+        for source, out in tasks:
+            refuse_inputs(out, run, *source.files)
+            if _identity(out) in inputs:
+                raise CpunetError(f"{out}: is the input; choose another `out`")
+            if not self.resume:
+                refuse_existing(out, force=self.force)
 
 
 def expanded(name: Path) -> list[Path]:
@@ -278,42 +294,8 @@ def expanded(name: Path) -> list[Path]:
     return [*map(Path, fitting)]
 
 
-def _work_of(
-    run: Run, options: TranslateOptions, device: str, how: Mapping[str, bool]
-) -> Callable[[Task], Counts]:
-    """Return a function that translates a file after the other."""
-    translation = FileTranslation(run, options, device)
-    return lambda task: translation(task[0], task[1], noise_key=task[1].name, **how)
-
-
 def _name(path: Path) -> str:
     return path.name if path.suffix.lower() in OF_HDF5 else f"{path.stem}.lh5"
-
-
-def _check(tasks: Sequence[Task], run: Path | None, *, resume: bool, force: bool) -> None:
-    """Raise a `CpunetError` if an output is an input, exists, or has the name of another.
-
-    Thousands of files are compared by their identity, and not each with each other.
-    """
-    several = [name for name, n in Counter(out.name for _, out in tasks).items() if n > 1]
-    if several:
-        raise CpunetError(
-            f"{len(several)} names occur twice among the files, as {several[0]}; "
-            "translate these into folders of their own"
-        )
-    shared = next((s.energy for s, _ in tasks if s.energy and ":" in s.energy), None)
-    if shared is not None and len(tasks) > 1:
-        raise CpunetError(
-            f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
-            "translate them one by one"
-        )
-    inputs = {_identity(source.path) for source, _ in tasks} - {None}
-    for source, out in tasks:
-        refuse_inputs(out, run, *source.files)
-        if _identity(out) in inputs:
-            raise CpunetError(f"{out}: is the input; choose another `out`")
-        if not resume:
-            refuse_existing(out, force=force)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

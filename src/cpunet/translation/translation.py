@@ -23,7 +23,7 @@ from cpunet.pulses.shape_parameters import MAX_BINS, all_parameters, data_axis, 
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.file_translation import Counts
-from cpunet.translation.forms import Formed
+from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -58,7 +58,7 @@ class Translation:
     counts: Counts
     adc: bool = False
     path: Path | None = None
-    kept: Formed | None = None
+    kept: TranslatedPulses | None = None
     writer: Callable[..., PulseWriter] | None = None
 
     @cached_property

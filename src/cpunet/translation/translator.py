@@ -8,8 +8,8 @@ of any length are accepted.  Preparation leaves prepared pulses unchanged.
 from __future__ import annotations
 
 import warnings
-from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Self, TypeVar
 
@@ -17,11 +17,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
+from cpunet.electronics.drawn_pile_up import Columns, DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
 from cpunet.recipes.schema import Recipe
+from cpunet.tables import counted
 from cpunet.training.run import Run
 from cpunet.translation.backends import Backend, Drawn, Energies, backend_of
 
@@ -42,39 +43,78 @@ class TranslatedPulses:
     Parameters
     ----------
     pulses
-        Windows of shape (n, samples); rows of NaN for rejected pulses.
+        Windows or traces of shape (n, samples); rows of NaN, or of 0 in ADC, for rejected
+        pulses.
     codes
         A `Rejection` for each row.
+    saturated
+        Mask of the traces that reach an end of the digitiser's range; None for windows.
+    truth
+        What is known of each pulse, arrays of shape (n,) with their units: ``tails_kev``
+        with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
+        pulses, see `InTracePileUp.largest`; ``realisation`` with several.
     """
 
     pulses: Pulses
     codes: Codes
+    saturated: npt.NDArray[np.bool_] | None = None
+    truth: Columns = field(default_factory=dict)
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
         """Mask of the translated rows."""
         return np.asarray(self.codes == Rejection.ACCEPTED)
 
-    def reasons(self) -> str:
-        """Numbers of rejected rows by reason, as text."""
-        counts = Counter(self.codes[~self.valid].tolist())
-        labels = ((n, Rejection(code).label.replace("_", " ")) for code, n in counts.items())
-        return ", ".join(f"{n} {label}" for n, label in labels)
+    @property
+    def rejections(self) -> dict[str, int]:
+        """Numbers of rejected rows by reason."""
+        counts = np.bincount(self.codes).tolist()
+        return {Rejection(code).label: n for code, n in enumerate(counts) if code and n}
+
+    @property
+    def columns(self) -> Columns:
+        """Columns to be stored beside the pulses."""
+        return {"rejection": (self.codes, ""), **self.truth}
+
+    @classmethod
+    def joined(cls, blocks: Sequence[Self]) -> Self:
+        """The rows of all blocks."""
+        masks = [block.saturated for block in blocks if block.saturated is not None]
+        return cls(
+            Pulses.concatenate([block.pulses for block in blocks]),
+            np.concatenate([block.codes for block in blocks]),
+            np.concatenate(masks) if masks else None,
+            {
+                name: (np.concatenate([block.truth[name][0] for block in blocks]), units)
+                for name, (_, units) in blocks[0].truth.items()
+            },
+        )
 
 
 class Translator:
     """A trained generator with the preparation that it was trained on.
 
     Use `REN.of` with a run, or `REN.load` with its folder.
+
+    Attributes
+    ----------
+    backend
+        Network, readout chain or inverse.
+    recipe, dt_ns
+        Recipe of the run, and sampling period in ns.
+    needs_energies
+        Whether the noise depends on the energies.
+    tails
+        Pile-up tails as learned by the run; None if it has no information.
     """
 
     part: ClassVar[str]
     takes: ClassVar[Kind]
 
     def __init__(self, backend: Backend, recipe: Recipe, dt_ns: float) -> None:
-        self.backend = backend
-        self.recipe = recipe
-        self.dt_ns = dt_ns
+        self.backend, self.recipe, self.dt_ns = backend, recipe, dt_ns
+        self.needs_energies = backend.needs_energies
+        self.tails: DrawnTails | None = backend.tails
 
     @classmethod
     def of(cls, run: Run, device: str = "cpu") -> Self:
@@ -160,12 +200,13 @@ class Translator:
         done = self.translate_pulses(
             pulses, noise=noise, generator=self.seeded(seed), tails_kev=left
         )
-        if array.ndim == 1 and not done.valid[0]:
-            raise CpunetError(f"the pulse cannot be translated: {done.reasons()}")
-        if not done.valid.all():
+        reasons = counted(done.rejections)
+        if array.ndim == 1 and reasons:
+            raise CpunetError(f"the pulse cannot be translated: {reasons}")
+        if reasons:
             warnings.warn(
                 f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
-                f"translated and are rows of NaN: {done.reasons()}",
+                f"translated and are rows of NaN: {reasons}",
                 RejectionWarning,
                 stacklevel=2,
             )
@@ -181,7 +222,6 @@ class Translator:
         noise: bool = True,
         generator: torch.Generator | None = None,
         tails_kev: Energies | None = None,
-        piled: InTracePileUp | None = None,
     ) -> TranslatedPulses:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
 
@@ -196,27 +236,29 @@ class Translator:
             Random generator of the noise.
         tails_kev
             Pile-up tails under each pulse in keV, shape ``(n,)``.
-        piled
-            Piled-up pulses within the records.
 
         Raises
         ------
         CpunetError
             If the sampling period is not that of the training.
         """
+        drawn = Drawn(pulses.energy_kev, noise, generator, tails_kev)
+        return self.translate_drawn(pulses, drawn)
+
+    def translate_drawn(self, pulses: Pulses, drawn: Drawn) -> TranslatedPulses:
+        """Like `translate_pulses`, with all that is drawn."""
         self.require_sampling("pulses", pulses.dt_ns)
         prepared = prepare(pulses, self.recipe.preparation, self.takes)
         length = self.recipe.preparation.length
         codes = prepared.codes.copy()
-        if noise and self.needs_energies:
+        if drawn.noise and self.needs_energies:
             unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
             codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
         rows = codes[prepared.index] == Rejection.ACCEPTED
         waveforms = np.full((len(pulses), length), np.nan, np.float32)
         index = prepared.index[rows]
         waveforms[index], codes[index] = self.apply_with_codes(
-            prepared.pulses.waveforms[rows],
-            Drawn(pulses.energy_kev, noise, generator, tails_kev, piled).of_rows(index),
+            prepared.pulses.waveforms[rows], drawn.of_rows(index)
         )
         return TranslatedPulses(pulses.with_waveforms(waveforms), codes)
 
@@ -227,16 +269,6 @@ class Translator:
                 f"{what} sampled every {dt_ns:g} ns, the run was trained on {self.dt_ns:g} ns; "
                 "resample the pulses"
             )
-
-    @property
-    def tails(self) -> DrawnTails | None:
-        """Pile-up tails as learned by the run; None if it has no information."""
-        return self.backend.tails
-
-    @property
-    def needs_energies(self) -> bool:
-        """Whether the noise depends on the energies."""
-        return self.backend.needs_energies
 
     def apply(
         self,

@@ -21,7 +21,8 @@ not, since deviations can cancel; so A/E is compared in bins of the drift time a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,10 +40,12 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.parameters import PARAMETERS, Values
-from cpunet.validation.comparisons import resampled_quantiles
+from cpunet.validation.comparisons import Missing, resampled_quantiles
 
 Range = tuple[float, float]
+Spread = tuple[float, float]  # a number and its error
 ByPeak = Mapping[str, Mapping[str, Values]]
+ByMethod = dict[str, float]
 
 ACCEPTANCE = 0.9  # fraction of the DEP that survives
 MIN_EVENTS = 20  # events of the DEP: two below the cut
@@ -55,35 +58,104 @@ LINEAR = 1.0  # percent, up to which the scale of the ratios is linear if some a
 FAR = 5  # times LINEAR: larger ratios count as large
 
 
-class PeakSurvival(NamedTuple):
-    """Survival of one peak after the cut.
+@dataclass(frozen=True)
+class SurvivalRow:
+    """Survival of one peak, by method and for the ``data``; NaN where there is none.
 
     Attributes
     ----------
-    survival, std
-        Survival and its error in percent; NaN without events.  The error combines those of
-        the number of survivors and of the cut in quadrature.
-    """
-
-    survival: float
-    std: float
-
-
-class Survival(NamedTuple):
-    """The cut and the survival of each peak.
-
-    Attributes
-    ----------
+    events, missing
+        Number of events with and without a finite amplitude.
     cut, cut_std
-        Lowest A/E that survives, in pulse heights per sample, and its error; NaN if fewer
-        than 20 events of the DEP have an A/E.
-    peaks
-        Survival of the other peaks.
+        Of the DEP only, see `ae_survival`.
+    survival, survival_std
+        Of the other peaks, in percent.
+    difference, difference_std, sigma
+        Method minus data in percentage points, and the same divided by its error.
     """
 
-    cut: float
-    cut_std: float
-    peaks: dict[str, PeakSurvival]
+    events: dict[str, int]
+    missing: dict[str, int]
+    cut: ByMethod | None = None
+    cut_std: ByMethod | None = None
+    survival: ByMethod | None = None
+    survival_std: ByMethod | None = None
+    difference: ByMethod | None = None
+    difference_std: ByMethod | None = None
+    sigma: ByMethod | None = None
+
+
+@dataclass(frozen=True)
+class RangeSurvival:
+    """Survival of a gamma line or of a range of energies.
+
+    Attributes
+    ----------
+    peak, peak_pass, sideband, sideband_pass
+        Numbers of events in the range and in the sidebands, and of those that survive.
+    scale
+        Width of the range over that of the sidebands.
+    undefined
+        Events there without a finite amplitude, which are not counted.
+    survival, survival_std
+        Survival in percent, and its error without that of the cut.
+    missing
+        Reason why there is none.
+    """
+
+    peak: int
+    peak_pass: int
+    sideband: int
+    sideband_pass: int
+    scale: float
+    undefined: int
+    survival: float | None = None
+    survival_std: float | None = None
+    missing: str | None = None
+
+
+@dataclass(frozen=True)
+class TimeBin:
+    """A/E of the events of a bin of drift time.
+
+    Attributes
+    ----------
+    n, time_ns
+        Number of events, and their median drift time.
+    q16, median, q84
+        Quantiles of A/E, with their errors.
+    missing
+        Reason why there are none.
+    """
+
+    n: int
+    time_ns: float | None = None
+    q16: float | None = None
+    q16_error: float | None = None
+    median: float | None = None
+    median_error: float | None = None
+    q84: float | None = None
+    q84_error: float | None = None
+    missing: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class AgainstTime:
+    """A/E in bins of drift time.
+
+    Attributes
+    ----------
+    edges_ns
+        Edges of the bins.
+    left_out
+        Number of events by method outside the edges, or without finite amplitude or time.
+    methods
+        Bins of each method and of the data.
+    """
+
+    edges_ns: Values
+    left_out: dict[str, int]
+    methods: Mapping[str, list[TimeBin]]
 
 
 def ae_survival(
@@ -92,7 +164,7 @@ def ae_survival(
     *,
     bootstraps: int = BOOTSTRAPS,
     seed: int | np.random.Generator = 0,
-) -> Survival:
+) -> tuple[float, float, dict[str, Spread]]:
     r"""Survival of other peaks after a low-A/E cut that keeps 90 % of the DEP.
 
     The acceptance is exact on average for *new* events of the same kind, however few events
@@ -117,38 +189,34 @@ def ae_survival(
 
     Returns
     -------
-    Survival
-        Cut, and survival in percent by peak.
+    cut, cut_std
+        Lowest A/E that survives, in pulse heights per sample, and its error; NaN if fewer
+        than 20 events of the DEP have an A/E.
+    peaks
+        Survival of the other peaks in percent and its error; NaN without events.  The error
+        combines those of the number of survivors and of the cut in quadrature.
 
     Examples
     --------
     Of 99 equidistant values the cut is the 10th, and 90 of the 99 survive:
 
     >>> ae = np.arange(1.0, 100.0)
-    >>> found = ae_survival(ae, {"SEP": ae})
-    >>> round(found.cut, 6), round(found.peaks["SEP"].survival, 2)
+    >>> cut, _, peaks = ae_survival(ae, {"SEP": ae})
+    >>> round(cut, 6), round(peaks["SEP"][0], 2)
     (10.0, 90.91)
     """
     dep = dep_ae[np.isfinite(dep_ae)]
     if dep.size < MIN_EVENTS:
-        return Survival(np.nan, np.nan, dict.fromkeys(others, PeakSurvival(np.nan, np.nan)))
+        return np.nan, np.nan, dict.fromkeys(others, (np.nan, np.nan))
     rng = np.random.default_rng(seed)
     # for this quantile the acceptance of new events is exact on average for any sample size
     cut = float(np.quantile(dep, 1 - ACCEPTANCE, method="weibull"))
     cuts = resampled_quantiles(dep, 1 - ACCEPTANCE, bootstraps, rng)
-    return Survival(
-        cut=cut,
-        cut_std=float(cuts.std(ddof=1)),
-        peaks={name: _peak_survival(values, cut, cuts) for name, values in others.items()},
-    )
+    peaks = {name: _peak_survival(values, cut, cuts) for name, values in others.items()}
+    return cut, float(cuts.std(ddof=1)), peaks
 
 
-def survival_table(
-    ae: ByPeak,
-    *,
-    bootstraps: int = BOOTSTRAPS,
-    seed: int | np.random.Generator = 0,
-) -> dict[str, Any]:
+def survival_table(ae: ByPeak, seed: int = 0) -> dict[str, SurvivalRow] | Missing:
     """Survival of each peak in data and simulations, each after its own cut.
 
     Since each dataset has its own cut, a wrong scale of A/E alone makes no difference.
@@ -158,32 +226,11 @@ def survival_table(
     ae
         A/E by peak and method, the measured ones under ``"data"``.  Methods that lack a peak
         are left out.
-    bootstraps, seed
-        Number and seed of the bootstraps for the errors of the cuts.
-
-    Returns
-    -------
-    dict
-        For each peak, JSON-ready (``None`` where a number does not exist):
-
-        ``events``, ``missing``
-            number of events with and without a finite amplitude, by method and for the
-            ``data``.
-        ``cut``, ``cut_std``
-            for the DEP only, by method and for the ``data``, in pulse heights per sample.
-            The cut and all numbers derived from it are None if fewer than 20 events of the
-            DEP have an amplitude.
-        ``survival``, ``survival_std``
-            for the other peaks in percent, by method and for the ``data``.
-        ``difference``, ``difference_std``
-            method minus data, in percentage points.
-        ``sigma``
-            difference divided by its error.
-
-        Or ``missing`` with the reason, without the DEP.
+    seed
+        Seed of the bootstraps for the errors of the cuts.
     """
     if DEP not in ae:
-        return {"missing": f"the data lack peak {DEP}; the A/E cut needs it"}
+        return Missing(f"the data lack peak {DEP}; the A/E cut needs it")
     rng = np.random.default_rng(seed)
     methods = [
         m for m in next(iter(ae.values())) if all(m in of_peak for of_peak in ae.values())
@@ -193,26 +240,20 @@ def survival_table(
         method: ae_survival(
             ae[DEP][method],
             {name: of_peak[method] for name, of_peak in ae.items() if name != DEP},
-            bootstraps=bootstraps,
             seed=rng,
         )
         for method in methods
     }
-    table: dict[str, Any] = {}
+    table = {}
     for name, of_peak in ae.items():
-        finite = {m: int(np.isfinite(of_peak[m]).sum()) for m in methods}
-        rows = (
-            {row: {m: getattr(s, row) for m, s in found.items()} for row in ("cut", "cut_std")}
-            if name == DEP
-            else _survival_rows(name, found)
-        )
-        table[name] = {
-            "events": finite,
-            "missing": {m: len(of_peak[m]) - finite[m] for m in methods},
-        } | {
-            row: {m: float(v) if np.isfinite(v) else None for m, v in numbers.items()}
-            for row, numbers in rows.items()
-        }
+        events = {m: int(np.isfinite(of_peak[m]).sum()) for m in methods}
+        row = SurvivalRow(events, {m: len(of_peak[m]) - events[m] for m in methods})
+        if name == DEP:
+            cuts = {m: cut for m, (cut, _, _) in found.items()}
+            errors = {m: std for m, (_, std, _) in found.items()}
+            table[name] = replace(row, cut=cuts, cut_std=errors)
+        else:
+            table[name] = _against_data(row, {m: s[2][name] for m, s in found.items()})
     return table
 
 
@@ -222,7 +263,7 @@ def peak_survival(
     cut: float,
     peak: Range,
     sidebands: Sequence[Range] = (),
-) -> dict[str, Any]:
+) -> RangeSurvival:
     """Survival of a gamma line after a low-A/E cut, with its background subtracted.
 
     Without sidebands, as for a range of the continuum, nothing is subtracted.
@@ -237,78 +278,28 @@ def peak_survival(
         Range of the line in keV: lower end (included) and upper end (excluded).
     sidebands
         Ranges in keV beside the line that contain only background.
-
-    Returns
-    -------
-    dict
-        JSON-ready: ``survival`` and ``survival_std`` in percent (without the error of the
-        cut); ``peak``, ``peak_pass``, ``sideband``, ``sideband_pass``, the numbers of events
-        in the ranges and of those that survive; ``scale``, the width of the peak's range over
-        that of the sidebands; ``undefined``, events in the ranges without a finite amplitude,
-        which are not counted.  If the survival is undefined, ``missing`` with the reason.
     """
     finite = np.isfinite(amplitude)
-    in_peak = _within(energy_kev, [peak])
-    beside = _within(energy_kev, sidebands)
-    survives = finite & (np.where(finite, amplitude, -np.inf) >= cut)
-    counts = {
-        "peak": int((finite & in_peak).sum()),
-        "peak_pass": int((survives & in_peak).sum()),
-        "sideband": int((finite & beside).sum()),
-        "sideband_pass": int((survives & beside).sum()),
-    }
+    in_peak, beside = _within(energy_kev, [peak]), _within(energy_kev, sidebands)
+    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, beside))
+    survives = finite & (amplitude >= cut)
+    passing, side_pass = (int((survives & inside).sum()) for inside in (in_peak, beside))
     width = sum(high - low for low, high in sidebands)
     scale = (peak[1] - peak[0]) / width if width else 0.0
-    result: dict[str, Any] = {
-        **counts,
-        "scale": scale,
-        "undefined": int((~finite & (in_peak | beside)).sum()),
-    }
+    undefined = int((~finite & (in_peak | beside)).sum())
+    found = RangeSurvival(n, passing, n_side, side_pass, scale, undefined)
     span = f"from {peak[0]:g} to {peak[1]:g} keV"
     if not np.isfinite(cut):
         missing = "there is no cut: too few events of the double-escape peak"
-        return result | {"missing": missing}
-    if not counts["peak"]:
-        return result | {"missing": f"no events {span}"}
-    n, passing = counts["peak"], counts["peak_pass"]
-    survival, std = sideband_survival(
-        passing, n, counts["sideband_pass"], counts["sideband"], scale
-    )
+        return replace(found, missing=missing)
+    if not n:
+        return replace(found, missing=f"no events {span}")
+    survival, std = sideband_survival(passing, n, side_pass, n_side, scale)
     if not np.isfinite(survival):
-        return result | {"missing": f"the sidebands leave no events of {n} {span}"}
+        return replace(found, missing=f"the sidebands leave no events of {n} {span}")
     if not scale or not std:
         std = 100 * survival_error(passing, n)
-    return result | {"survival": survival, "survival_std": std}
-
-
-def survival_by_range(
-    amplitude: Mapping[str, Values],
-    energy_kev: Mapping[str, Values],
-    cuts: Mapping[str, float],
-    ranges: Mapping[str, tuple[Range, Sequence[Range]]],
-) -> dict[str, dict[str, Any]]:
-    """`peak_survival` of every line and range, by method.
-
-    Parameters
-    ----------
-    amplitude, energy_kev, cuts
-        Amplitudes, energies in keV and cut by method; each method has its own cut (see
-        `ae_survival`), NaN if it has none.
-    ranges
-        Range and sidebands of each gamma line in keV, by name; a continuum has no sidebands.
-
-    Returns
-    -------
-    dict
-        Results of `peak_survival` by name and method.
-    """
-    return {
-        name: {
-            method: peak_survival(values, energy_kev[method], cuts[method], span, sidebands)
-            for method, values in amplitude.items()
-        }
-        for name, (span, sidebands) in ranges.items()
-    }
+    return replace(found, survival=survival, survival_std=std)
 
 
 def sideband_survival(
@@ -366,30 +357,32 @@ def survival_error(passing: int, n: int) -> float:
     return float(np.sqrt(p * (1 - p) / (n + 3)))
 
 
-def _peak_survival(values: Values, cut: float, cuts: Values) -> PeakSurvival:
+def _peak_survival(values: Values, cut: float, cuts: Values) -> Spread:
     finite = np.sort(values[np.isfinite(values)])
     n = finite.size
     if not n:
-        return PeakSurvival(float("nan"), float("nan"))
+        return np.nan, np.nan
     passing = n - int(np.searchsorted(finite, cut))
     of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
     error = float(100 * np.hypot(survival_error(passing, n), of_cut))
-    return PeakSurvival(100 * passing / n, error)
+    return 100 * passing / n, error
 
 
-def _survival_rows(name: str, found: Mapping[str, Survival]) -> dict[str, dict[str, float]]:
-    values = {m: s.peaks[name].survival for m, s in found.items()}
-    errors = {m: s.peaks[name].std for m, s in found.items()}
-    methods = [m for m in found if m != "data"]
-    difference = {m: values[m] - values["data"] for m in methods}
-    std = {m: float(np.hypot(errors[m], errors["data"])) for m in methods}
-    return {
-        "survival": values,
-        "survival_std": errors,
-        "difference": difference,
-        "difference_std": std,
-        "sigma": {m: difference[m] / std[m] for m in methods},
-    }
+def _against_data(row: SurvivalRow, found: Mapping[str, Spread]) -> SurvivalRow:
+    (data, data_std), difference, std, sigma = found["data"], {}, {}, {}
+    for method, (survival, error) in found.items():
+        if method != "data":
+            difference[method] = survival - data
+            std[method] = float(np.hypot(error, data_std))
+            sigma[method] = difference[method] / std[method]
+    return replace(
+        row,
+        survival={m: survival for m, (survival, _) in found.items()},
+        survival_std={m: error for m, (_, error) in found.items()},
+        difference=difference,
+        difference_std=std,
+        sigma=sigma,
+    )
 
 
 def _within(energy_kev: Values, ranges: Sequence[Range]) -> npt.NDArray[np.bool_]:
@@ -401,7 +394,7 @@ def _within(energy_kev: Values, ranges: Sequence[Range]) -> npt.NDArray[np.bool_
 
 def ae_against_drift_time(
     amplitude: Mapping[str, Values], drift_time: Mapping[str, Values], bins: int = TIME_BINS
-) -> dict[str, Any]:
+) -> AgainstTime:
     """Median and 16 and 84 % quantiles of A/E in bins of the drift time, by method.
 
     Parameters
@@ -411,14 +404,6 @@ def ae_against_drift_time(
         of the measured pulses are under ``"data"``.
     bins
         Number of bins, with equal numbers of measured pulses.
-
-    Returns
-    -------
-    dict
-        JSON-ready: ``edges_ns`` of the bins; ``left_out``, the number of events by method that
-        are outside the edges or lack a finite amplitude or time; and ``methods``, for each
-        method and the data a list of bins with ``n``, ``time_ns`` (median), and ``q16``,
-        ``median`` and ``q84`` with ``…_error`` of each; or ``missing`` with the reason.
     """
     known = {m: np.isfinite(ae) & np.isfinite(drift_time[m]) for m, ae in amplitude.items()}
     edges = np.quantile(drift_time["data"][known["data"]], np.linspace(0, 1, bins + 1))
@@ -430,15 +415,11 @@ def ae_against_drift_time(
         chosen = [inside & (place == i) for i in range(bins)]
         methods[method] = [_bin(ae[rows], time[rows]) for rows in chosen]
         left_out[method] = len(amplitude[method]) - int(inside.sum())
-    return {
-        "edges_ns": [float(edge) for edge in edges],
-        "left_out": left_out,
-        "methods": methods,
-    }
+    return AgainstTime(edges, left_out, methods)
 
 
 @styled
-def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
+def ae_figure(table: AgainstTime, peak: str) -> Figure:
     """Median A/E against drift time with its error, and the range from 16 to 84 %.
 
     Parameters
@@ -448,17 +429,16 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
     peak
         Name of the gamma line, for the title.
     """
-    methods = table["methods"]
+    methods = table.methods
     palette = colours(methods)
     figure, above, below = stacked((6.4, 5.4), left=1.1, top=legend_height(len(methods), 3))
     ratios: list[float] = []
     for method, rows in methods.items():
-        known = [row for row in rows if "missing" not in row]
+        known = [row for row in rows if row.missing is None]
         if not known:
             continue
-        time, median, low, high, error = (
-            np.array([row[key] for row in known], float)
-            for key in ("time_ns", "median", "q16", "q84", "median_error")
+        time, median, low, high, error = columns_of(
+            known, "time_ns", "median", "q16", "q84", "median_error"
         )
         look = {"color": palette[method], "marker": "o", "markersize": 3.5}
         group(above.errorbar(time, median, error, label=label(method), **look), method)
@@ -468,7 +448,7 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
         if method != "data":
             points = _ratio(rows, methods["data"])
             group(below.errorbar(*points, **look), method)
-            ratios += points[1]
+            ratios += points[1].tolist()
     below.axhline(0, color="black", linewidth=0.8)
     above.set(ylabel=PARAMETERS["current_amplitude"].axis_label)
     below.set(
@@ -482,27 +462,32 @@ def ae_figure(table: Mapping[str, Any], peak: str) -> Figure:
     return figure
 
 
-def _bin(ae: Values, time: Values) -> dict[str, Any]:
+def _bin(ae: Values, time: Values) -> TimeBin:
     n = len(ae)
     if n < MIN_IN_BIN:
-        return {"n": n, "missing": f"{n} events (at least {MIN_IN_BIN} are needed)"}
-    row: dict[str, Any] = {"n": n, "time_ns": float(np.median(time))}
+        return TimeBin(n, missing=f"{n} events (at least {MIN_IN_BIN} are needed)")
+    found: dict[str, Any] = {}
     for name, p in QUANTILES.items():
         # scatter of the rank of a quantile, which is independent of the distribution
         stray = np.sqrt(p * (1 - p) / n)
         low, high = np.quantile(ae, np.clip([p - stray, p + stray], 0, 1))
-        row |= {name: float(np.quantile(ae, p)), f"{name}_error": float((high - low) / 2)}
-    return row
+        found |= {name: float(np.quantile(ae, p)), f"{name}_error": float((high - low) / 2)}
+    return TimeBin(n, float(np.median(time)), **found)
 
 
-def _ratio(rows: list[Any], data: list[Any]) -> tuple[list[float], list[float], list[float]]:
+def _ratio(rows: Sequence[TimeBin], data: Sequence[TimeBin]) -> Values:
     """Time, deviation of the median from that of the data in percent, and its error."""
-    points: list[tuple[float, float, float]] = []
-    for row, measured in zip(rows, data, strict=True):
-        if "missing" in row or "missing" in measured or not measured["median"]:
-            continue
-        ratio = row["median"] / measured["median"]
-        own = row["median_error"] / measured["median"]
-        other = ratio * measured["median_error"] / measured["median"]
-        points.append((row["time_ns"], 100 * (ratio - 1), 100 * float(np.hypot(own, other))))
-    return [p[0] for p in points], [p[1] for p in points], [p[2] for p in points]
+    time, median, error = columns_of(rows, "time_ns", "median", "median_error")
+    measured, other = columns_of(data, "median", "median_error")
+    known = np.isfinite(median) & np.isfinite(measured) & (measured != 0)
+    time, median, error, measured, other = (
+        values[known] for values in (time, median, error, measured, other)
+    )
+    ratio = median / measured
+    spread = np.hypot(error / measured, ratio * other / measured)
+    return np.stack([time, 100 * (ratio - 1), 100 * spread])
+
+
+def columns_of(rows: Sequence[Any], *names: str) -> Values:
+    """Fields of objects as rows of an array; NaN for None."""
+    return np.array([[getattr(row, name) for row in rows] for name in names], float)

@@ -8,8 +8,7 @@ width decreases too, since noise matters less.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
@@ -18,12 +17,13 @@ from scipy.special import expit, log_ndtr, ndtr
 
 from cpunet.plotting import GROUP, colours, group, label, stacked, styled
 from cpunet.pulses.parameters import Values
-from cpunet.validation.a_over_e import DEP, Range
+from cpunet.validation.a_over_e import DEP, Range, columns_of
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
 MIN_EVENTS = 60  # minimum number of events in a fit
 BELOW, ABOVE = 6.0, 4.0  # range of the fit in widths of the peak
+FITTED = ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
 REFERENCE_KEV = 1592.5  # where A/E is 1: the double-escape peak
 
 
@@ -51,11 +51,88 @@ class SiteFit:
     n: int
 
 
+@dataclass(frozen=True)
+class MeanLine:
+    """Straight line ``a E + b`` through the means, which is 1 at 1592.5 keV.
+
+    Attributes
+    ----------
+    a, a_error, b
+        Slope per keV with its error, and constant.
+    per_mev_percent, per_mev_error_percent
+        The slope in percent per MeV.
+    chi_square, degrees
+        Of the fit, and its degrees of freedom.
+    """
+
+    a: float
+    b: float
+    a_error: float
+    per_mev_percent: float
+    per_mev_error_percent: float
+    chi_square: float
+    degrees: int
+
+
+@dataclass(frozen=True)
+class WidthLaw:
+    """Relative width ``sqrt(a + (b/E)**c)``, and its value at 1592.5 keV in percent."""
+
+    a: float
+    b: float
+    c: float
+    at_reference_percent: float
+
+    def of(self, energy_kev: Values) -> Values:
+        """Relative width at some energies."""
+        return np.asarray(np.sqrt(self.a + (self.b / energy_kev) ** self.c))
+
+
+@dataclass(frozen=True)
+class Course:
+    """A/E of one method against energy.
+
+    Attributes
+    ----------
+    points
+        Fit of each range of energy.
+    scale, scale_error
+        A/E at 1592.5 keV and its error.
+    mean, resolution
+        Fits to means and widths, both relative to `scale`.
+    """
+
+    points: list[SiteFit]
+    scale: float
+    scale_error: float
+    mean: MeanLine
+    resolution: WidthLaw
+
+
+@dataclass(frozen=True)
+class AgainstEnergy:
+    """A/E against energy.
+
+    Attributes
+    ----------
+    multi_site
+        Whether lines with mostly multi-site events were fitted too.
+    methods
+        Points and fits of each method.
+    missing
+        Reason why there is nothing.
+    """
+
+    multi_site: bool | None = None
+    methods: dict[str, Course] | None = None
+    missing: str | None = None
+
+
 def against_energy(
     amplitude: Mapping[str, Values],
     energy_kev: Mapping[str, Values],
     lines_kev: Mapping[str, Range],
-) -> dict[str, Any]:
+) -> AgainstEnergy:
     """Position and width of the single-site peak against energy, by method, with fits to both.
 
     Parameters
@@ -66,16 +143,6 @@ def against_energy(
         Range of each gamma line.  Events within 8 keV of one are left out of the continuum.
         If fewer than three ranges can be fitted for all methods, the other lines are fitted
         too, although few of their events have one site.
-
-    Returns
-    -------
-    dict
-        JSON-ready: ``methods`` and ``multi_site``, whether lines with mostly multi-site events
-        were fitted too; or ``missing`` with the reason.  For each method: ``points``
-        (`SiteFit` of each range); ``mean`` with ``a`` (per keV) and ``b`` of ``a E + b``, which
-        is 1 at 1592.5 keV, ``per_mev_percent`` with its error, and ``chi_square`` for
-        ``degrees`` of freedom; ``scale``, the A/E at 1592.5 keV; ``resolution`` with ``a``,
-        ``b`` and ``c`` of ``sqrt(a + (b/E)**c)``.
     """
     lines = list(lines_kev.values())
     single_site = [span for name, span in lines_kev.items() if name == DEP]
@@ -92,15 +159,15 @@ def against_energy(
         if len(common) >= 3:
             break
     if len(common) < 2:
-        return {
-            "missing": f"A/E can be fitted in {len(common)} ranges of energy only; "
+        return AgainstEnergy(
+            missing=f"A/E can be fitted in {len(common)} ranges of energy only; "
             "it takes two that both sides have: give events of more energies"
-        }
+        )
     methods = {
-        method: _lines([p for p in found if (p.low_kev, p.high_kev) in common])
+        method: _course([p for p in found if (p.low_kev, p.high_kev) in common])
         for method, found in points.items()
     }
-    return {"multi_site": bands is all_bands, "methods": methods}
+    return AgainstEnergy(bands is all_bands, methods)
 
 
 def site_fit(
@@ -149,7 +216,7 @@ def site_fit(
 
 
 @styled
-def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
+def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
     """Relative shift and relative width of the single-site peak of A/E against energy.
 
     Parameters
@@ -160,25 +227,20 @@ def ae_energy_figure(methods: Mapping[str, Any]) -> Figure:
     figure, above, below = stacked((6.4, 5.6), top=0.15)
     palette = colours(methods)
     for method, found in methods.items():
-        points, colour = found["points"], palette[method]
-        energy, mean, error, sigma, sigma_error = (
-            np.array([point[name] for point in points], float)
-            for name in ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
-        )
-        scale, line, law = found["scale"], found["mean"], found["resolution"]
+        colour, line = palette[method], found.mean
+        energy, mean, error, sigma, sigma_error = columns_of(found.points, *FITTED)
         look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
         for axes, value, spread in (
-            (above, mean / scale - 1, error / scale),
+            (above, mean / found.scale - 1, error / found.scale),
             (below, sigma / mean, sigma_error / mean),
         ):
             group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
         along = np.linspace(energy.min(), energy.max(), 100)
-        text = f"{label(method)}: {line['per_mev_percent']:+.3f} ± "
-        text += f"{line['per_mev_error_percent']:.3f} % per MeV"
+        text = f"{label(method)}: {line.per_mev_percent:+.3f} ± "
+        text += f"{line.per_mev_error_percent:.3f} % per MeV"
         fit = {"color": colour, "gid": GROUP + method}
-        above.plot(along, 100 * (line["a"] * along + line["b"] - 1), label=text, **fit)
-        width = np.sqrt(law["a"] + (law["b"] / along) ** law["c"])
-        below.plot(along, 100 * width, **fit)
+        above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
+        below.plot(along, 100 * found.resolution.of(along), **fit)
     above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
     below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
     above.legend()
@@ -205,36 +267,30 @@ def _points(
     return sorted(found, key=lambda point: point.energy_kev)
 
 
-def _lines(points: Sequence[SiteFit]) -> dict[str, Any]:
+def _course(points: list[SiteFit]) -> Course:
     """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
-    energy, mean, error, sigma, sigma_error = (
-        np.array([getattr(p, name) for p in points])
-        for name in ("energy_kev", "mean", "mean_error", "sigma", "sigma_error")
-    )
+    energy, mean, error, sigma, sigma_error = columns_of(points, *FITTED)
     design = np.stack([energy - REFERENCE_KEV, np.ones(len(energy))], axis=1) / error[:, None]
     slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
     covariance = np.linalg.inv(design.T @ design) / scale**2
     chi_square = float(np.sum(((mean - scale - slope * (energy - REFERENCE_KEV)) / error) ** 2))
-    a = slope / scale
+    a = float(slope / scale)
     a_error = float(np.sqrt(covariance[0, 0]))
-    return {
-        "points": [asdict(p) for p in points],
-        "scale": float(scale),
-        "scale_error": float(scale * np.sqrt(covariance[1, 1])),
-        "mean": {
-            "a": float(a),
-            "b": float(1 - a * REFERENCE_KEV),
-            "a_error": a_error,
-            "per_mev_percent": float(1e5 * a),
-            "per_mev_error_percent": 1e5 * a_error,
-            "chi_square": chi_square,
-            "degrees": len(points) - 2,
-        },
-        "resolution": _resolution(energy, sigma / mean, sigma_error / mean),
-    }
+    line = MeanLine(
+        a=a,
+        b=1 - a * REFERENCE_KEV,
+        a_error=a_error,
+        per_mev_percent=1e5 * a,
+        per_mev_error_percent=1e5 * a_error,
+        chi_square=chi_square,
+        degrees=len(points) - 2,
+    )
+    law = _resolution(energy, sigma / mean, sigma_error / mean)
+    scale_error = float(scale * np.sqrt(covariance[1, 1]))
+    return Course(points, float(scale), scale_error, line, law)
 
 
-def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, Any]:
+def _resolution(energy: Values, relative: Values, error: Values) -> WidthLaw:
     """Fit ``a`` and ``b`` of sqrt(a + (b/E)^2), neither below 0, to the squared widths."""
     terms = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1)
     squares = relative**2
@@ -243,12 +299,8 @@ def _resolution(energy: Values, relative: Values, error: Values) -> dict[str, An
         weight = relative / (2 * squares * error)
         a, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
         squares = terms @ np.array([a, b2])
-    return {
-        "a": float(a),
-        "b": float(1e3 * np.sqrt(b2)),
-        "c": 2.0,
-        "at_reference_percent": float(100 * np.sqrt(a + b2 * 1e6 / REFERENCE_KEV**2)),
-    }
+    at_reference = 100 * np.sqrt(a + b2 * 1e6 / REFERENCE_KEV**2)
+    return WidthLaw(float(a), float(1e3 * np.sqrt(b2)), 2.0, float(at_reference))
 
 
 def _seen(values: Values) -> tuple[float, float] | None:

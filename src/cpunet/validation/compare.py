@@ -13,13 +13,8 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.tables import text_table
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
-from cpunet.validation.side_by_side import (
-    FEW,
-    Metrics,
-    SideBySide,
-    comparison_page,
-    side_by_side,
-)
+from cpunet.validation.side_by_side import FEW, SideBySide, comparison_page, side_by_side
+from cpunet.validation.verdicts import Metrics
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -348,7 +348,14 @@ def _finite(values: Values) -> Values:
     return values[np.isfinite(values)]
 
 
-ByMethod = dict[str, float | None]
+ByMethod = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Reason why something is not scored."""
+
+    missing: str
 
 
 class Compared(TypedDict):
@@ -358,14 +365,14 @@ class Compared(TypedDict):
     iou_std: ByMethod
     wasserstein: ByMethod
     wasserstein_std: ByMethod
-    wasserstein_null: float | None
-    wasserstein_null_std: float | None
+    wasserstein_null: float
+    wasserstein_null_std: float
     ks: ByMethod
     ks_std: ByMethod
-    ks_null: float | None
-    ks_null_std: float | None
+    ks_null: float
+    ks_null_std: float
     missing: dict[str, int]
-    axis: ByMethod
+    axis: dict[str, float | None]
 
 
 def histogram(values: Values, axis: hist.axis.Regular) -> Values:
@@ -503,7 +510,7 @@ def compare(
     Returns
     -------
     dict
-        For each parameter, JSON-ready (``None`` where a number does not exist):
+        For each parameter, NaN where a number does not exist:
 
         ``iou``, ``iou_std``
             IoU and its error in percent, by method and for the ``ceiling``.  The ceiling
@@ -526,10 +533,7 @@ def compare(
     null = resampled_twice(n_data, n_sim, n_data, scores.bootstraps, rng)
     known = {name: values for name, values in data.items() if np.isfinite(values).any()}
     axes = {name: data_axis(values, scores.max_bins) for name, values in known.items()}
-    found = {
-        name: _of_data(values, list(methods), null, axes.get(name))
-        for name, values in data.items()
-    }
+    found = {name: _of_data(values, null, axes.get(name)) for name, values in data.items()}
     own = null[1]
     del null
     for method, values in methods.items():
@@ -539,31 +543,25 @@ def compare(
     return found
 
 
-def _of_data(
-    data: Values, methods: list[str], null: Draws, axis: hist.axis.Regular | None
-) -> Compared:
+def _of_data(data: Values, null: Draws, axis: hist.axis.Regular | None) -> Compared:
     """Ceiling and nulls from the data alone, before any method is added."""
     distances = null_distances(data, null)
-    result = Compared(
-        iou=dict.fromkeys([*methods, "ceiling"]),
-        iou_std=dict.fromkeys([*methods, "ceiling"]),
-        wasserstein=dict.fromkeys(methods),
-        wasserstein_std=dict.fromkeys(methods),
-        wasserstein_null=_or_none(distances.wasserstein),
-        wasserstein_null_std=_or_none(distances.wasserstein_std),
-        ks=dict.fromkeys(methods),
-        ks_std=dict.fromkeys(methods),
-        ks_null=_or_none(distances.ks),
-        ks_null_std=_or_none(distances.ks_std),
+    mean, std = (np.nan, np.nan) if axis is None else ceiling(data, axis, null)
+    low, high = (None, None) if axis is None else axis.edges[[0, -1]].tolist()
+    return Compared(
+        iou={"ceiling": mean},
+        iou_std={"ceiling": std},
+        wasserstein={},
+        wasserstein_std={},
+        wasserstein_null=distances.wasserstein,
+        wasserstein_null_std=distances.wasserstein_std,
+        ks={},
+        ks_std={},
+        ks_null=distances.ks,
+        ks_null_std=distances.ks_std,
         missing={"data": int(np.isnan(data).sum())},
-        axis=dict.fromkeys(("low", "high", "bins")),
+        axis={"low": low, "high": high, "bins": None if axis is None else axis.size},
     )
-    if axis is not None:
-        mean, std = ceiling(data, axis, null)
-        result["iou"]["ceiling"], result["iou_std"]["ceiling"] = _or_none(mean), _or_none(std)
-        low, high = axis.edges[[0, -1]].tolist()
-        result["axis"] = {"low": low, "high": high, "bins": axis.size}
-    return result
 
 
 def _add_method(
@@ -576,14 +574,13 @@ def _add_method(
 ) -> None:
     """Add the scores of one method."""
     w1_error, ks_error = distance_errors(data, values, draws)
-    result["wasserstein"][method] = _or_none(wasserstein(data, values))
-    result["wasserstein_std"][method] = _or_none(w1_error)
-    result["ks"][method] = _or_none(kolmogorov_smirnov(data, values))
-    result["ks_std"][method] = _or_none(ks_error)
+    result["wasserstein"][method] = wasserstein(data, values)
+    result["wasserstein_std"][method] = w1_error
+    result["ks"][method] = kolmogorov_smirnov(data, values)
+    result["ks_std"][method] = ks_error
     result["missing"][method] = int(np.isnan(values).sum())
-    if axis is not None:
-        result["iou"][method] = _or_none(iou(data, values, axis))
-        result["iou_std"][method] = _or_none(iou_error(data, values, axis, draws))
+    result["iou"][method] = np.nan if axis is None else iou(data, values, axis)
+    result["iou_std"][method] = np.nan if axis is None else iou_error(data, values, axis, draws)
 
 
 def _overlap(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> Values:
@@ -591,7 +588,3 @@ def _overlap(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> Values
     with np.errstate(invalid="ignore"):
         a, b = (h / h.sum(axis=0, dtype=float) for h in (a, b))
         return np.asarray(100 * np.minimum(a, b).sum(axis=0) / np.maximum(a, b).sum(axis=0))
-
-
-def _or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None

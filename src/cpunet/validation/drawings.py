@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -59,8 +60,8 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     tails = metrics["tails"] or {}
     if tails.get("rate_khz") and "sizes" in tails:  # if any are known and were kept
         drawn[TAILS] = partial(tails_figure, tails)
-    if methods := metrics["ae_energy"].get("methods"):
-        drawn[AE_ENERGY] = partial(ae_energy_figure, methods)
+    if found.ae_energy.methods:
+        drawn[AE_ENERGY] = partial(ae_energy_figure, found.ae_energy.methods)
     scored = [peak for peak in found.sets if found.values[peak.name]]
     fullest = max(scored, key=lambda s: min(len(s.sim_rows), len(s.data_rows)))
     for name, side, there, back, titles in (
@@ -126,9 +127,8 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         )
     slices = _shown(details.slices, ("data", "superpulse", "ren"))
     drawn["superpulses"] = partial(slice_figure, slices, dt_ns, name)
-    table = dict(details.ae_against_time)
-    table["methods"] = _shown(table["methods"])
-    drawn["A over E"] = partial(ae_figure, table, name)
+    ae = details.ae_against_time
+    drawn["A over E"] = partial(ae_figure, replace(ae, methods=_shown(ae.methods)), name)
     if "missing" not in scores["noise"]["data"]:
         noise = _shown(scores["noise"], ("frequency_mhz", "data", "ren"))
         drawn["noise"] = partial(spectrum_of_noise, noise, name)

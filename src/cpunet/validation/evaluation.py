@@ -21,28 +21,30 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.parameters import Values, current_amplitude
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.a_over_e import (
     DEP,
+    AgainstTime,
     Range,
+    RangeSurvival,
+    SurvivalRow,
     ae_against_drift_time,
-    survival_by_range,
+    peak_survival,
     survival_table,
 )
-from cpunet.validation.ae_energy import against_energy
-from cpunet.validation.methods import Responses, fit_baseline_methods, translate_all
-from cpunet.validation.peaks import ByMethod, PeakSets, score_peak
+from cpunet.validation.ae_energy import AgainstEnergy, against_energy
+from cpunet.validation.comparisons import Missing
+from cpunet.validation.methods import fit_baseline_methods, translate_all, true_responses
+from cpunet.validation.peaks import ByMethod, PeakScores, PeakSets, score_peak
+from cpunet.validation.report import as_stored
 from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
 from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
-# numbers of the noise that are shown beside each other; its spectrum is with the scores
-NOISE = ("n", "samples", "rms", "rms_std", "missing")
-AGAINST_DATA = ("rms_ratio", "sigma", "worst_band_sigma", "spectrum_sigma")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class PeakDetails:
 
     means: Mapping[str, MeanPulse]
     slices: Mapping[str, Slices]
-    ae_against_time: Mapping[str, Any]
+    ae_against_time: AgainstTime
 
     @classmethod
     def of(cls, peak: PeakSets, values: ByMethod) -> PeakDetails:
@@ -88,6 +90,8 @@ class Evaluation:
     sets, values, details
         Pulses, parameters by method, and further comparisons, each by peak.  The latter two
         exist only for scored peaks.
+    ae_energy
+        A/E against energy.
     metrics
         Content of ``metrics.json``.
     """
@@ -100,6 +104,7 @@ class Evaluation:
     sets: list[PeakSets]
     values: Mapping[str, ByMethod]
     details: Mapping[str, PeakDetails]
+    ae_energy: AgainstEnergy
     metrics: dict[str, Any]
 
 
@@ -125,8 +130,12 @@ def evaluate(
     device, recipe, trained_on = resolve_device(device), run.recipe, run.peak
     ren, iren = REN.of(run, device), IREN.of(run, device)
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
-    sim_set, data_set = _load_both(ren, sim, data, names, max_pulses)
-    responses = None if truth is None else Responses(truth, sim_set)
+    selection = _selected(recipe, names)
+    sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
+    data_set = load_pulses(data, "measured", recipe, selection, max_pulses=max_pulses)
+    require_same_sampling(sim_set, data_set)
+    ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
+    responses = None if truth is None else true_responses(truth, sim_set)
     baseline_methods = fit_baseline_methods(
         sim_set,
         data_set,
@@ -145,10 +154,10 @@ def evaluate(
         chosen = parse_selection(name, recipe.peaks)
         in_sim = np.flatnonzero(chosen.select(simulated.energy_kev))
         in_data = np.flatnonzero(chosen.select(measured.energy_kev))
-        one = PeakSets(name, simulated, measured, in_sim, in_data, translations, amplitudes)
+        one = PeakSets(name, measured, in_sim, in_data, translations, amplitudes)
         sets.append(one)
     values: dict[str, ByMethod] = {}
-    peaks: dict[str, Any] = {}
+    peaks: dict[str, PeakScores] = {}
     details: dict[str, PeakDetails] = {}
     with stage("Scoring", len(sets)) as bar:
         for peak in sets:
@@ -171,6 +180,11 @@ def evaluate(
     sides = {m: measured if m == "data" else simulated for m in amplitudes}
     energies = {method: side.energy_kev for method, side in sides.items()}
     known = None if run.fit is None else run.fit.tails
+    ae_energy = against_energy(
+        {method: amplitudes[method] for method in ("data", "ren")},
+        energies,
+        {name: span for name, (span, _) in _lines(recipe).items()},
+    )
     metrics = {
         "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
@@ -181,21 +195,16 @@ def evaluate(
                 name: of_peak.ae_against_time for name, of_peak in details.items()
             },
         },
-        "ae_energy": against_energy(
-            {method: amplitudes[method] for method in ("data", "ren")},
-            energies,
-            {name: span for name, (span, _) in _lines(recipe).items()},
-        ),
+        "ae_energy": ae_energy,
         "drift_slices": {
             name: slice_table(of_peak.slices, data_set.dt_ns)
             for name, of_peak in details.items()
         },
+        # numbers of the noise beside each other; its spectrum is with the scores
         "noise": {
             name: {
-                method: {
-                    key: value for key, value in found.items() if key in NOISE + AGAINST_DATA
-                }
-                for method, found in peaks[name]["noise"].items()
+                method: {k: v for k, v in found.items() if not k.startswith("power")}
+                for method, found in (peaks[name].noise or {}).items()
                 if method != "frequency_mhz"
             }
             for name in details
@@ -214,49 +223,44 @@ def evaluate(
             "data": data_set.prepared.rejections,
         },
     }
-    metrics["verdicts"] = {
-        "summary": [summary(metrics, name, "ren") for name in details],
-        "table": verdict_table(metrics),
+    stored = as_stored(metrics)
+    stored["verdicts"] = {
+        "summary": [summary(stored, name, "ren") for name in details],
+        "table": verdict_table(stored),
     }
-    return Evaluation(ren, iren, run, sim_set, data_set, sets, values, details, metrics)
+    return Evaluation(
+        ren, iren, run, sim_set, data_set, sets, values, details, ae_energy, stored
+    )
 
 
-def _load_both(
-    ren: REN,
-    sim: PulseFile,
-    data: PulseFile,
-    names: list[str],
-    max_pulses: int,
-) -> tuple[InputSet, InputSet]:
-    # the peaks, with all sidebands and continua
-    chosen = parse_selection(",".join(names), ren.recipe.peaks)
-    more = [band for _, bands in _lines(ren.recipe).values() for band in bands]
-    more += ren.recipe.scores.continuum_kev.values()
-    selection = replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
-    sim_set = load_pulses(sim, "simulated", ren.recipe, selection, max_pulses=max_pulses)
-    data_set = load_pulses(data, "measured", ren.recipe, selection, max_pulses=max_pulses)
-    require_same_sampling(sim_set, data_set)
-    ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
-    return sim_set, data_set
+def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
+    """Energies of the peaks, with all sidebands and continua."""
+    chosen = parse_selection(",".join(names), recipe.peaks)
+    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    more += recipe.scores.continuum_kev.values()
+    return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
 def _range_survivals(
     amplitudes: Mapping[str, Values],
     energies: Mapping[str, Values],
-    ae_survival: Mapping[str, Any],
+    ae_survival: dict[str, SurvivalRow] | Missing,
     recipe: Recipe,
-) -> dict[str, Any]:
+) -> dict[str, dict[str, RangeSurvival]] | Missing:
     """A/E survival of gamma lines, sideband-subtracted, and of continua, after known cuts."""
-    cuts = ae_survival.get(DEP, {}).get("cut")
-    if not cuts:
-        return {"missing": f"there is no A/E cut: {ae_survival['missing']}"}
-    return survival_by_range(
-        {method: values for method, values in amplitudes.items() if method in cuts},
-        energies,
-        {method: np.nan if cut is None else cut for method, cut in cuts.items()},
-        {name: line for name, line in _lines(recipe).items() if name != DEP}
-        | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
-    )
+    if isinstance(ae_survival, Missing):
+        return Missing(f"there is no A/E cut: {ae_survival.missing}")
+    cuts = ae_survival[DEP].cut or {}  # each method has its own
+    ranges = {name: line for name, line in _lines(recipe).items() if name != DEP}
+    ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
+    return {
+        name: {
+            method: peak_survival(values, energies[method], cuts[method], span, sidebands)
+            for method, values in amplitudes.items()
+            if method in cuts
+        }
+        for name, (span, sidebands) in ranges.items()
+    }
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
@@ -280,7 +284,7 @@ def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
     }
 
 
-def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, Any]:
+def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
     """Description of the compared inputs, shown before the scores."""
     training = (
         f"recipe {run.recipe.name} on {run.peak}",

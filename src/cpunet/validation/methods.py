@@ -12,7 +12,7 @@ the alignment is not a difference of shape.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,11 +20,11 @@ from typing import TypedDict, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, SameNoise, TraceNoise
-from cpunet.electronics.finishing import BLOCK as FINISHED
 from cpunet.electronics.finishing import blocks, finish
 from cpunet.electronics.fitted_kernels import BASELINE_METHODS
 from cpunet.electronics.measured import noise_of, tails_of
@@ -46,8 +46,8 @@ T = TypeVar("T")
 Flags = npt.NDArray[np.bool_]
 
 
-class Responses:
-    """Noise-free traces of the simulated pulses in use, block by block.
+def true_responses(path: Path, sim: InputSet) -> FloatArray:
+    """Noise-free traces of the simulated pulses in use, float32, shape (n, samples).
 
     Parameters
     ----------
@@ -59,38 +59,22 @@ class Responses:
     Raises
     ------
     CpunetError
-        If the file is not readable or belongs to other pulses.
+        If the file is not readable or belongs to other pulses, or no trace is finite.
     """
-
-    def __init__(self, path: Path, sim: InputSet) -> None:
-        self._index = sim.prepared.index
-        arrays = read_arrays(path)
-        if "response" not in arrays:
-            names = ", ".join(arrays) or "none"
-            raise CpunetError(f"{path}: has no array 'response' (found {names})")
-        values = arrays["response"]
-        if values.ndim != 2 or values.shape[0] != sim.prepared.n_read:
-            raise CpunetError(
-                f"{path}: response has shape {values.shape}, but {sim.path} holds "
-                f"{sim.prepared.n_read} pulses; give the truth of that file"
-            )
-        self._path, self._values = path, values
-
-    def blocks(self, size: int = FINISHED) -> Iterator[FloatArray]:
-        """Float32 traces of the pulses in use, in order, `size` at a time.
-
-        Raises
-        ------
-        CpunetError
-            At the end, if none of them is finite.
-        """
-        finite = False
-        for first in range(0, len(self._index), size):
-            rows = self._values[self._index[first : first + size]].astype(np.float32)
-            finite = finite or bool(np.isfinite(rows).all(axis=1).any())
-            yield rows
-        if len(self._index) and not finite:
-            raise CpunetError(f"{self._path}: no response is finite; give noise-free traces")
+    arrays = read_arrays(path)
+    if "response" not in arrays:
+        names = ", ".join(arrays) or "none"
+        raise CpunetError(f"{path}: has no array 'response' (found {names})")
+    values = arrays["response"]
+    if values.ndim != 2 or values.shape[0] != sim.prepared.n_read:
+        raise CpunetError(
+            f"{path}: response has shape {values.shape}, but {sim.path} holds "
+            f"{sim.prepared.n_read} pulses; give the truth of that file"
+        )
+    used = np.asarray(values[sim.prepared.index], np.float32)
+    if len(used) and not any(np.isfinite(trace).all() for trace in used):
+        raise CpunetError(f"{path}: no response is finite; give noise-free traces")
+    return used
 
 
 class PairedScores(TypedDict):
@@ -321,7 +305,7 @@ def translate_all(
     ren: REN,
     baselines: FittedBaselineMethods,
     sim: InputSet,
-    responses: Responses | None,
+    responses: FloatArray | None,
     seed: int,
 ) -> Translations:
     """Translate the simulated pulses by every method, with noise and without.
@@ -338,7 +322,8 @@ def translate_all(
         Seed of the noise, common to all methods.
     """
     pulses, recipe = sim.prepared.pulses, ren.recipe
-    others = [*baselines.methods, *(["truth"] if responses is not None else [])]
+    known: dict[str, FloatArray] = {} if responses is None else {"truth": responses}
+    others = [*baselines.methods, *known]
     shape = (len(pulses), recipe.preparation.length)
     noisy = {
         name: np.empty(shape, np.float32)
@@ -346,10 +331,7 @@ def translate_all(
         if name == "ren" or (name in others and baselines.noise is not None)
     }
     truth = None if responses is None else np.empty(shape, np.float32)
-    true_records = iter(()) if responses is None else responses.blocks()
     generator = ren.seeded(seed)
-    # like the data with which they are compared
-    tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
     # the random generators of all methods are in the same state
     noise = None if baselines.noise is None else SameNoise(baselines.noise)
     rngs = {name: np.random.default_rng(seed) for name in others}
@@ -359,10 +341,9 @@ def translate_all(
             block = pulses[rows]
             clean = {"raw": block.waveforms}
             for name in others:
+                method = baselines.methods.get(name)
                 records = (
-                    next(true_records)
-                    if name == "truth"
-                    else baselines.methods[name].translate(block.waveforms)
+                    known[name][rows] if method is None else method.translate(block.waveforms)
                 )
                 finished = finish(
                     records,
@@ -376,12 +357,7 @@ def translate_all(
                 if noise is not None:
                     noisy[name][rows] = finished.windows
             clean["ren"] = ren.apply(block.waveforms, noise=False)
-            noisy["ren"][rows] = ren.apply(
-                block.waveforms,
-                energy_kev=block.energy_kev,
-                generator=generator,
-                tails_kev=drawn_kev(tails, len(block), generator),
-            )
+            noisy["ren"][rows] = like_data(ren, block, generator)
             if truth is not None:
                 truth[rows] = clean["truth"]
             for name, numbers in _numbers(clean, recipe, sim.dt_ns).items():
@@ -390,6 +366,17 @@ def translate_all(
     whole = {name: _whole(windows) for name, windows in noisy.items()}
     joined = {name: _joined(found) for name, found in parts.items()}
     return Translations(ren, baselines, pulses, noisy, whole, joined, truth)
+
+
+def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArray:
+    """Translated windows with noise and pile-up tails as those of the data."""
+    tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
+    return ren.apply(
+        pulses.waveforms,
+        energy_kev=pulses.energy_kev,
+        generator=generator,
+        tails_kev=drawn_kev(tails, len(pulses), generator),
+    )
 
 
 def _numbers(

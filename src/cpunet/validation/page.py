@@ -25,6 +25,7 @@ from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
 from cpunet.validation.side_by_side import peak_figure
+from cpunet.validation.verdicts import Metrics
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
 AE_ENERGY = "A over E and energy"  # figure with a section of its own
@@ -43,7 +44,7 @@ PLACES = {
 
 def write_page(
     folder: Path,
-    metrics: Mapping[str, Any],
+    metrics: Metrics,
     figures: Mapping[str, Callable[[], Figure]],
     notes: Sequence[str],
 ) -> None:
@@ -128,7 +129,7 @@ def verdicts_html(verdicts: Mapping[str, Any]) -> Markup:
         for quantity, found in quantities.items()
     ]
     head = ["Peak", "Method", "Quantity", "σ", "In words"]
-    table = _table(head, rows, words={0, 1, 2, 4})
+    table = part("table", head, rows, {0, 1, 2, 4})
     return joined(
         [
             part("points", verdicts["summary"]),
@@ -168,7 +169,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
             else [label(method), *(with_std(found[one], found[std]) for one, std in pairs)]
             for method, found in tested.items()
         ]
-        tables.append(part("folded", "The classifier as a table", _table(head, rows)))
+        tables.append(part("folded", "The classifier as a table", part("table", head, rows)))
     if paired := scores.get("paired", {}):
         head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
         rows = [
@@ -181,7 +182,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
             ]
             for method, found in paired.items()
         ]
-        tables.append(_table(head, rows))
+        tables.append(part("table", head, rows))
     return joined([*parts, part("grid", "beside", tables)])
 
 
@@ -205,7 +206,7 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
             rows.append([title, label(method), kept, apart, sigma])
             title = ""
     head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
-    return _table(head, rows, words={0, 1})
+    return part("table", head, rows, {0, 1})
 
 
 def ranges_table(ranges: Mapping[str, Any]) -> Markup:
@@ -221,7 +222,7 @@ def ranges_table(ranges: Mapping[str, Any]) -> Markup:
         for method, found in methods.items()
     ]
     head = ["Range", "Method", "Pulses", "Survival [%]", ""]
-    return _table(head, rows, words={0, 1, 4}) if rows else Markup()
+    return part("table", head, rows, {0, 1, 4}) if rows else Markup()
 
 
 def noise_table(noise: Mapping[str, Any]) -> Markup:
@@ -234,7 +235,7 @@ def noise_table(noise: Mapping[str, Any]) -> Markup:
         for method, found in methods.items()
     ]  # fmt: skip
     head = ["Peak", "Method", "Pulses", "Samples", "RMS [height]", "Over the data's", "In σ"]
-    return _table([*head, "Spectrum in σ"], rows, words={0, 1}) if rows else Markup()
+    return part("table", [*head, "Spectrum in σ"], rows, {0, 1}) if rows else Markup()
 
 
 def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
@@ -256,13 +257,13 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
         )
     head = ["Method", "Slope [% per MeV]", "χ² / degrees", "Width at all energies [%]"]
     head += ["Noise [keV]", f"Width at {REFERENCE_KEV:g} keV [%]"]
-    return joined([_table(head, rows, words={0}), part("grid", "figures", [figure])])
+    return joined([part("table", head, rows, {0}), part("grid", "figures", [figure])])
 
 
 def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
     """Return a table of names and values; nested names are joined: ``data: saturated``."""
     rows = [[name, number(value)] for name, value in flat(values, ": ")]
-    return _table(list(head), rows) if rows else part("p", "None recorded.")
+    return part("table", head, rows) if rows else part("p", "None recorded.")
 
 
 def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
@@ -286,7 +287,7 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
         )
         rows.append([title, "Ceiling", ceiling, moved, apart])
     head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS"]
-    return _table(head, rows, words={0, 1})
+    return part("table", head, rows, {0, 1})
 
 
 def _sigma(value: float | None) -> str:
@@ -298,10 +299,3 @@ def _percent(value: float | None, error: float | None) -> str:
         return NO_VALUE
     value = round(value, 1) + 0.0  # no negative zero
     return f"{value:.1f}" if error is None else f"{value:.1f} ± {error:.1f}"
-
-
-def _table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], words: set[int] | None = None
-) -> Markup:
-    """Return a table; the columns `words` are aligned as text, all others as numbers."""
-    return part("table", head, rows, words or set())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,10 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
-from cpunet.validation.comparisons import Compared, compare
+from cpunet.validation.comparisons import Compared, Missing, compare
 from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
 from cpunet.validation.noise import baseline_spectra
-from cpunet.validation.two_sample import classifier_auc
+from cpunet.validation.two_sample import TwoSample, classifier_auc
 
 MIN_PULSES = 10  # minimum number of pulses of a distribution
 
@@ -34,8 +34,8 @@ class PeakSets:
     ----------
     name
         Name of a peak of the recipe, or a range in keV.
-    simulated, measured
-        All prepared pulses of the two sides.
+    measured
+        All prepared measured pulses.
     sim_rows, data_rows
         Rows of the pulses of the peak.
     translations
@@ -45,7 +45,6 @@ class PeakSets:
     """
 
     name: str
-    simulated: Pulses
     measured: Pulses
     sim_rows: Rows
     data_rows: Rows
@@ -55,7 +54,7 @@ class PeakSets:
     @property
     def raw(self) -> Pulses:
         """The simulated pulses of the peak."""
-        return self.simulated[self.sim_rows]
+        return self.translations.simulated[self.sim_rows]
 
     @property
     def data(self) -> Pulses:
@@ -65,7 +64,7 @@ class PeakSets:
     @property
     def dt_ns(self) -> float:
         """Sampling period in ns."""
-        return self.simulated.dt_ns
+        return self.translations.simulated.dt_ns
 
     def rows(self, method: str) -> Rows:
         """Rows of the pulses with noise of one method in its whole dataset."""
@@ -133,7 +132,40 @@ class PeakSets:
         return self.sim_rows[flags[self.sim_rows]]
 
 
-def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dict[str, Any]]:
+@dataclass(frozen=True, eq=False)
+class PeakScores:
+    """Scores of a peak, its entry in ``metrics.json``.
+
+    Attributes
+    ----------
+    n_sim, n_data
+        Numbers of pulses.
+    not_prepared
+        Number of translated pulses that cannot be prepared like data, by method.
+    parameters, further
+        Comparison of each parameter, of `PARAMETERS` and of all others.
+    two_sample
+        Classifier test between each method and the data.
+    noise
+        Result of `baseline_spectra`.
+    paired
+        Paired scores by method; None if the truth is unknown.
+    missing
+        Reason why the peak is not scored.
+    """
+
+    n_sim: int
+    n_data: int
+    not_prepared: dict[str, int]
+    parameters: dict[str, Compared] = field(default_factory=dict)
+    further: dict[str, Compared] | None = None
+    two_sample: dict[str, TwoSample | Missing] | None = None
+    noise: Mapping[str, Any] | None = None
+    paired: dict[str, PairedScores] | None = None
+    missing: str | None = None
+
+
+def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, PeakScores]:
     """Compare the pulses of a peak, method by method.
 
     Parameters
@@ -151,16 +183,11 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, or only those
         of `PARAMETERS` for methods without noise.  Empty if the peak is not scored.
     scores
-        Entry of the peak in ``metrics.json``, ready for JSON.
+        Scores of the peak.
     """
-    scores: dict[str, Any] = {
-        "n_sim": len(peak.sim_rows),
-        "n_data": len(peak.data_rows),
-        "not_prepared": peak.not_prepared(),
-    }
-    missing = peak.missing()
-    if missing is not None:
-        return {}, scores | {"parameters": {}, "missing": missing}
+    counted = PeakScores(len(peak.sim_rows), len(peak.data_rows), peak.not_prepared())
+    if (missing := peak.missing()) is not None:
+        return {}, replace(counted, missing=missing)
     values = {
         method: all_parameters(
             peak.pulses(method),
@@ -171,26 +198,27 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, dic
         for method in peak.methods
     } | peak.noise_free_parameters()
     chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
-    scores["two_sample"] = classifier_tests(peak, chief, seed)
-    scores["parameters"] = _compared(chief, recipe, seed)
     further = {
         method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
         for method, of_method in values.items()
         if not method.endswith(NO_NOISE)
     }
-    scores["further"] = _compared(further, recipe, seed)
     align, dt_ns = recipe.preparation.samples_before, peak.dt_ns
     samples = recipe.preparation.baseline_samples
-    scores["noise"] = baseline_spectra(
+    noise = baseline_spectra(
         {method: peak.pulses(method).waveforms[:, :samples].copy() for method in peak.methods},
         {method: align + values[method]["t01"] / dt_ns for method in peak.methods},
         samples,
         dt_ns,
     )
-    paired = peak.paired_scores()
-    if paired is not None:
-        scores["paired"] = paired
-    return values, scores
+    return values, replace(
+        counted,
+        parameters=_compared(chief, recipe, seed),
+        further=_compared(further, recipe, seed),
+        two_sample=classifier_tests(peak, chief, seed),
+        noise=noise,
+        paired=peak.paired_scores(),
+    )
 
 
 def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Compared]:
@@ -198,7 +226,9 @@ def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Compared
     return compare(values["data"], methods, recipe.scores, seed)
 
 
-def classifier_tests(peak: PeakSets, values: ByMethod, seed: int) -> dict[str, Any]:
+def classifier_tests(
+    peak: PeakSets, values: ByMethod, seed: int
+) -> dict[str, TwoSample | Missing]:
     """Classifier test between each method and the data, for one peak.
 
     Parameters
@@ -209,19 +239,13 @@ def classifier_tests(peak: PeakSets, values: ByMethod, seed: int) -> dict[str, A
         Pulse-shape parameters of those with noise, by method.
     seed
         Seed of the folds.
-
-    Returns
-    -------
-    dict
-        Fields of `cpunet.validation.two_sample.TwoSample` by method, or ``missing`` with the
-        reason.
     """
-    tested: dict[str, Any] = {}
+    tested: dict[str, TwoSample | Missing] = {}
     data = peak.data.waveforms
     for method in peak.methods[1:]:
         others, features = peak.pulses(method).waveforms, (values["data"], values[method])
         try:
-            tested[method] = asdict(classifier_auc(data, others, seed=seed, features=features))
+            tested[method] = classifier_auc(data, others, seed=seed, features=features)
         except CpunetError as error:
-            tested[method] = {"missing": str(error)}
+            tested[method] = Missing(str(error))
     return tested

@@ -223,16 +223,16 @@ def single_pulse_figure(
             _draw(axes, time_ns, drawn)
     for axes in grid[2]:
         axes.axhline(0, color="black", linewidth=0.8)
+        axes.set_xlabel("Time from half maximum [ns]")
     linear_within(grid[2, 0], LINEAR)
+    decay = f"{-1e3 / slope:.3g} µs" if slope else "none"
     grid[0, 0].set(ylabel="Pulse height", title="As prepared")
     grid[0, 1].set(title="Edge", xlim=ZOOM_NS)
-    grid[1, 0].set(ylabel="Pulse height,\nplateau = 1")
-    decay = f"{-1e3 / slope:.3g} µs" if slope else "none"
-    grid[1, 0].set_title(f"Corrected for a decay of {decay}")
+    grid[1, 0].set(
+        ylabel="Pulse height,\nplateau = 1", title=f"Corrected for a decay of {decay}"
+    )
     grid[1, 1].set_title("Edge, corrected")
     grid[2, 0].set_ylabel("Corrected: method −\ndata pulse [%]")
-    for axes in grid[2]:
-        axes.set_xlabel("Time from half maximum [ns]")
     beside = f"data pulse {data.row} is nearest to “{label(data.target)}”, RMS {data.rms:.4f}"
     legend_above(figure, grid[0, 0], len(shown), f"{title}: {beside}")
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.settings import plain, read_json
 from cpunet.tables import text_table
-from cpunet.validation.verdicts import judged_scores
+from cpunet.validation.verdicts import Metrics, judged_scores
 
 if TYPE_CHECKING:
     import hist
@@ -62,7 +62,7 @@ class Report:
         Paragraphs for the top of the page.
     """
 
-    metrics: Mapping[str, Any]
+    metrics: Metrics
     values: Mapping[str, Mapping[str, Mapping[str, Values]]] = field(default_factory=dict)
     folder: Path | None = None
     drawn: Mapping[str, Callable[[], Any]] | None = None
@@ -276,7 +276,7 @@ class Report:
         return ["peak", "parameter", *shown], rows
 
 
-def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str, Any]:
+def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:
     """Read a ``metrics.json``; `remedy` says what to do if that fails.
 
     Raises
@@ -290,6 +290,15 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> dict[str
             f"{file}: holds no scores by peak", "give a report of cpunet validate"
         )
     return content
+
+
+def as_stored(results: Any) -> Any:
+    """Results ready for JSON, see `plain`, without the fields of objects that are None."""
+    if is_dataclass(results):
+        results = {name: one for name, one in vars(results).items() if one is not None}
+    if isinstance(results, Mapping):
+        return {name: as_stored(one) for name, one in results.items()}
+    return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
 
 
 class _Figures(Mapping[str, "Figure"]):

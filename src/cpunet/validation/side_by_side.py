@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,9 +12,14 @@ from matplotlib.figure import Figure
 from cpunet.errors import CpunetError
 from cpunet.plotting import GROUP, colours, label, panels, styled
 from cpunet.tables import NO_VALUE
-from cpunet.validation.verdicts import judged_scores, methods_of, number, part, summary
-
-Metrics = Mapping[str, Any]
+from cpunet.validation.verdicts import (
+    Metrics,
+    judged_scores,
+    methods_of,
+    number,
+    part,
+    summary,
+)
 
 FEW = 8  # runs whose scores fit beside each other; more have an overview and panels
 CEILING = " (ceiling)"
@@ -131,24 +136,11 @@ def score_figure(
     return figure
 
 
-def peak_figure(peak: str, scores: Mapping[str, Any]) -> Figure:
+def peak_figure(peak: str, scores: Metrics) -> Figure:
     """Draw the IoU of each parameter of a peak, and the AUC of the classifier, by method."""
-    tested = scores["two_sample"]
-    methods = [m for m in tested if m != "ren"] + ["ren"]
-    rows = [
-        Row(
-            peak,
-            f"IoU of the {name.replace('_', ' ')} [%]",
-            tuple(
-                Cell("", iou.get(m), error.get(m), iou["ceiling"], error["ceiling"])
-                for m in methods
-            ),
-        )
-        for name, found in scores["parameters"].items()
-        for iou, error in [(found["iou"], found["iou_std"])]
-    ]
-    cells = (Cell("", *(tested[m].get(key) for key in AUC)) for m in methods)
-    rows.append(Row(peak, "AUC of a classifier against data", tuple(cells)))
+    methods = [m for m in scores["two_sample"] if m != "ren"] + ["ren"]
+    rows = _score_rows(peak, [(scores, method) for method in methods])
+    rows = [replace(row, score=row.score.removesuffix(CEILING)) for row in rows]
     return score_figure(rows, list(map(label, methods)), methods=methods)
 
 
@@ -328,23 +320,27 @@ def _over(cells: Sequence[Cell]) -> Cell:
     return Cell(digits, median, spread, appended=appended)
 
 
-def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
-    """Rows of one peak in which any run has a value."""
-    scores = [part(metrics, "peaks", peak) for metrics in runs]
+def _score_rows(peak: str, found: Sequence[tuple[Metrics, str]]) -> list[Row]:
+    """IoU of each parameter and AUC of the classifier, of methods in scores of a peak."""
     rows = []
-    for name in _union(part(s, "parameters") for s in scores):
+    for name in _union(part(scores, "parameters") for scores, _ in found):
         cells = []
-        for one in (part(s, "parameters", name) for s in scores):
+        for scores, method in found:
+            one = part(scores, "parameters", name)
             value, ceiling = (number(one, "iou", key) for key in (method, "ceiling"))
             error, spread = (number(one, "iou_std", key) for key in (method, "ceiling"))
             appended = f" ({ceiling:.1f})" if ceiling is not None else ""
             cells.append(Cell(".1f", value, error, ceiling, spread, appended=appended))
         title = f"{name.replace('_', ' ')}: IoU [%]{CEILING}"
         rows.append(_row(peak, title, cells, lambda c: -(c.value or 0.0)))
-    cells = [
-        Cell(".3f", *(number(s, "two_sample", method, key) for key in AUC)) for s in scores
-    ]
-    rows.append(_row(peak, "classifier: AUC", cells, _off))
+    cells = [Cell(".3f", *(number(s, "two_sample", m, key) for key in AUC)) for s, m in found]
+    return [*rows, _row(peak, "classifier: AUC", cells, _off)]
+
+
+def _peak_rows(peak: str, runs: Sequence[Metrics], method: str) -> list[Row]:
+    """Rows of one peak in which any run has a value."""
+    scores = [part(metrics, "peaks", peak) for metrics in runs]
+    rows = _score_rows(peak, [(one, method) for one in scores])
     edges = (number(s, "paired", method, "edge_rmse") for s in scores)
     cells = [Cell("#.3g", None if edge is None else 1e3 * edge) for edge in edges]
     rows.append(_row(peak, "edge RMSE [10⁻³]", cells, _off))
@@ -390,17 +386,14 @@ def _notes(runs: Mapping[str, Metrics]) -> list[str]:
 
 def _differences(one: Metrics, other: Metrics) -> list[str]:
     a, b = (part(metrics, "peaks") for metrics in (one, other))
+    both = a.keys() & b.keys()
     apart = ["peaks"] if a.keys() != b.keys() else []
-    apart += [
-        f"number of {called} pulses"
-        for key, called in (("n_data", "measured"), ("n_sim", "simulated"))
-        if any(part(a, peak).get(key) != part(b, peak).get(key) for peak in a.keys() & b.keys())
-    ]
-    apart += [
-        f"rejections of {called} pulses"
-        for side, called in (("data", "measured"), ("sim", "simulated"))
-        if part(one, "rejections").get(side) != part(other, "rejections").get(side)
-    ]
+    for side, called in (("data", "measured"), ("sim", "simulated")):
+        n = f"n_{side}"
+        if any(part(a, peak).get(n) != part(b, peak).get(n) for peak in both):
+            apart.append(f"number of {called} pulses")
+        if part(one, "rejections").get(side) != part(other, "rejections").get(side):
+            apart.append(f"rejections of {called} pulses")
     return apart
 
 

@@ -16,7 +16,7 @@ counts against it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -90,6 +90,54 @@ class Slices:
     pulses: tuple[MeanPulse, ...]
     edges: Values
     left_out: dict[str, int]
+
+
+@dataclass(frozen=True)
+class SliceScore:
+    """Deviation of a method's mean pulse from that of the data in one slice.
+
+    Attributes
+    ----------
+    n, n_data
+        Numbers of pulses.
+    rms, rms_error
+        RMS of the residual and its expectation by chance, both in percent of full charge.
+    largest, largest_at_ns
+        Largest residual in percent, and its time from the crossing.
+    mean_abs_z, rms_z
+        Mean absolute pull and RMS pull (0.80 and 1 if there is no difference).
+    missing
+        Reason why there are none.
+    """
+
+    n: int
+    n_data: int
+    rms: float | None = None
+    rms_error: float | None = None
+    largest: float | None = None
+    largest_at_ns: float | None = None
+    mean_abs_z: float | None = None
+    rms_z: float | None = None
+    missing: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SliceTable:
+    """Deviations of each method's mean pulses from those of the data.
+
+    Attributes
+    ----------
+    edges_ns
+        Edges of the slices.
+    left_out
+        Number of pulses in no slice, by method and reason.
+    slices
+        Scores of the slices, by method.
+    """
+
+    edges_ns: Values
+    left_out: dict[str, dict[str, int]]
+    slices: dict[str, list[SliceScore]]
 
 
 class Residual(NamedTuple):
@@ -186,8 +234,8 @@ def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]
     )
 
 
-def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> dict[str, Any]:
-    """Deviations of each method's mean pulses from those of the data.
+def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> SliceTable:
+    """Compare each method's mean pulses with those of the data.
 
     Parameters
     ----------
@@ -195,33 +243,14 @@ def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> dict[str, Any]:
         Mean pulses by method, the measured ones under ``"data"``.
     dt_ns
         Sampling period in ns.
-
-    Returns
-    -------
-    dict
-        JSON-ready:
-
-        ``edges_ns``
-            edges of the slices.
-        ``left_out``
-            number of pulses in no slice, by method and reason.
-        ``slices``
-            by method a list with, for each slice, ``n`` and ``n_data``; ``rms`` of the
-            residual and ``rms_error``, its expectation by chance, both in percent of full
-            charge; the ``largest`` residual in percent and its time from the crossing,
-            ``largest_at_ns``; ``mean_abs_z`` and ``rms_z``, mean absolute pull and RMS pull
-            (0.80 and 1 if there is no difference).  Or ``missing`` with the reason.
     """
     data = sets["data"]
-    return {
-        "edges_ns": [float(edge) for edge in data.edges],
-        "left_out": {method: dict(slices.left_out) for method, slices in sets.items()},
-        "slices": {
-            method: _rows(data, slices, dt_ns)
-            for method, slices in sets.items()
-            if method != "data"
-        },
-    }
+    others = {method: slices for method, slices in sets.items() if method != "data"}
+    return SliceTable(
+        data.edges,
+        {method: slices.left_out for method, slices in sets.items()},
+        {method: _scores(data, slices, dt_ns) for method, slices in others.items()},
+    )
 
 
 @styled
@@ -274,29 +303,31 @@ def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
     return figure
 
 
-def _rows(data: Slices, method: Slices, dt_ns: float) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
+def _scores(data: Slices, method: Slices, dt_ns: float) -> list[SliceScore]:
+    scores = []
     residuals = slice_residuals(data, method)
     for residual, own, measured in zip(residuals, method.pulses, data.pulses, strict=True):
-        row: dict[str, Any] = {"n": own.n, "n_data": measured.n}
+        score = SliceScore(own.n, measured.n)
         if residual is None:
             few = f"{own.n} pulses beside {measured.n} measured ones"
-            rows.append(row | {"missing": f"{few} (at least {MIN_PULSES} are needed)"})
+            missing = f"{few} (at least {MIN_PULSES} are needed)"
+            scores.append(replace(score, missing=missing))
             continue
         near = slice(BEFORE - EDGE_SAMPLES, BEFORE + EDGE_SAMPLES + 1)
         difference, error, z = (v[near] for v in (*residual, residual.z))
         known, pulls = np.isfinite(difference), z[np.isfinite(z)]
         worst = int(np.nanargmax(np.abs(difference)))
-        row |= {
-            "rms": 100 * _rms(difference[known]),
-            "rms_error": 100 * _rms(error[known]),
-            "largest": 100 * float(difference[worst]),
-            "largest_at_ns": float((worst + near.start - BEFORE) * dt_ns),
-            "mean_abs_z": float(np.abs(pulls).mean()) if pulls.size else None,
-            "rms_z": _rms(pulls) if pulls.size else None,
-        }
-        rows.append(row)
-    return rows
+        found = replace(
+            score,
+            rms=100 * _rms(difference[known]),
+            rms_error=100 * _rms(error[known]),
+            largest=100 * float(difference[worst]),
+            largest_at_ns=float((worst + near.start - BEFORE) * dt_ns),
+            mean_abs_z=float(np.abs(pulls).mean()) if pulls.size else np.nan,
+            rms_z=_rms(pulls) if pulls.size else np.nan,
+        )
+        scores.append(found)
+    return scores
 
 
 def _rms(values: Values) -> float:

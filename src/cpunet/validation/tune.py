@@ -10,12 +10,14 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import yaml
-from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs, written_aside
@@ -33,14 +35,12 @@ from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, checked
-from cpunet.training.job import match
-from cpunet.training.loop import train
-from cpunet.training.networks import differences, outside_noise
-from cpunet.training.run import Run, resolve_device
-from cpunet.translation.forms import drawn_kev, wanted_tails
-from cpunet.translation.options import LEARNED
+from cpunet.training.job import TrainingJob
+from cpunet.training.networks import differences
+from cpunet.training.run import resolve_device
 from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import null_distances, resampled_twice, wasserstein
+from cpunet.validation.methods import like_data
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -135,36 +135,26 @@ def tune(
     given = {key: _in_journal(space[key], value) for key, value in own.items()}
     if not study.trials and None not in given.values():
         study.enqueue_trial(given, {UNCHANGED: True})
-    states = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
-
-    def objective(trial: Trial) -> float:
-        # trials have numbers of their own, so processes do not draw the same random ones
-        study.sampler = optuna.samplers.GPSampler(
-            seed=(seed + trial.number) % 2**32,
-            n_startup_trials=STARTS,
-            warn_independent_sampling=False,
-        )
-        values = {key: _suggested(trial, key, own[key], space[key]) for key in space}
-        try:
-            return held_out.score(held_out.train(with_values(recipe, values), seed, device))
-        except CpunetError as error:
-            trial.set_user_attr(REASON, str(error))
-            log.info(f"trial {trial.number} failed: {error}")
-            raise
-
-    done = len(study.get_trials(states=states))
+    ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
     with stage("Trials", trials) as bar:
-        if done:
-            bar.update(done)
-        if done < trials:
-            study.optimize(
-                objective,
-                catch=CpunetError,
-                callbacks=[
-                    optuna.study.MaxTrialsCallback(trials, states),
-                    lambda *_: bar.update(1),
-                ],
+        while (done := len(study.get_trials(states=ended))) < trials:
+            bar.update(done - bar.n)
+            trial = study.ask()
+            # trials have numbers of their own, so processes do not draw the same random ones
+            study.sampler = optuna.samplers.GPSampler(
+                seed=(seed + trial.number) % 2**32,
+                n_startup_trials=STARTS,
+                warn_independent_sampling=False,
             )
+            values = {key: _suggested(trial, key, own[key], space[key]) for key in space}
+            try:
+                ren = held_out.train(with_values(recipe, values), seed, device)
+                study.tell(trial, held_out.score(ren))
+            except CpunetError as error:
+                trial.set_user_attr(REASON, str(error))
+                log.info(f"trial {trial.number} failed: {error}")
+                study.tell(trial, state=ended[1])
+        bar.update(done - bar.n)
     _write(out, study, recipe, space)
     return study
 
@@ -221,12 +211,12 @@ def value_of(recipe: Recipe, key: str) -> Any:
     CpunetError
         If the recipe has none of that name.
     """
-    node: Any = recipe.model_dump(mode="json")
-    for part in key.split("."):
-        if not isinstance(node, dict) or part not in node:
-            raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
-        node = node[part]
-    return node
+    try:
+        return reduce(getitem, key.split("."), recipe.model_dump(mode="json"))
+    except (LookupError, TypeError):
+        raise CpunetError(
+            f"recipe {recipe.name}: search.{key}: there is no such setting"
+        ) from None
 
 
 def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
@@ -240,32 +230,27 @@ def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
     settings = recipe.model_dump(mode="json") | {"search": None}
     for key, value in values.items():
         *parents, last = key.split(".")
-        node = settings
-        for parent in parents:
-            node = node[parent]
-        node[last] = value
+        reduce(getitem, parents, settings)[last] = value
     source = ", ".join(f"{key} = {value}" for key, value in values.items())
     return checked(Recipe, settings, f"recipe {recipe.name}, search, {source}")
 
 
 def _in_journal(config: SearchConfig, value: Any) -> Any:
     """A value as the journal has it, choices as JSON; None if the space does not contain it."""
-    if config.low is None or config.high is None:
-        choices = config.choices or ()  # a setting of 4.0 is the choice 4
+    if (choices := config.choices) is not None:  # a setting of 4.0 is the choice 4
         return json.dumps(choices[choices.index(value)]) if value in choices else None
-    within = isinstance(value, int | float) and config.low <= value <= config.high
-    return value if within else None
+    number = isinstance(value, int | float)
+    return value if number and config.low <= value <= config.high else None
 
 
 def _suggested(trial: Trial, key: str, own: Any, config: SearchConfig) -> Any:
     """The value of a setting proposed for a trial; an integer if all that is given is."""
-    low, high = config.low, config.high
-    if low is None or high is None:
-        labels = [json.dumps(choice) for choice in config.choices or ()]
-        return json.loads(str(trial.suggest_categorical(key, labels)))
-    if all(type(number) is int for number in (own, low, high)):
-        return trial.suggest_int(key, int(low), int(high), log=config.log)
-    return trial.suggest_float(key, low, high, log=config.log)
+    if config.choices is not None:
+        return json.loads(trial.suggest_categorical(key, [*map(json.dumps, config.choices)]))
+    ends: Any = config.low, config.high
+    if all(type(number) is int for number in (own, *ends)):
+        return trial.suggest_int(key, *ends, log=config.log)
+    return trial.suggest_float(key, *ends, log=config.log)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,14 +306,7 @@ class HeldOut:
         CpunetError
             If pulses cannot be translated.
         """
-        generator = ren.seeded(self.seed)
-        tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
-        windows = ren.apply(
-            self.sim.waveforms,
-            energy_kev=self.sim.energy_kev,
-            generator=generator,
-            tails_kev=drawn_kev(tails, len(self.sim), generator),
-        )
+        windows = like_data(ren, self.sim, ren.seeded(self.seed))
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MAX_LOST:
             raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")
@@ -348,17 +326,10 @@ class HeldOut:
         CpunetError
             If the training fails.
         """
-        model: nn.Module
-        if recipe.training.method == "matching":
-            found = match(self.fit_sim, self.fit_data, recipe, seed, lambda *_step: None)
-            model, recipe = found.model, found.recipe
-        else:
-            sides = (self.fit_sim, self.fit_data)
-            outside, _ = outside_noise(*sides, recipe)
-            sim, data = (side.prepared.pulses.waveforms for side in sides)
-            model = train(sim, data, recipe, seed=seed, device=device, outside=outside)
-        facts = {"dt_ns": self.sim.dt_ns, "peak": "", "seconds": 0.0}
-        return REN.of(Run.of(model, recipe, seed=seed, device=device, **facts), device)
+        sides = self.fit_sim, self.fit_data
+        with TemporaryDirectory() as folder:
+            job = TrainingJob(recipe, "", seed, device, *sides, Path(folder))
+            return REN.of(job.trained(None), device)
 
 
 def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:

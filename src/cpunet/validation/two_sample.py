@@ -25,7 +25,6 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 
 Values = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 Parameters = Mapping[str, Values]
 
 MIN_PULSES = 40  # pulses per side: 8 in each test fold

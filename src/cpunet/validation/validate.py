@@ -12,11 +12,12 @@ from typing import Any
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside
 from cpunet.pulses.channels import ALL, Outcome, Pair, each_channel, own_folder, paired
-from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, as_run
 from cpunet.validation.compare import compared
 from cpunet.validation.report import REPORT, Report
+from cpunet.validation.verdicts import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -87,44 +88,33 @@ def validate(
     if max_pulses < 100:
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
     sim, data = pulse_file(sim, read.sim), pulse_file(data, read.data)
-    how = {
-        "baselines": baselines,
-        "max_pulses": max_pulses,
-        "seed": require_seed(seed),
-        "device": device,
-    }
-    how["truth"] = None if truth is None else Path(truth)
+    how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses}
+    how |= {"seed": require_seed(seed), "device": device, "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)
     if data.table == ALL:
-        return _of_channels(run, sim, data, folder, how, force=force)
-    return _validated(as_run(run), sim, data, folder, how, force=force)
+        return _of_channels(run, (sim, data), folder, how, force)
+    return _validated(as_run(run), (sim, data), folder, how, force)
 
 
 def _validated(
-    run: Run,
-    sim: PulseFile,
-    data: PulseFile,
-    out: Path | None,
-    how: Mapping[str, Any],
-    *,
-    force: bool,
+    run: Run, pair: Pair, out: Path | None, how: Mapping[str, Any], force: bool
 ) -> Report:
-    sim, data = run.sim.reading(sim), run.data.reading(data)
+    pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
     if out is None:
-        return _report(run, sim, data, how)
-    read = (run.folder, *sim.files, *data.files, how["truth"])
+        return _report(run, pair, how)
+    read = (run.folder, *pair[0].files, *pair[1].files, how["truth"])
     with folder_written_aside(out, REPORT, *read, force=force) as aside:
-        report = _report(run, sim, data, how)
+        report = _report(run, pair, how)
         report.write(aside)
     return replace(report, folder=out)
 
 
-def _report(run: Run, sim: PulseFile, data: PulseFile, how: Mapping[str, Any]) -> Report:
+def _report(run: Run, pair: Pair, how: Mapping[str, Any]) -> Report:
     """Scores, and functions that draw; translated pulses are forgotten."""
     # imported late: not needed for the help of the command
     from cpunet.validation.evaluation import evaluate
 
-    found = evaluate(run, sim, data, **how)
+    found = evaluate(run, *pair, **how)
 
     # nor is matplotlib while the pulses take most memory
     from cpunet.validation.drawings import drawings
@@ -135,19 +125,13 @@ def _report(run: Run, sim: PulseFile, data: PulseFile, how: Mapping[str, Any]) -
 
 
 def _of_channels(
-    runs: RunLike,
-    sim: PulseFile,
-    data: PulseFile,
-    out: Path | None,
-    how: Mapping[str, Any],
-    *,
-    force: bool,
+    runs: RunLike, pair: Pair, out: Path | None, how: Mapping[str, Any], force: bool
 ) -> Outcome[Report]:
     """Validate the run of each channel of the data, with a page of all reports."""
     if out is None:
         raise CpunetError(f"`data_table` {ALL}: give `out`, the folder of the reports")
 
-    channels = paired(sim, data)
+    channels = paired(*pair)
     outcome = each_channel(channels, out, partial(_of_channel, runs, how, force))
     if outcome.done:
         folders = [out / name for name in channels]
@@ -163,11 +147,11 @@ def _of_channel(
 ) -> Path:
     """The folder of the report of a channel, made in a process of its own."""
     run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-    _validated(as_run(run), *pair, folder, how, force=force)
+    _validated(as_run(run), pair, folder, how, force)
     return folder
 
 
-def _notes(run: Run, metrics: Mapping[str, Any], truth: Path | None) -> list[str]:
+def _notes(run: Run, metrics: Metrics, truth: Path | None) -> list[str]:
     notes = [
         f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "

@@ -32,6 +32,7 @@ WITHIN = "agrees within errors"
 
 Worse = Literal["lower", "higher", "both"]
 Words = dict[str, float | str | None]
+Metrics = Mapping[str, Any]  # content of ``metrics.json``
 
 _SHORT = {"ren": "REN", "iren": "IREN"}
 _W1, _SPECTRUM = "_wasserstein", "_spectrum"
@@ -129,7 +130,7 @@ def verdict(
     return Verdict(sigma, True, WITHIN, quoted)
 
 
-def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[str, Verdict]:
+def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdict]:
     """Verdicts on one method at one peak, by quantity.
 
     Parameters
@@ -190,7 +191,7 @@ def method_verdicts(metrics: Mapping[str, Any], peak: str, method: str) -> dict[
     return found
 
 
-def verdict_table(metrics: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Words]]]:
+def verdict_table(metrics: Metrics) -> dict[str, dict[str, dict[str, Words]]]:
     """Verdicts on all methods, ready for JSON.
 
     Methods without noise are left out, since the missing noise alone makes them differ.
@@ -218,7 +219,7 @@ def verdict_table(metrics: Mapping[str, Any]) -> dict[str, dict[str, dict[str, W
     }
 
 
-def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
+def summary(metrics: Metrics, peak: str, method: str) -> str:
     """Return one line with the quantities that agree with the data and those that are off.
 
     A parameter is off if its IoU or its Wasserstein distance is; the noise is off if its RMS
@@ -252,7 +253,7 @@ def summary(metrics: Mapping[str, Any], peak: str, method: str) -> str:
     return f"{head}: {'; '.join(parts + silent) or 'not scored'}"
 
 
-def methods_of(metrics: Mapping[str, Any], peak: str) -> list[str]:
+def methods_of(metrics: Metrics, peak: str) -> list[str]:
     """Methods with noise in the scores of a peak, in their order there."""
     scores = part(metrics, "peaks", peak)
     names = [
@@ -294,7 +295,7 @@ def _agreement(agreeing: list[str], n_off: int) -> str:
     return f"{names} {'agree' if first else 'agrees'} with the data within errors"
 
 
-def judged_scores(metrics: Mapping[str, Any], method: str) -> tuple[int, int]:
+def judged_scores(metrics: Metrics, method: str) -> tuple[int, int]:
     """Number of scores of a method that are off, and number of scores with a verdict."""
     judged = [
         found.agrees
