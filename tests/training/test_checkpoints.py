@@ -24,10 +24,7 @@ VARIANTS = {
     "paper": (),
     "everything": (
         "generator.dropout=0.0",
-        "training.average_decay=0.5",
-        "training.instance_noise=0.1",
         "training.discriminator_interval=1",
-        "training.losses.gradient_penalty=1.0",
         "training.precision=bf16",
     ),
     "fast-step": ("generator.width=16", "training.discriminator_interval=2"),

@@ -61,29 +61,6 @@ def test_the_first_bad_iteration_is_named(tiny, sets, monkeypatch):
         train(*sets, tiny("training.iterations=20", "training.log_interval=10"), seed=0)
 
 
-def test_without_an_average_the_last_weights_are_kept(tiny, sets, monkeypatch):
-
-    history = []
-
-    class Watched(Step):
-        def __call__(self, iteration, sim, data, rows):
-            losses = super().__call__(iteration, sim, data)
-            history.append([p.detach().clone() for p in self.model.ren.parameters()])
-            return losses
-
-    monkeypatch.setattr(loop, "Step", Watched)
-    model = train(*sets, tiny("training.average_decay=0"), seed=0)
-    assert all(map(torch.equal, model.ren.parameters(), history[-1]))
-
-    history.clear()
-    model = train(*sets, tiny("training.average_decay=0.6"), seed=0)
-    expected = history[0]
-    for weights in history[1:]:
-        expected = [0.6 * e + 0.4 * w for e, w in zip(expected, weights, strict=True)]
-    for kept, truth in zip(model.ren.parameters(), expected, strict=True):
-        torch.testing.assert_close(kept.detach(), truth, rtol=1e-4, atol=1e-6)
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_training_on_a_gpu_goes_on(tiny, sets):

@@ -77,9 +77,8 @@ def test_the_adversarial_loss_alone_reaches_every_generator_parameter(tiny, batc
     assert all(p.grad is None for p in other.parameters())
 
 
-@pytest.mark.parametrize("penalty", [0.0, 0.3])
-def test_every_discriminator_parameter_learns(tiny, batches, penalty):
-    step = make_step(tiny(f"training.losses.gradient_penalty={penalty}"))
+def test_every_discriminator_parameter_learns(tiny, batches):
+    step = make_step(tiny())
     judges = nn.ModuleList(step.model.judges().values())
     before = parameters(judges)
     step(0, *batches)
@@ -165,31 +164,6 @@ def test_the_total_is_the_papers_weighted_sum(tiny):
         zip(GENERATOR_LOSSES, torch.tensor([1.0, 10, 100, 1e3, 1e4, 1e5]), strict=True)
     )
     assert float(step.total(values)) == 5 * (1 + 10) + 20 * (100 + 1000) + 9 * (1e4 + 1e5)
-
-
-def test_judges_see_the_instance_noise_and_it_fades(tiny, batches, monkeypatch):
-    sim, data = batches
-    recipe = tiny(
-        "training.instance_noise=0.3",
-        "training.discriminator_interval=1",
-        "training.iterations=10",
-        "training.decay_start=0",
-    )
-    step = make_step(recipe)
-    seen: list[Tensor] = []
-    judge = step.model.discriminator_data
-    forward = judge.forward
-
-    def noted(pulses: Tensor) -> Tensor:
-        seen.append(pulses.detach())
-        return forward(pulses)
-
-    monkeypatch.setattr(judge, "forward", noted)
-    for iteration in range(10):
-        seen.clear()
-        step(iteration, sim, data)
-        noise = (seen[1][: len(data)] - data).std()  # seen[0]: of the generators' update
-        assert float(noise) == pytest.approx(0.3 * (10 - iteration) / 10, rel=0.25)
 
 
 PAPER = load_recipe("paper").training.losses

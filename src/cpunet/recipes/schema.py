@@ -154,13 +154,7 @@ _Number = Annotated[int, Field(ge=1, le=1000)]
 
 
 class LossConfig(Config):
-    """Weights of the eight losses and of the three windows of the L1 terms.
-
-    ``gradient_penalty`` weighs the mean squared gradient of the discriminators on
-    real and translated pulses (Mescheder et al. 2018, arXiv:1801.04406; 0 in the
-    paper): it keeps a discriminator from growing so steep that it throws the
-    generators off.
-    """
+    """Weights of the eight losses and of the three windows of the L1 terms."""
 
     baseline_len: Samples
     rising_edge_len: Samples
@@ -171,21 +165,16 @@ class LossConfig(Config):
     cycle_weight: NonNegative
     identity_weight: NonNegative
     adversarial_weight: NonNegative
-    gradient_penalty: NonNegative
 
 
 class TrainingConfig(Config):
     """Settings of the training loop.
 
-    The final generators are running averages of the trained ones, with
-    ``average_decay`` per iteration (0: the last weights, as in the paper); their
-    batch-norm statistics are computed again over ``statistics_batches``.
+    Batch-norm statistics of the final generators are computed again over
+    ``statistics_batches``.
     After a start from another run, the rates rise from zero over ``warmup`` iterations.
-    ``instance_noise`` is the RMS of white noise added to all that the discriminators
-    see, falling with the rates (Sønderby et al. 2017, arXiv:1610.04490; 0 in the
-    paper): translations have no electronic noise, and a discriminator that recognises
-    them by that alone teaches nothing about the shape.  After every
-    ``checkpoint_interval`` iterations all that is needed to resume the training is saved.
+    After every ``checkpoint_interval`` iterations all that is needed to resume the training
+    is saved.
     ``precision`` is that of the generators' passes; ``compiled`` fuses them by torch.compile.
     With ``noise`` from ``baselines``, the generators do not make noise: noise drawn from the
     data's own baselines is added to all that a discriminator or a score sees.
@@ -202,8 +191,6 @@ class TrainingConfig(Config):
     weight_decay: NonNegative
     max_grad_norm: Positive
     discriminator_interval: Count
-    instance_noise: NonNegative
-    average_decay: Fraction
     statistics_batches: Count
     log_interval: Count
     checkpoint_interval: Count

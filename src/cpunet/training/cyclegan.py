@@ -210,23 +210,6 @@ def fake_loss(logits: Tensor) -> Tensor:
     return binary_cross_entropy_with_logits(logits, torch.zeros_like(logits))
 
 
-def mean_square_slope(logits: Tensor, pulses: Tensor) -> Tensor:
-    r"""Mean over pulses of the squared gradient of a discriminator, to be penalised.
-
-    .. math:: \Big\langle \sum_k (\partial l / \partial x_k)^2 \Big\rangle
-
-    after Mescheder et al., ICML 2018, arXiv:1801.04406.
-
-    Examples
-    --------
-    >>> pulses = torch.ones(2, 1, 3, requires_grad=True)
-    >>> float(mean_square_slope(2 * pulses.sum(dim=(1, 2)), pulses).detach())
-    12.0
-    """
-    (slope,) = torch.autograd.grad(logits.sum(), pulses, create_graph=True)
-    return slope.square().sum(dim=(1, 2)).mean()
-
-
 class Step:
     """One training iteration: generators always, discriminators at their interval.
 
@@ -253,7 +236,6 @@ class Step:
         self.outside, self.warmup = outside, warmup
         self.accuracy: dict[str, Tensor] = {}  # of the discriminators, if updated
         self.weights = window_weights(config.losses).to(next(model.parameters()).device)
-        self.noise = config.instance_noise
         self.ren, self.iren = (_pass(network, config) for network in (model.ren, model.iren))
 
         def adamw(parameters: list[nn.Parameter], rate: float) -> AdamW:
@@ -278,7 +260,6 @@ class Step:
         With noise outside the generators, `rows` are the indices of the simulated pulses.
         """
         model, limit = self.model, self.config.max_grad_norm
-        self.noise = self.config.instance_noise * self._falling(iteration)
         for judge in model.judges().values():  # they are fixed here
             judge.requires_grad_(False)
             judge.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
@@ -316,8 +297,8 @@ class Step:
             # generators make no noise: discriminators see it, and cycles of data lack it
             fake_data = self.outside.noisy_windows(fake_data, rows)
             ignored = tolerance(data, self.outside.preparation)
-        judged_data = self.model.discriminator_data(self._noisy(fake_data))  # (batch,)
-        judged_sim = self.model.discriminator_sim(self._noisy(fake_sim))
+        judged_data = self.model.discriminator_data(fake_data)  # (batch,)
+        judged_sim = self.model.discriminator_sim(fake_sim)
         losses = {
             "identity_data": weighted_l1(same_data, data, weights),
             "identity_sim": weighted_l1(same_sim, sim, weights),
@@ -338,37 +319,24 @@ class Step:
         )
 
     def _judge(self, side: str, real: Tensor, fake: Tensor) -> Tensor:
-        """Update the discriminator of a side; return its loss without the gradient penalty."""
+        """Update the discriminator of a side; return its loss."""
         network, optimiser = self.model.judges()[side], self.discriminators[side]
-        weight = self.config.losses.gradient_penalty
         # in one batch: the batch norm must see both kinds together
-        pulses = self._noisy(torch.cat([real, fake])).requires_grad_(weight > 0)
-        # cuDNN's GRU has no second derivative
-        with torch.backends.cudnn.flags(enabled=weight == 0):
-            logits = network(pulses)  # (2 batch,)
+        logits = network(torch.cat([real, fake]))  # (2 batch,)
         of_real, of_fake = logits[: len(real)], logits[len(real) :]
         loss = real_loss(of_real) + fake_loss(of_fake)
-        penalty = weight * mean_square_slope(logits, pulses) if weight else 0.0
         optimiser.zero_grad(set_to_none=True)
-        (loss + penalty).backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call]
         clip_grad_norm_(network.parameters(), self.config.max_grad_norm)
         optimiser.step()
         self.accuracy[side] = torch.cat([of_real > 0, of_fake < 0]).float().mean()
         return loss
 
-    def _noisy(self, pulses: Tensor) -> Tensor:
-        """Add the instance noise of this iteration, if any."""
-        return pulses + self.noise * torch.randn_like(pulses) if self.noise else pulses
-
-    def _falling(self, iteration: int) -> float:
-        """Constant, then linear to zero at the end (paper, section 3.4.2)."""
-        last = self.config.iterations
-        return min(1.0, max(0, last - iteration) / max(1, last - self.config.decay_start))
-
     def _rate_factor(self, iteration: int) -> float:
-        """The factor above, after a linear rise in the first iterations."""
+        """A linear rise after a start, then constant, then linear to zero (section 3.4.2)."""
         rise = min(1.0, (iteration + 1) / self.warmup) if self.warmup else 1.0
-        return rise * self._falling(iteration)
+        config, left = self.config, max(0, self.config.iterations - iteration)
+        return rise * min(1.0, left / max(1, config.iterations - config.decay_start))
 
 
 def _pass(network: nn.Module, config: TrainingConfig) -> Callable[[Tensor], Tensor]:

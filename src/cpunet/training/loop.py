@@ -1,7 +1,7 @@
 """The training loop: batch, step, log, checkpoint, and stop if a loss is not finite.
 
-One step is in `cpunet.training.cyclegan`.  The final generators are running averages of the
-trained ones, with batch-norm statistics of the side that each of them translates.
+One step is in `cpunet.training.cyclegan`.  In the end, generators get batch-norm statistics of
+the side that each of them translates.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, update_bn
+from torch.optim.swa_utils import update_bn
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -104,10 +104,7 @@ def train(
         if start is not None:
             training.load_state_dict(start)
         training.run(listener, save)
-        for averaged, network, sampler in zip(
-            training.averages, training.generators, samplers, strict=True
-        ):
-            network.load_state_dict(averaged.module.state_dict())
+        for network, sampler in zip((model.ren, model.iren), samplers, strict=True):
             refresh_batch_statistics(network, sampler, config.statistics_batches)
     return model.eval()
 
@@ -199,12 +196,9 @@ class _Training:
         self, step: Step, samplers: list[EpochSampler], device: str, seed: int
     ) -> None:
         self.step, self.samplers, self.config, self.seed = step, samplers, step.config, seed
-        self.model, self.generators = step.model, (step.model.ren, step.model.iren)
+        self.model = step.model
         self.device = torch.device(device)
-        average = get_ema_multi_avg_fn(self.config.average_decay)  # type: ignore[no-untyped-call]
-        self.averages = [AveragedModel(g, multi_avg_fn=average) for g in self.generators]
         self.parts: dict[str, Sequence[Any]] = {
-            "averages": self.averages,
             "optimisers": step.optimisers,
             "schedules": step.schedules,
             "decks": samplers,
@@ -216,8 +210,6 @@ class _Training:
         iteration, rate = self.iteration, float(self.step.schedules[0].get_last_lr()[0])
         sim, data = (sampler.next_batch() for sampler in self.samplers)
         losses = self.step(iteration, sim, data, self.samplers[0].last_rows)
-        for averaged, network in zip(self.averages, self.generators, strict=True):
-            averaged.update_parameters(network)
         self.iteration += 1
         told = {"iteration": iteration, "rate": rate, "losses": losses}
         return told | ({"accuracy": self.step.accuracy} if self.step.accuracy else {})
