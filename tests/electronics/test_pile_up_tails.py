@@ -14,7 +14,6 @@ from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.drawn_pile_up import (
     SIZES_KEV,
     DrawnTails,
-    SameNoise,
     TraceNoise,
     passing,
 )
@@ -264,29 +263,6 @@ def test_another_rate_is_without_cuts():
 def test_they_are_told_and_read_again():
     again = DrawnTails.of(json.loads(json.dumps(DRAWN.describe())))
     assert again.describe() == DRAWN.describe()
-
-
-def test_noise_of_several_methods_is_drawn_once_and_is_what_each_would_draw():
-    noise = TraceNoise(BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50), DRAWN)
-    energies = np.linspace(500.0, 2000.0, 20)
-    # the second as the first; then after another draw, for other pulses, for other records
-    asked = [
-        (1, 0, energies, 600),
-        (1, 0, energies, 600),
-        (1, 1, energies, 600),
-        (1, 0, energies[:9], 600),
-        (1, 0, energies, 700),
-        (2, 0, energies, 700),
-    ]
-    same = SameNoise(noise)
-    for seed, before, kev, length in asked:
-        own, shared = (np.random.default_rng(seed) for _ in range(2))
-        own.random(before), shared.random(before)
-        expected = noise.draw(kev, length, own)
-        found = same.draw(kev, length, shared)
-        np.testing.assert_array_equal(found, expected)
-        assert shared.random() == own.random()
-        found += 1  # the caller's own
 
 
 def test_records_get_noise_and_tails_in_proportion_to_their_energies():

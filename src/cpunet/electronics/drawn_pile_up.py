@@ -152,37 +152,6 @@ class TraceNoise:
         return drawn
 
 
-class SameNoise:
-    """Noise that several methods add to the same records in turn, drawn only once.
-
-    Parameters
-    ----------
-    noise
-        Noise of the records.
-    """
-
-    def __init__(self, noise: BaselineNoise | TraceNoise) -> None:
-        self._noise = noise
-        # arguments of the last draw, its result, and the state of the generator after it
-        self._last: tuple[Any, FloatArray, Any] | None = None
-
-    @property
-    def dt_ns(self) -> float:
-        """Sampling period of the noise in ns."""
-        return self._noise.dt_ns
-
-    def draw(
-        self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
-    ) -> FloatArray:
-        """Draw like the noise itself; repeat the last draw for the same generator state."""
-        asked = (rng.bit_generator.state, energy_kev.tobytes(), length)
-        if self._last is None or self._last[0] != asked:
-            drawn = self._noise.draw(energy_kev, length, rng)
-            self._last = asked, drawn, rng.bit_generator.state
-        _, drawn, rng.bit_generator.state = self._last
-        return drawn.copy()
-
-
 def passing(
     tails: PileUpTails, traces: Pulses, config: PreparationConfig, cuts: CutWindows
 ) -> tuple[float, ...] | None:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import SameNoise, TraceNoise
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import tail_slope
@@ -75,7 +75,7 @@ def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> F
     return extended(windows, config, dt_ns, record_length(config.length), before)
 
 
-RecordNoise = BaselineNoise | TraceNoise | SameNoise
+RecordNoise = BaselineNoise | TraceNoise
 
 BLOCK = 512  # pulses at a time, to bound memory
 

@@ -24,7 +24,7 @@ import torch
 
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails, SameNoise, TraceNoise
+from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
 from cpunet.electronics.finishing import blocks, finish
 from cpunet.electronics.fitted_kernels import BASELINE_METHODS
 from cpunet.electronics.measured import noise_of, tails_of
@@ -332,8 +332,8 @@ def translate_all(
     }
     truth = None if responses is None else np.empty(shape, np.float32)
     generator = ren.seeded(seed)
-    # the random generators of all methods are in the same state
-    noise = None if baselines.noise is None else SameNoise(baselines.noise)
+    noise = baselines.noise
+    # all methods get the same noise
     rngs = {name: np.random.default_rng(seed) for name in others}
     parts: dict[str, list[NoiseFree]] = {}
     with stage("Translating", len(pulses)) as bar:
