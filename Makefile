@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: install install-locked lock install-dev demo test test-thorough test-slow lint docs clean
+.PHONY: install install-locked lock install-dev resolve demo test test-thorough test-slow lint docs clean
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
@@ -42,6 +42,12 @@ lint: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# could LEGEND's chain be installed beside it, the newest and the oldest that was tested? (a dry run)
+RESOLVE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --dry-run .
+resolve: install
+	$(RESOLVE) --upgrade legend-lh5io legend-pydataobj dspeed pygama reboost
+	$(RESOLVE) legend-lh5io==0.2.3 legend-pydataobj==2.0.1 dspeed==2.1.4 pygama==2.3.10 reboost==1.0.0
 
 # site/index.html, which needs no network; a warning is an error
 docs: install-dev
