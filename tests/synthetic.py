@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
+from cpunet.electronics.tails_law import TailsLaw, energies_at
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
@@ -352,3 +353,9 @@ def write_report(
     """Write a report of these metrics and figures into a folder."""
     drawn = {name: partial(lambda one: one, one) for name, one in (figures or {}).items()}
     Report(metrics, {}, None, drawn, notes).write(folder)
+
+
+def mean_kev(law: TailsLaw) -> float:
+    """Mean tail, rate times decay time times mean energy (Campbell's theorem)."""
+    energies = energies_at((np.arange(1000) + 0.5) / 1000, law.energies_kev)
+    return float(law.expected * energies.mean())

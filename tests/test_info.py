@@ -283,3 +283,17 @@ def test_the_command_line(tmp_path, capsys):
     printed = told(table, "--table", "all")
     assert printed.startswith("1 ")
     assert "ch3:\nthe sampling period is not in the file; give --dt-ns" in printed
+
+
+def test_measured_traces_are_described(reference_data: Path):
+    """A bench detector: what its digitiser was set to, and what is seen by eye."""
+    told = info(reference_data / "real" / "th228.fcio").values["traces"]
+    assert told["looked_at"] == 1000
+    low, middle, high = told["trigger_sample"]
+    assert low <= middle <= high
+    assert middle == pytest.approx(911, abs=3)
+    assert 700 < told["baseline_samples"] < middle
+    assert told["decay_us"] == pytest.approx(78.9, rel=0.03)
+    assert told["saturated_percent"] == pytest.approx(0.2)
+    assert told["noise_adc"] == pytest.approx(15, abs=2)
+    assert told["noise_kev"] is None

@@ -50,10 +50,6 @@ def traces(n: int = 300, seed: int = 0, start: int = 500) -> Pulses:
     return Pulses.of(np.round(15_000 + ADC_PER_KEV * adc), dt_ns=DT_NS, energy_kev=energy)
 
 
-def without_tails(n: int = 300, start: int = 500) -> Pulses:
-    return traces(n, start=start)[np.arange(n) % 10 > 0]
-
-
 @pytest.fixture(scope="module")
 def noise() -> BaselineNoise:
     return BaselineNoise.of(Baselines.of([traces()], CONFIG))
@@ -202,54 +198,80 @@ def test_baselines_of_different_kinds_are_drawn_as_such(n: int) -> None:
     assert width.std() == pytest.approx(0.3, rel=0.25)
 
 
+def test_beginnings_of_windows_show_the_fast_part() -> None:
+    rng = np.random.default_rng(13)
+    raw = on_baselines(2 * coloured(600, 1200, rng))
+    windows = prepare(raw, CONFIG, "measured").pulses
+    noise = BaselineNoise.from_windows(windows, 200)
+    # so short ones leave what is slow to a guess
+    assert noise.rms == pytest.approx(2 * TO_PREPARED, rel=0.1)
+    drawn = noise.draw(np.ones(400), 1200, rng) / TO_PREPARED
+    for lag in (1, 3, 8):
+        assert drift(drawn, lag) == pytest.approx(4 * (1 - 0.8**lag), rel=0.05)
+
+
 def test_traces_without_noise_are_refused() -> None:
     with pytest.raises(CpunetError, match="most baselines are constant"):
         BaselineNoise.of(Baselines.of([on_baselines(np.zeros((100, 1200)))], CONFIG))
 
 
+FAST = load_recipe("fast").preparation
+DT_NS, WHITE_KEV, DECAY_SAMPLES = 16.0, 2.0, 4000.0
+# prepared pulses are 0.8 where a step has come down for 397 samples
+WANTED = WHITE_KEV * 0.8 / np.exp(-397 / DECAY_SAMPLES)
+
+
+def white_traces(n: int = 300, start: int = 560, seed: int = 0) -> Pulses:
+    """Raw white_traces of different energies with white noise of one size in keV."""
+    rng = np.random.default_rng(seed)
+    energy = rng.uniform(1500, 2700, n)
+    time = np.arange(start + 700) - start
+    pulse = np.clip(time / 40, 0, 1) * np.exp(-np.maximum(time - 40, 0) / DECAY_SAMPLES)
+    kev = energy[:, np.newaxis] * pulse + rng.normal(0, WHITE_KEV, (n, len(time)))
+    return Pulses.of(15_000 + 10 * kev, dt_ns=DT_NS, energy_kev=energy)
+
+
 def as_input(raw: Pulses) -> InputSet:
-    prepared, baselines = prepare(raw, CONFIG, "measured"), Baselines.of([raw], CONFIG)
+    prepared, baselines = prepare(raw, FAST, "measured"), Baselines.of([raw], FAST)
     return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, baselines=baselines)
 
 
 def test_noise_of_raw_traces_needs_no_word() -> None:
-    noise, note = measured_noise(as_input(traces()), CONFIG)
+    noise, note = measured_noise(as_input(white_traces()), FAST)
     assert note is None
-    assert noise.rms == pytest.approx(NOISE_KEV * TO_PREPARED, rel=0.03)
-    assert noise.n_baselines > 200
+    assert noise.rms == pytest.approx(WANTED, rel=0.03)
+    assert noise.n_baselines > 250
 
 
 def test_energies_that_are_not_known_do_not_matter() -> None:
-    raw = traces(400)
+    raw = white_traces(400)
     raw.energy_kev[::4] = np.nan
     raw.energy_kev[1::4] = 0
     raw.waveforms[::4] += np.random.default_rng(1).normal(0, 500, raw.waveforms[::4].shape)
     noise = noise_of(as_input(raw))
-    assert noise.rms == pytest.approx(NOISE_KEV * TO_PREPARED, rel=0.04)
+    assert noise.rms == pytest.approx(WANTED, rel=0.04)
     assert noise.n_baselines <= 200
 
 
 def test_prepared_windows_fall_back_on_their_beginnings() -> None:
-    windows = prepare(without_tails(600), CONFIG, "measured").pulses
-    noise, note = measured_noise(as_input(windows), CONFIG)
+    windows = prepare(white_traces(), FAST, "measured").pulses
+    noise, note = measured_noise(as_input(windows), FAST)
     assert note is not None
-    assert note.startswith(f"noise is taken from {CONFIG.baseline_samples // 2} samples a")
+    assert note.startswith(f"noise is taken from {FAST.baseline_samples // 2} samples a pulse")
     assert "\n" not in note
-    # so short ones leave what is slow to a guess, and show the fast part
-    assert noise.rms == pytest.approx(NOISE_KEV * TO_PREPARED, rel=0.1)
-    drawn = noise.draw(np.ones(400), 1200, np.random.default_rng(2)) / TO_PREPARED
-    for lag in (1, 3, 8):
-        assert drift(drawn, lag) == pytest.approx(NOISE_KEV**2 * (1 - 0.8**lag), rel=0.05)
+    assert noise.rms == pytest.approx(WANTED, rel=0.05)
+    drawn = noise.draw(np.full(300, 2000.0), 1400, np.random.default_rng(2))
+    assert drawn.std() == pytest.approx(WANTED / 2000, rel=0.05)
 
 
 def test_traces_that_begin_late_fall_back_too() -> None:
-    noise, note = measured_noise(as_input(without_tails(start=380)), CONFIG)
+    noise, note = measured_noise(as_input(white_traces(start=380)), FAST)
     assert note is not None
     assert "samples before the pulse; the noise needs 400 or more" in note
-    assert noise.rms == pytest.approx(NOISE_KEV * TO_PREPARED, rel=0.2)  # begins with padding
+    assert noise.rms == pytest.approx(WANTED, rel=0.05)
 
 
 def test_without_energies_there_is_no_noise() -> None:
-    raw = Pulses.of(traces(60).waveforms, dt_ns=DT_NS)
+    raw = Pulses.of(white_traces(60).waveforms, dt_ns=DT_NS)
     with pytest.raises(CpunetError, match="only 0 flat baselines among 60 traces"):
-        measured_noise(as_input(raw), CONFIG)
+        measured_noise(as_input(raw), FAST)

@@ -165,11 +165,17 @@ def test_encoded_waveforms_are_decoded(file, raw):
     np.testing.assert_array_equal(got, raw)
 
 
-def test_ragged_waveforms_of_one_length_are_read(file):
-    values = VectorOfVectors([[1, 2, 3, 4]] * 5, dtype=np.uint16)
-    lh5.write(Table(col_dict={"waveform": waveform_table(values)}), "raw", file)
-    assert [len(block) for block in open_pulses(file).blocks(2)] == [2, 2, 1]
-    np.testing.assert_array_equal(open_pulses(file).read().waveforms[4], [1, 2, 3, 4])
+def test_ragged_waveforms_are_refused_if_they_differ(file):
+    even = VectorOfVectors([[1, 2, 3, 4]] * 5, dtype=np.uint16)
+    odd = VectorOfVectors([[1, 2, 3, 4]] * 4 + [[1, 2]], dtype=np.uint16)
+    for name, values in (("even", even), ("odd", odd)):
+        lh5.write(Table(col_dict={"waveform": waveform_table(values)}), name, file)
+    assert [len(b) for b in open_pulses(file, table="even").blocks(2)] == [2, 2, 1]
+    np.testing.assert_array_equal(
+        open_pulses(file, table="even").read().waveforms[4], [1, 2, 3, 4]
+    )
+    with pytest.raises(CpunetError, match=r"event 4: 2 samples, others have 4"):
+        open_pulses(file, table="odd").read()
 
 
 def test_a_period_that_changes_names_the_event(file, raw):
@@ -369,3 +375,10 @@ def test_no_column_replaces_another(tmp_path):
     for others in (in_file, beside):
         values = {name: column.nda[0] for name, column in others.read(0, 6).items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
+
+
+def test_the_users_period_must_agree(file, raw):
+    lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
+    assert open_pulses(file, dt_ns=16).dt_ns == 16
+    with pytest.raises(CpunetError, match=r"every 16 ns, but `dt_ns` says 10; drop"):
+        open_pulses(file, dt_ns=10)

@@ -111,6 +111,16 @@ def test_tail_slope_equals_a_polynomial_fit():
     assert tail_slope(waveforms, DT_NS, 300) == pytest.approx(expected, rel=1e-9)
 
 
+def test_current_amplitude_of_measured_traces_equals_the_production_chain(reference_data):
+    import h5py
+
+    with h5py.File(reference_data / "closure" / "data.lh5") as file:
+        traces = file["geds/raw/waveform/values"][:300].astype(np.float32)
+    traces -= traces[:, :200].mean(axis=1, keepdims=True)
+    traces /= traces.max(axis=1, keepdims=True)
+    assert np.abs(current_amplitude(traces) - production_chain(traces)).max() < 1e-6
+
+
 def parameters_of(waveforms: np.ndarray) -> dict[str, np.ndarray]:
     pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=DT_NS)
     return all_parameters(pulses, PREPARATION, SCORES)

@@ -18,6 +18,7 @@ from cpunet.simulation.velocity import (
     HOLE,
     VelocityTable,
     carrier_velocity,
+    measured_table,
     velocity_factor,
     velocity_table,
 )
@@ -49,6 +50,12 @@ def test_nothing_drifts_from_a_contact_or_from_outside(planar: FieldMaps, far: f
     assert np.isnan(paths.electrons).all()
 
 
+def test_a_single_place_is_one_path(planar: FieldMaps) -> None:
+    paths = drift_paths(planar, 5.0, 3.0, 8.0, STEPS)
+    assert paths.holes.shape == (1, STEPS.n_steps, 3)
+    np.testing.assert_array_equal(paths.holes, drift_paths(planar, [5], [3], [8], STEPS).holes)
+
+
 def test_reference_paths(reference_data: Path, reference_maps: FieldMaps) -> None:
     with np.load(reference_data / "siggen" / "drift_paths_A_grid0.1.npz") as data:
         start, expected = data["positions"], data["paths"][:, : STEPS.n_steps]
@@ -75,6 +82,16 @@ def test_reference_vectors(
     np.testing.assert_allclose(velocity, expected, atol=3e-7)
 
 
+@pytest.mark.parametrize(("axis", "column"), [((1, 0, 0), 1), ((1, 1, 0), 2), ((1, 1, 1), 3)])
+def test_along_the_axes_the_table_comes_back(axis: tuple[int, ...], column: int) -> None:
+    table = measured_table()
+    direction = np.array(axis) / np.linalg.norm(axis)
+    for carrier, sign in ((ELECTRON, -1), (HOLE, 1)):
+        velocity = drift_velocity(velocity_table(77), table[:, :1] * direction, carrier)
+        speed = table[:, column + 3 * carrier]
+        np.testing.assert_allclose(velocity, sign * speed[:, None] * direction, atol=1e-12)
+
+
 @given(component, component, component)
 def test_cubic_symmetry(x: float, y: float, z: float) -> None:
     table = velocity_table(90)
@@ -83,6 +100,15 @@ def test_cubic_symmetry(x: float, y: float, z: float) -> None:
         turned = drift_velocity(table, [[-y, x, z], [y, z, x], [x, y, -z]], carrier)
         expected = [[-vy, vx, vz], [vy, vz, vx], [vx, vy, -vz]]
         np.testing.assert_allclose(turned, expected, atol=1e-12)
+
+
+def test_colder_crystals_are_faster_and_no_field_means_no_motion() -> None:
+    field = [[300.0, 100.0, 50.0], [0.0, 0.0, 0.0]]
+    for carrier in (ELECTRON, HOLE):
+        cold = np.linalg.norm(drift_velocity(velocity_table(77), field, carrier), axis=1)
+        warm = np.linalg.norm(drift_velocity(velocity_table(95), field, carrier), axis=1)
+        assert cold[0] > warm[0] > 0
+        assert cold[1] == warm[1] == 0
 
 
 def test_factors_hold_below_and_above_and_change_smoothly_in_between() -> None:

@@ -87,6 +87,23 @@ def test_an_undepleted_detector_is_refused() -> None:
         compute_fields(read_detector("icpc", [*COARSE, "impurity_z0_1e10_per_cm3=-90"]))
 
 
+def test_solved_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG", "cpunet")
+    detector = read_detector("icpc", COARSE)
+    first = compute_fields(detector)
+    assert caplog.messages
+    caplog.clear()
+    warmer = detector.model_copy(update={"temperature_K": 100.0, "name": "warm"})
+    second = compute_fields(warmer)
+    assert not caplog.messages
+    assert second.temperature_K == 100
+    np.testing.assert_array_equal(first.potential_V, second.potential_V)
+    assert same(first, compute_fields(detector))
+    thicker = detector.model_copy(update={"li_thickness": 1.1})
+    compute_fields(thicker)
+    assert caplog.messages
+
+
 @pytest.mark.parametrize("damage", ["cut", "empty", "text", "other"])
 def test_a_damaged_cache_is_solved_anew(damage: str) -> None:
     detector = read_detector("icpc", COARSE)
@@ -157,6 +174,19 @@ def test_the_scale_decides_whether_a_bias_depletes(caplog: pytest.LogCaptureFixt
     caplog.set_level("DEBUG", "cpunet")
     assert solve(same_sum).unit_depletion_V == np.inf
     assert not caplog.messages
+
+
+def test_undepleted_parts_are_not_superposed() -> None:
+    detector = read_detector("ppc", COARSE)
+    solution = solve(detector)
+    depletion = solution.depletion_V(1.3)
+    for volts in (depletion + 1, depletion - 1):
+        if volts > depletion:
+            assert solution.potential_V(volts, 1.3).max() == pytest.approx(volts)
+            continue
+        wanted = detector.model_copy(update={"bias_V": volts, "impurity_scale": 1.3})
+        with pytest.raises(CpunetError, match="does not deplete it; give at least the dep"):
+            superposed_fields(solution, wanted)
 
 
 @pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)

@@ -32,6 +32,13 @@ def test_active_germanium_is_inside(name: str, r: float, z: float) -> None:
     assert not detector.active(r, z) or detector.inside(r, z)
 
 
+@given(z=st.floats(2.1, 60), depth=st.floats(0, 3))
+def test_lithium_is_as_thick_as_said_on_the_wall(z: float, depth: float) -> None:
+    r = ICPC.crystal_radius - depth
+    assert ICPC.inside(r, z)
+    assert ICPC.active(r, z) == (depth > ICPC.li_thickness + 1e-5)
+
+
 @pytest.mark.parametrize("taper", ["outer", "inner", "bottom"])
 def test_lithium_is_as_thick_as_said_on_a_taper(taper: str) -> None:
     detector = changed(

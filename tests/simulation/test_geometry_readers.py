@@ -348,11 +348,9 @@ def test_what_was_cut_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     assert "pc_radius is 12 mm, as in siggen: at most wrap_around_radius - ditch_th" in said
 
 
-def test_what_is_not_symmetric_is_refused(tmp_path: Path) -> None:
+def test_holes_beside_the_axis_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CpunetError, match="hole_offset_y_top is not 0; only axially symmetric"):
         siggen(tmp_path, "hole_offset_y_top 4")
-    with pytest.raises(CpunetError, match=r"geometry\.extra\.crack cuts off a side; only"):
-        legend(tmp_path, {"crack": {"radius_in_mm": 8, "width_in_mm": 22}})
 
 
 ICPC: dict[str, Any] = {
@@ -401,6 +399,18 @@ def legend(folder: Path, *extra: object, overrides: tuple[str, ...] = ()) -> Det
 )
 def test_extra_shapes_that_change_nothing(tmp_path: Path, extra: object) -> None:
     assert legend(tmp_path, extra).fingerprint() == legend(tmp_path).fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        ({"crack": {"radius_in_mm": 8, "width_in_mm": 22}}, "crack cuts off a side; only"),
+        ({"hole": {"depth_in_mm": 5}}, "hole.depth_in_mm"),
+    ],
+)
+def test_extra_shapes_that_no_crystal_has(tmp_path: Path, extra: object, said: str) -> None:
+    with pytest.raises(CpunetError, match=rf"geometry\.extra\.{said}"):
+        legend(tmp_path, extra)
 
 
 def test_symmetric_extra_shapes_are_simulated(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.events import INTERPOLATED, simulate_events
-from cpunet.simulation.fields import FieldMaps
+from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings
@@ -90,6 +91,18 @@ def test_reference_pulses(reference_data: Path, reference_maps: FieldMaps) -> No
     assert np.median(worst) < 3e-4
     # the others start beside the contact or end at its corner, between nodes 0.5 mm apart
     assert (worst < 1e-3).sum() >= 192
+
+
+@pytest.mark.thorough
+def test_pulses_in_own_fields_agree_with_the_reference(reference_data: Path) -> None:
+    with np.load(
+        reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
+    ) as data:
+        start, expected = data["positions"], data["wf1"]
+    signals = hit_signals(compute_fields(read_detector("icpc")), *start.T, 100.0, PLAIN)
+    collected = [np.argmax(w > 0.995, axis=1) for w in (signals.waveforms, expected)]
+    assert np.abs(np.subtract(*collected)).max() <= 1
+    assert np.sqrt(np.mean((signals.waveforms - expected) ** 2, axis=1)).max() < 2e-3
 
 
 def test_reference_clouds(reference_data: Path, reference_maps: FieldMaps) -> None:

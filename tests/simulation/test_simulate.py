@@ -253,6 +253,18 @@ def test_hits_nearly_all_outside_are_refused(ppc, tmp_path: Path):
         HitFile(npz(tmp_path / "hits.npz", hits)).open(ppc)
 
 
+def test_impurities_from_the_depletion_are_told_and_kept(ppc, source, tmp_path: Path, caplog):
+    caplog.set_level("INFO", "cpunet")
+    out = tmp_path / "sim.lh5"
+    values = {"measured_depletion_V": 2100.0, "impurity_scale": "depletion"}
+    simulate(out, detector=ppc, hits=source, settings=SETTINGS | values)
+    made = json.loads(h5py.File(out)["geds/sim"].attrs["simulation"])
+    scale = made["detector"]["impurity_scale"]
+    assert made["depletion_V"] == pytest.approx(2100, abs=1)
+    assert scale > 1.05
+    assert any(f"impurities times {scale:.4g}" in note for note in caplog.messages)
+
+
 def test_no_event_with_a_signal(ppc, tmp_path: Path):
     dead = HitFile(npz(tmp_path / "hits.npz", HITS[2:3]))
     with pytest.raises(CpunetError, match="none of 1 events gives a signal"):

@@ -273,3 +273,7 @@ def test_blocks_do_not_decide_which_tails_are_excluded(
     assert used[0] / len(sim) == pytest.approx(share, abs=0.005)
     for total in totals[1:]:
         np.testing.assert_allclose(total, totals[0], rtol=1e-4, atol=1e-4 * used[0])
+
+
+def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:
+    assert "ringing_mhz" not in near.response.describe()

@@ -338,3 +338,16 @@ def test_too_few_events_are_told() -> None:
     nothing = np.full(500, np.nan)
     assert against_energy({"data": nothing}, {"data": 2000 + 0 * nothing}, LINES).missing
     assert site_fit(np.full(500, 0.1)) is None
+
+
+def test_sigma_of_agreeing_sets_is_standard_normal():
+    rng = np.random.default_rng(5)
+    sigmas = [
+        survival_table(
+            by_peak(data=peaks(rng, 300, 300), ren=peaks(rng, 500, 700)),
+            seed=rng,
+        )["SEP"].sigma["ren"]
+        for _ in range(200)
+    ]
+    assert np.mean(sigmas) == pytest.approx(0, abs=0.25)
+    assert np.std(sigmas) == pytest.approx(1, abs=0.15)
