@@ -16,23 +16,21 @@ from cpunet.electronics.chain import (
     NoiseSpectrum,
     read_electronics,
 )
-from cpunet.electronics.exact_response import linear_response, respond
+from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.finishing import PADDING_BEFORE, record_length, with_room
 from cpunet.electronics.readout import (
     RawTraces,
     coloured_noise,
-    cut_noise,
     draw_other_pulses,
     noise_power,
-    read_baselines,
     read_out,
 )
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
-from synthetic import mean_kev, write_pulses
+from synthetic import mean_kev
 
 PRESETS = ("legend200", "ornl", "ringing")
 T_NS = np.arange(0, 20_000, 0.5)
@@ -105,16 +103,6 @@ def test_ornl_decays_as_measured():
     assert 0.93 <= 0.80 / after <= 0.97
 
 
-def test_slew_and_quadratic_bend_tall_pulses_more():
-    chain = altered(non_linearity={"quadratic_fraction": 0.01, "slew_kev_per_ns": None})
-    steps = Pulses.of(np.ones((2, 900)), dt_ns=4, energy_kev=[261.45, 2614.5])
-    bent = respond(steps, chain).max(axis=1) / linear_response(steps, chain).max(axis=1)
-    assert bent == pytest.approx([1.001, 1.01], abs=2e-4)
-    slow = altered(non_linearity={"quadratic_fraction": 0.0, "slew_kev_per_ns": 2.0})
-    rate = np.diff(respond(steps, slow), axis=1).max(axis=1) * steps.energy_kev / 16
-    assert rate[1] == pytest.approx(2.0, rel=1e-3)
-
-
 @pytest.mark.parametrize(
     ("values", "field"),
     [
@@ -141,7 +129,7 @@ def test_impossible_chains_name_the_field(tmp_path: Path, values: dict, field: s
 def test_a_pole_faster_than_the_grid_names_the_field():
     steps = Pulses.of(np.ones((1, 900)), dt_ns=4, energy_kev=[1000])
     with pytest.raises(CpunetError, match="bandwidth_poles_ns means 3 ns"):
-        respond(steps, altered(bandwidth_poles_ns=[40, 3]))
+        linear_response(steps, altered(bandwidth_poles_ns=[40, 3]))
 
 
 CONFIG = load_recipe("paper").preparation
@@ -207,30 +195,10 @@ def test_noise_has_the_spectrum_asked_for():
     assert np.abs(ratio - 1).max() < 0.05
 
 
-def test_noise_cut_from_baselines_is_theirs(tmp_path):
-    path = tmp_path / "baselines.lh5"
-    white = 14000 + np.random.default_rng(4).normal(0, 7, (50, 2000))
-    write_pulses(path, Pulses.of(white, dt_ns=16, energy_kev=np.zeros(50)))
-    baselines = read_baselines(path, 1200, 16)
-    cut = cut_noise(baselines, 200, 1200, np.random.default_rng(5))
-    assert cut.std() == pytest.approx(1, rel=0.02)
-    kev = altered(noise={"rms_kev": 2.0, "baselines_file": path})
-    steps = Pulses.of(np.ones((20, 900)), dt_ns=4, energy_kev=np.full(20, 1000.0))
-    level = read_out(steps, kev, seed=1).waveforms[:, :400].std() / kev.gain_adc_per_kev
-    assert level > 1.9
-    with pytest.raises(CpunetError, match="shorter than the record"):
-        read_baselines(path, 2001, 16)
-    white[17, 3] = np.nan
-    write_pulses(tmp_path / "broken.lh5", Pulses.of(white, dt_ns=16, energy_kev=np.zeros(50)))
-    with pytest.raises(CpunetError, match="baseline 17 is not finite; leave it out"):
-        read_baselines(tmp_path / "broken.lh5", 1200, 16)
-
-
 def test_clean_traces_are_baseline_gain_and_response(pulses: Pulses):
     quiet = altered(
-        noise={"rms_kev": 0.0, "spectrum": read_electronics("ornl").noise.spectrum},
-        earlier_pulses={"rate_kHz": 0.0},
-        pile_up={"rate_kHz": 0.0},
+        noise={"rms_kev": 0.0, "spectrum": QUIET},
+        **rates(),
     )
     traces = read_out(pulses, quiet, seed=3)
     height = quiet.gain_adc_per_kev * traces.true_energy_kev[:, None]
@@ -285,34 +253,6 @@ def test_piled_up_pulses_are_where_the_truth_says():
     assert rise_ns(rest) - rise_ns(own[alone]) == pytest.approx(traces.piled_ns[alone], abs=5)
     assert rest.max(axis=1) == pytest.approx(traces.piled_kev[alone], rel=0.03)
     assert np.isnan(traces.piled_kev[traces.n_piled == 0]).all()
-
-
-def test_hum_is_a_wave_of_its_size():
-    hum = {"frequency_Hz": 50, "amplitude_kev": 30}
-    noise = {"rms_kev": 0.0, "spectrum": QUIET}
-    chain = altered("ornl", noise=noise, hum=hum, **rates())
-    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
-    traces = read_out(steps, chain, seed=2)
-    level = traces.waveforms[:, :400].mean(axis=1) - traces.baseline_adc
-    assert level.std() == pytest.approx(30 * chain.gain_adc_per_kev / 2**0.5, rel=0.1)
-
-
-def test_wandering_is_recovered_from_levels_and_their_changes():
-    noise, wander = {"rms_kev": 0.0, "spectrum": QUIET}, {"time_us": 200, "rms_kev": 20}
-    chain = altered("ornl", noise=noise, wander=wander, **rates())
-    steps = Pulses.of(np.ones((400, 900)), dt_ns=4, energy_kev=np.full(400, 1000.0))
-    traces = read_out(steps, chain, seed=2)
-    level = (traces.waveforms - traces.baseline_adc[:, None]) / chain.gain_adc_per_kev
-    first, later = level[:, 0], level[:, 450]
-    assert first.std() == pytest.approx(20, rel=0.1)
-    # 2 sigma^2 (1 - exp(-t / T)) after 7.2 us
-    change = 20 * np.sqrt(2 * -np.expm1(-7.2 / 200))
-    assert (later - first).std() == pytest.approx(change, rel=0.12)
-    # all else is drawn as without it
-    quiet = altered("ornl", noise=noise, **rates())
-    plain = read_out(steps, quiet, seed=2)
-    assert np.array_equal(plain.energy_kev, traces.energy_kev)
-    assert np.array_equal(plain.response, traces.response)
 
 
 def test_saturation_is_flagged_and_clipped(pulses: Pulses):

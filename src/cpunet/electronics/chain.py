@@ -56,22 +56,6 @@ class Decay(Config):
     tau_us: Positive
 
 
-class NonLinearity(Config):
-    r"""Departures from a linear chain.
-
-    Parameters
-    ----------
-    quadratic_fraction
-        Relative excess :math:`q` of a 2614.5 keV signal. A signal of height :math:`E` is
-        read out as :math:`E\,(1 + q E / 2614.5\ \mathrm{keV})`.
-    slew_kev_per_ns
-        Maximum rate of change in keV/ns, or null for no limit.
-    """
-
-    quadratic_fraction: Annotated[float, Field(gt=-0.5, lt=0.5)]
-    slew_kev_per_ns: Positive | None
-
-
 class NoiseLine(Config):
     """A narrow line in the noise: its frequency and its fraction of the noise power."""
 
@@ -104,46 +88,16 @@ class NoiseSpectrum(Config):
 
 
 class ReadoutNoise(Config):
-    """Noise with an RMS of `rms_kev`, independent of the pulse energy.
-
-    It is drawn from a spectrum or cut from measured baselines. `baselines_file` holds
-    measured traces without pulses, at least as long as the record. They are scaled to
-    `rms_kev`.
-    """
+    """Noise with an RMS of `rms_kev` and a spectrum, independent of the pulse energy."""
 
     rms_kev: NonNegative
-    spectrum: NoiseSpectrum | None = None
-    baselines_file: Path | None = None
-
-    @model_validator(mode="after")
-    def _one_source(self) -> ReadoutNoise:
-        if (self.spectrum is None) == (self.baselines_file is None):
-            raise ValueError("give either a spectrum or a baselines_file")
-        return self
+    spectrum: NoiseSpectrum
 
 
 class OtherPulses(Config):
     """Rate of the pulses before a trace, or within its record."""
 
     rate_kHz: _Rate
-
-
-class Hum(Config):
-    """Mains hum: a sine under every trace with a random phase."""
-
-    frequency_Hz: Positive
-    amplitude_kev: Positive
-
-
-class Wander(Config):
-    r"""A baseline that wanders slowly: an Ornstein-Uhlenbeck process under every trace.
-
-    Its covariance is :math:`\sigma^2 e^{-|t - t'| / T}`, with the RMS :math:`\sigma` of
-    `rms_kev` and the correlation time :math:`T` of `time_us`.
-    """
-
-    time_us: Positive
-    rms_kev: Positive
 
 
 class Electronics(Config):
@@ -165,8 +119,6 @@ class Electronics(Config):
         Components of the preamplifier decay. Their fractions add up to 1.
     gain_adc_per_kev
         Gain in ADC counts per keV.
-    non_linearity
-        Departures from a linear chain, or null.
     noise
         RMS and spectrum of the noise.
     baseline_mean_adc, baseline_spread_adc
@@ -178,10 +130,6 @@ class Electronics(Config):
     other_pulses_kev
         Quantiles of the energies of other pulses in keV, evenly spaced in probability from
         the minimum to the maximum. The logarithm is interpolated linearly between them.
-    hum
-        Mains hum, or null.
-    wander
-        Slow wandering of the baseline, or null.
     adc_bits
         Resolution of the digitiser. Samples saturate at ``2**adc_bits - 1``.
     resolution_fwhm_kev
@@ -201,7 +149,6 @@ class Electronics(Config):
     ringing: Ringing | None
     decays: Annotated[tuple[Decay, ...], Field(min_length=1, max_length=4)]
     gain_adc_per_kev: Positive
-    non_linearity: NonLinearity | None
     noise: ReadoutNoise
     baseline_mean_adc: NonNegative
     baseline_spread_adc: NonNegative
@@ -209,8 +156,6 @@ class Electronics(Config):
     earlier_pulses: OtherPulses
     pile_up: OtherPulses
     other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
-    hum: Hum | None = None
-    wander: Wander | None = None
     adc_bits: Annotated[int, Field(ge=8, le=16)]
     resolution_fwhm_kev: NonNegative
     n_pre: Samples
@@ -230,9 +175,8 @@ class Electronics(Config):
             raise ValueError(
                 f"baseline_mean_adc must be below {self.adc_top}, the most of adc_bits"
             )
-        nyquist_MHz = 500 / self.dt_ns
-        spectrum = self.noise.spectrum
-        if spectrum and any(line.frequency_MHz >= nyquist_MHz for line in spectrum.lines):
+        nyquist_MHz, lines = 500 / self.dt_ns, self.noise.spectrum.lines
+        if any(line.frequency_MHz >= nyquist_MHz for line in lines):
             raise ValueError(f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate")
         return self
 
@@ -258,7 +202,7 @@ class Electronics(Config):
 
     @property
     def transfer(self) -> Exponentials:
-        r"""Linear part of the chain as a sum of exponentials.
+        r"""The chain as a sum of exponentials.
 
         .. math:: H(s) = \Big[\sum_i f_i \frac{s\tau_i}{1 + s\tau_i}\Big]
             \Big[1 - f_s \frac{s\tau_s}{1 + s\tau_s}\Big]

@@ -8,16 +8,16 @@ import numpy as np
 import numpy.typing as npt
 from numba import prange
 
-from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NonLinearity
+from cpunet.electronics.chain import Electronics
 from cpunet.electronics.exponentials import ComplexArray, FloatArray
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.pulses.container import Pulses
 
 
-def respond(
+def linear_response(
     pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
-) -> npt.NDArray[np.float32]:
+) -> FloatArray:
     r"""Noise-free traces of charge pulses, in units of the full charge.
 
     Each sample of a pulse :math:`q` is the constant charge during its period. The chain's
@@ -32,8 +32,7 @@ def respond(
     Parameters
     ----------
     pulses
-        Ideal pulses from 0 to 1 with energies. Their sampling period must divide that of the
-        digitiser.
+        Ideal pulses from 0 to 1. Their sampling period must divide that of the digitiser.
     electronics
         The readout chain.
     shift_ns
@@ -42,54 +41,24 @@ def respond(
     Returns
     -------
     array
-        Float32, shape ``(n, electronics.length)``.
+        Shape ``(n, electronics.length)``.
 
     Raises
     ------
     CpunetError
-        If the pulses are sampled too coarsely for the chain, hold NaN, or lack energies.
+        If the pulses are sampled too coarsely for the chain.
 
     Examples
     --------
     A step through one pole without decay approaches the full charge.
 
     >>> from cpunet.electronics.chain import read_electronics
-    >>> step = Pulses.of(np.ones((1, 10)), dt_ns=4, energy_kev=[1592.5])
+    >>> step = Pulses.of(np.ones((1, 10)), dt_ns=4)
     >>> chain = read_electronics("legend200")
-    >>> trace = respond(step, chain)[0]
+    >>> trace = linear_response(step, chain)[0]
     >>> trace.shape, bool(trace[: chain.n_pre].any())
     ((1400,), False)
     """
-    linear = linear_response(pulses, electronics, shift_ns)
-    if electronics.non_linearity is None:
-        return linear.astype(np.float32)
-    energy = required_energy_kev(pulses)[:, None]
-    signal = distorted(energy * linear, electronics.non_linearity, electronics.dt_ns)
-    return (signal / energy).astype(np.float32)
-
-
-def required_energy_kev(pulses: Pulses) -> FloatArray:
-    """Energies of the pulses in keV.
-
-    Raises
-    ------
-    CpunetError
-        If an energy is unknown or not positive.
-    """
-    bad = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
-    if bad.any():
-        i = int(bad.argmax())
-        raise CpunetError(
-            f"event {pulses.event_number[i]}: energy {pulses.energy_kev[i]} keV; the readout "
-            "needs an energy above 0 for each pulse"
-        )
-    return pulses.energy_kev
-
-
-def linear_response(
-    pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
-) -> FloatArray:
-    """Response of the linear part of the chain, as `respond` but in float64."""
     per_sample = _fine_per_sample(pulses, electronics)
     n, dt, fine = len(pulses), electronics.dt_ns, pulses.dt_ns
     shift = np.broadcast_to(0.0 if shift_ns is None else np.asarray(shift_ns, float), (n,))
@@ -113,34 +82,6 @@ def linear_response(
         traces,
     )
     return traces
-
-
-def distorted(signal_kev: FloatArray, figures: NonLinearity, dt_ns: float) -> FloatArray:
-    r"""Apply the non-linearity of the chain to signals.
-
-    .. math:: s' = s\,(1 + q s / E_0), \qquad |s_k - s_{k-1}| \le v\,\Delta t,
-
-    with the quadratic fraction :math:`q`, :math:`E_0 = 2614.5` keV and the slew rate
-    :math:`v`, which is applied first.
-
-    Parameters
-    ----------
-    signal_kev
-        Signals in keV, shape ``(n, samples)``.
-    figures
-        The non-linearity.
-    dt_ns
-        Sampling period in ns.
-
-    Examples
-    --------
-    >>> quadratic = NonLinearity(quadratic_fraction=0.01, slew_kev_per_ns=None)
-    >>> distorted(np.array([[0.0, 2614.5]]), quadratic, 16.0).round(3).tolist()
-    [[0.0, 2640.645]]
-    """
-    if figures.slew_kev_per_ns is not None:
-        signal_kev = _slewed(signal_kev, figures.slew_kev_per_ns * dt_ns)
-    return signal_kev * (1 + figures.quadratic_fraction * signal_kev / REFERENCE_KEV)
 
 
 def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
@@ -227,13 +168,3 @@ def _follow(
             if row >= 0:
                 traces[i, row] = value
             row += 1
-
-
-@kernel
-def _slewed(signal: Any, most: float) -> Any:  # pragma: no cover - compiled
-    out = signal.copy()
-    for i in range(signal.shape[0]):
-        for j in range(1, signal.shape[1]):
-            change = signal[i, j] - out[i, j - 1]
-            out[i, j] = out[i, j - 1] + min(max(change, -most), most)
-    return out

@@ -1,37 +1,31 @@
 """From ideal pulses to raw traces as a digitiser writes them, with the truth kept.
 
-Noise is drawn from a spectrum or cut from measured baselines; other pulses, mains hum and
-wandering baselines disturb the traces.
+Noise has a spectrum; earlier pulses, and others within the record, disturb the traces.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
-from scipy.signal import lfilter
 
-from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum, Wander
+from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum
 from cpunet.electronics.drawn_pile_up import DrawnPileUp, InTracePileUp
-from cpunet.electronics.exact_response import distorted, linear_response, required_energy_kev
+from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray as PulseArray
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.files import open_pulses
 from cpunet.simulation.gammas.sample import with_resolution
 
 # Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
 # the record moves its level and the trace's end is independent of its beginning.
 _MIN_SAMPLES = 8192
 _TRACES_AT_A_TIME = 128
-# Measured traces kept for cutting; some tens of MB.
-_MAX_BASELINES = 2048
 
 
 def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatArray:
@@ -112,91 +106,6 @@ def coloured_noise(
     return noise
 
 
-def read_baselines(path: Path, length: int, dt_ns: float) -> npt.NDArray[np.float32]:
-    """Measured traces without pulses, shape ``(traces, samples)``, with their means removed.
-
-    Parameters
-    ----------
-    path
-        Waveform file in any format that `open_pulses` reads.
-    length, dt_ns
-        Number of samples and sampling period in ns of the traces to be cut from them.
-
-    Raises
-    ------
-    CpunetError
-        If baselines are too short, sampled differently, not finite, or constant.
-    """
-    source = open_pulses(path)
-    if not np.isclose(source.dt_ns, dt_ns):
-        raise CpunetError(
-            f"{path}: baselines sampled every {source.dt_ns:g} ns, the electronics every "
-            f"{dt_ns:g} ns; give others as noise.baselines_file"
-        )
-    whole = next(source.blocks(_MAX_BASELINES)).waveforms
-    if whole.shape[1] < length:
-        raise CpunetError(
-            f"{path}: baselines of {whole.shape[1]} samples are shorter than the record of "
-            f"{length}; lower length or give longer noise.baselines_file"
-        )
-    baselines = np.asarray(whole - whole.mean(axis=1, keepdims=True), np.float32)
-    finite = np.isfinite(baselines).all(axis=1)
-    if not finite.all():
-        bad = int(np.argmin(finite))
-        raise CpunetError(f"{path}: baseline {bad} is not finite; leave it out")
-    if not baselines.std() > 0:
-        raise CpunetError(f"{path}: no baselines that vary; give another noise.baselines_file")
-    return baselines
-
-
-def cut_noise(
-    baselines: npt.NDArray[np.float32], n: int, length: int, rng: np.random.Generator
-) -> npt.NDArray[np.float32]:
-    """Random windows of measured baselines, scaled to a common RMS of 1.
-
-    Parameters
-    ----------
-    baselines
-        Output of `read_baselines`.
-    n, length
-        Number of windows and of samples in each.
-    rng
-        Random generator.
-    """
-    trace = rng.integers(len(baselines), size=n)
-    begin = rng.integers(baselines.shape[1] - length + 1, size=n)
-    windows = baselines[trace[:, None], begin[:, None] + np.arange(length)]
-    return np.asarray(windows / baselines.std(dtype=np.float64), np.float32)
-
-
-def noise_of(
-    electronics: Electronics, n: int, rng: np.random.Generator
-) -> npt.NDArray[np.float32]:
-    """Noise in keV of `n` traces of a chain, shape ``(n, electronics.length)``.
-
-    Parameters
-    ----------
-    electronics
-        The readout chain.
-    n
-        Number of traces.
-    rng
-        Random generator.
-
-    Raises
-    ------
-    CpunetError
-        If the file of baselines cannot be used.
-    """
-    noise, length, dt_ns = electronics.noise, electronics.length, electronics.dt_ns
-    if noise.spectrum is not None:
-        unit = coloured_noise(noise.spectrum, n, length, dt_ns, rng)
-    else:
-        assert noise.baselines_file is not None  # ReadoutNoise validates this
-        unit = cut_noise(read_baselines(noise.baselines_file, length, dt_ns), n, length, rng)
-    return unit * np.float32(noise.rms_kev)
-
-
 def draw_other_pulses(
     pulses: Pulses, electronics: Electronics, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, InTracePileUp]:
@@ -217,18 +126,11 @@ def draw_other_pulses(
         Signal in keV that is added to each trace, shape ``(n, length)``; sum of the pile-up
         tails at the first sample of each, in keV; piled-up pulses in the traces.
     """
-    tails, within, slow = rng.spawn(3)
+    tails, within = rng.spawn(2)
     added_kev = _tails(len(pulses), electronics, tails)
-    # before hum and piled-up pulses are added
+    # before piled-up pulses are added
     tails_kev = added_kev[:, 0].copy()
     piled = _add_piled(pulses, electronics, added_kev, within)
-    if electronics.hum is not None:
-        added_kev += _hum(len(pulses), electronics, slow)
-    if electronics.wander is not None:
-        wander, dt_ns = electronics.wander, electronics.dt_ns
-        # its own generator, so that it does not change the other random numbers
-        (drift,) = rng.spawn(1)
-        added_kev += _wander(len(pulses), electronics.length, dt_ns, wander, drift)
     return added_kev, tails_kev, piled
 
 
@@ -259,25 +161,6 @@ def _add_piled(
     shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
     np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
     return piled
-
-
-def _hum(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
-    """Mains hum with random phases in keV, shape ``(n, length)``."""
-    assert electronics.hum is not None  # checked by the caller
-    phase = rng.uniform(0, 2 * np.pi, size=(n, 1))
-    turns = np.arange(electronics.length) * electronics.dt_ns * 1e-9
-    wave = np.sin(2 * np.pi * electronics.hum.frequency_Hz * turns + phase)
-    return np.asarray(electronics.hum.amplitude_kev * wave, float)
-
-
-def _wander(
-    n: int, length: int, dt_ns: float, wander: Wander, rng: np.random.Generator
-) -> FloatArray:
-    """Slow wandering in keV, shape ``(n, length)``: exact samples of its process."""
-    lost = 1e-3 * dt_ns / wander.time_us
-    steps = rng.normal(0, wander.rms_kev * np.sqrt(-np.expm1(-2 * lost)), (n, length))
-    steps[:, 0] = rng.normal(0, wander.rms_kev, n)  # stationary from the start
-    return np.asarray(lfilter([1.0], [1.0, -np.exp(-lost)], steps, axis=1), float)
 
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
@@ -332,7 +215,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     Raises
     ------
     CpunetError
-        For the reasons of `cpunet.electronics.exact_response.respond` and `noise_of`.
+        If an energy is not above 0, or as `cpunet.electronics.exact_response.linear_response`.
 
     Examples
     --------
@@ -342,22 +225,25 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     >>> traces.waveforms.shape, traces.waveforms.dtype
     ((2, 1400), dtype('uint16'))
     """
-    energy, n = required_energy_kev(pulses), len(pulses)
+    energy, n = pulses.energy_kev, len(pulses)
+    bad = ~(np.isfinite(energy) & (energy > 0))
+    if bad.any():
+        i = int(bad.argmax())
+        raise CpunetError(
+            f"event {pulses.event_number[i]}: energy {energy[i]} keV; the readout needs an "
+            "energy above 0 for each pulse"
+        )
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
     # a uniform clock phase plus trigger jitter
     shift_ns = clock.uniform(0, electronics.dt_ns, size=n)
     shift_ns += clock.normal(0, electronics.trigger_jitter_ns, size=n)
-    linear = linear_response(pulses, electronics, shift_ns)
-    own_kev = energy[:, None] * linear
+    response = linear_response(pulses, electronics, shift_ns)
     added_kev, tails_kev, piled = draw_other_pulses(pulses, electronics, others)
     n_piled, piled_kev, piled_ns = piled.largest()
-    total_kev = own_kev + added_kev
-    response = linear
-    if electronics.non_linearity is not None:
-        figures, dt_ns = electronics.non_linearity, electronics.dt_ns
-        response = distorted(own_kev, figures, dt_ns) / energy[:, None]
-        total_kev = distorted(total_kev, figures, dt_ns)
-    total_kev += noise_of(electronics, n, noise)
+    spectrum, length, dt_ns = electronics.noise.spectrum, electronics.length, electronics.dt_ns
+    unit = coloured_noise(spectrum, n, length, dt_ns, noise)
+    total_kev = energy[:, None] * response + added_kev
+    total_kev += unit * np.float32(electronics.noise.rms_kev)
     baseline = level.normal(
         electronics.baseline_mean_adc, electronics.baseline_spread_adc, size=n
     )

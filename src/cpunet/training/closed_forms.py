@@ -156,19 +156,16 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
 
 
 def true_chain_of(electronics: Electronics) -> Chain:
-    """The closed form of a true chain; its nonlinearity is left out."""
+    """The closed form of a true chain."""
     endless = electronics.model_copy(
         update={"decays": (Decay(fraction=1, tau_us=_FOREVER_US),)}
     )
     name = f"true response ({electronics.name})"
-    chain = Chain(name, electronics.transfer, endless.transfer)
-    if electronics.noise.spectrum is None:
-        return chain
     samples, dt_ns = 2 * (NOISE_BINS - 1), electronics.dt_ns
     power = noise_power(electronics.noise.spectrum, dt_ns, samples)
     frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
     density = electronics.noise.rms_kev**2 * power / frequency[1]
-    return replace(chain, noise=(frequency, density))
+    return Chain(name, electronics.transfer, endless.transfer, (frequency, density))
 
 
 def with_noise(
