@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines, tail_shape
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.plotting import COLOURS, DATA_FILL, styled
 from cpunet.pulses.baselines import Baselines
@@ -51,7 +51,7 @@ class Slopes:
         """Slopes of the raw traces whose tails can be estimated."""
         kev = tails.measure(raw)
         told = np.isfinite(kev)
-        flat = tails.subtracted_from(raw)
+        flat = _subtracted(raw, tails)
         before, after = (
             read_baselines(
                 traces.waveforms[told, : tails.samples].astype(float),
@@ -126,7 +126,7 @@ def _slopes(axes: Axes, slopes: Slopes) -> None:
 def _traces(axes: Axes, raw: Pulses, tails: PileUpTails, kev: Values) -> None:
     large = np.flatnonzero(np.nan_to_num(kev) > 20 * tails.error_kev)
     chosen = large[np.argsort(kev[large])][:: max(1, len(large) // SHOWN)][:SHOWN]
-    flat = tails.subtracted_from(raw[chosen])
+    flat = _subtracted(raw[chosen], tails)
     time_us = np.arange(tails.samples) * tails.dt_ns * 1e-3
     for traces, colour, label in (
         (raw.waveforms[chosen], DATA_FILL, "as measured"),
@@ -140,6 +140,13 @@ def _traces(axes: Axes, raw: Pulses, tails: PileUpTails, kev: Values) -> None:
     axes.set_yscale("symlog", linthresh=10)
     axes.set_ylim(bottom=-10)
     axes.legend(loc="lower right")
+
+
+def _subtracted(raw: Pulses, tails: PileUpTails) -> Pulses:
+    """Traces with their tails subtracted; unchanged where these are undetermined."""
+    decay = tail_shape(raw.length, tails.dt_ns, tails.decay_us)
+    heights = np.nan_to_num(tails.measure(raw)) * tails.adc_per_kev
+    return raw.with_waveforms(np.float32(raw.waveforms - heights[:, np.newaxis] * decay))
 
 
 def _in_kev(traces: FloatArray, tails: PileUpTails) -> Values:

@@ -52,8 +52,6 @@ order in which data flow.
 
 ::: cpunet.load
 
-::: cpunet.subtract_tails
-
 ::: cpunet.check
 
 ::: cpunet.response

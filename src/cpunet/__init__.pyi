@@ -4,7 +4,6 @@ from cpunet.calibration.calibrate import calibrate as calibrate
 from cpunet.calibration.calibrated_run import Calibration as Calibration
 from cpunet.calibration.calibrated_run import Plan as Plan
 from cpunet.demonstration import demo as demo
-from cpunet.electronics.measured import subtract_tails as subtract_tails
 from cpunet.electronics.stand import Stand as Stand
 from cpunet.electronics.stand import make_stand as make_stand
 from cpunet.errors import CpunetError as CpunetError

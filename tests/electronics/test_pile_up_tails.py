@@ -17,7 +17,7 @@ from cpunet.electronics.drawn_pile_up import (
     TraceNoise,
     passing,
 )
-from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines, tail_shape
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.tails_law import (
     TailsLaw,
@@ -160,9 +160,11 @@ def test_nothing_is_invented_where_there_is_nothing(preset: str):
     assert found.describe()["rate_khz"] == 0
 
 
-def test_tails_are_taken_off(busy: RawTraces, found: PileUpTails):
+def test_tails_can_be_taken_off(busy: RawTraces, found: PileUpTails):
     raw = as_pulses(busy)
-    flat = found.subtracted_from(raw)
+    tails = found.adc_per_kev * np.nan_to_num(found.measure(raw))
+    shape = tail_shape(raw.length, 16, found.decay_us)
+    flat = raw.with_waveforms(raw.waveforms - np.outer(tails, shape).astype(np.float32))
     alone = np.isfinite(found.kev) & (busy.n_piled == 0)
     slopes = [
         read_baselines(traces.waveforms[:, : found.samples].astype(float), 16, 54.6)[1]

@@ -1,57 +1,30 @@
-"""Noise and pile-up tails of the measured side, and its traces without the tails."""
+"""Noise and pile-up tails of the measured side."""
 
 from __future__ import annotations
 
 import logging
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-import cpunet
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails, passing
+from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise, passing
 from cpunet.electronics.finishing import PADDING_BEFORE
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.errors import CpunetError
-from cpunet.outputs import refuse_existing
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.provenance import MADE_BY, SIDE
-from cpunet.pulses.reading.files import Source, pulse_file
-from cpunet.pulses.writing import PulseWriter
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig
 
 log = logging.getLogger(__name__)
 
 LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is stored
 NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
-_BLOCK = 4096  # traces read at a time
 MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
 
 
-class FoundTails(NamedTuple):
-    """Pile-up tails in measured traces.
-
-    Parameters
-    ----------
-    measured
-        Pile-up tails in the traces; None if they cannot be estimated.
-    drawn
-        Distribution to draw from; None if the existence of tails is not certain.
-    told
-        Entry of ``run.json``: what was measured, even if the existence of tails is not
-        certain.
-    """
-
-    measured: PileUpTails | None
-    drawn: DrawnTails | None
-    told: dict[str, Any]
-
-
-def find_tails(data: InputSet, config: PreparationConfig) -> FoundTails:
-    """Measure the tails in the data of a training, and note what was found.
+def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, dict[str, Any]]:
+    """Measure noise and pile-up tails in the data of a training, and note what was found.
 
     Parameters
     ----------
@@ -59,23 +32,38 @@ def find_tails(data: InputSet, config: PreparationConfig) -> FoundTails:
         Measured pulses that passed the cuts, with the baselines of their file.
     config
         Preparation of the pulses.
+
+    Returns
+    -------
+    tuple
+        Noise, with tails to draw if their existence is certain; entry of ``run.json``: what was
+        measured of tails, even if it is not.
+
+    Raises
+    ------
+    CpunetError
+        If neither traces nor windows have enough flat baselines.
     """
     found, reason = tails_of(data)
+    drawn: DrawnTails | None = None
+    told: dict[str, Any] = {"missing": reason}
     if found is None:
         log.info(f"pile-up tails are not measured: {reason}")
-        return FoundTails(None, None, {"missing": reason})
-    drawn = drawn_like(found, data, config)
-    told = found.describe() | {"sizes": _sizes(found), "drawn": drawn.describe()}
-    if found.law is None:
-        return FoundTails(found, None, told)
-    tenth = told["percent_above"]["10_kev"]["law"]
-    alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
-    log.info(
-        f"pile-up tails: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
-        f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are given "
-        "them"
-    )
-    return FoundTails(found, drawn, told)
+    else:
+        likely = drawn_like(found, data, config)
+        told = found.describe() | {"sizes": _sizes(found), "drawn": likely.describe()}
+    if found is not None and found.law is not None:
+        drawn, tenth = likely, told["percent_above"]["10_kev"]["law"]
+        alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
+        log.info(
+            f"pile-up tails: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
+            f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are "
+            "given them"
+        )
+    noise, remark = measured_noise(data, config, found)
+    if remark is not None:
+        log.warning(remark)
+    return TraceNoise(noise, drawn), told
 
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
@@ -179,56 +167,3 @@ def _sizes(tails: PileUpTails) -> dict[str, list[float]]:
     told = np.sort(tails.kev[np.isfinite(tails.kev)])
     above = 1 - np.searchsorted(told, kev, side="right") / max(len(told), 1)
     return {"kev": kev.round(4).tolist(), "percent_above": (100 * above).round(3).tolist()}
-
-
-def subtract_tails(
-    data: Source,
-    out: str | Path,
-    *,
-    preparation: PreparationConfig | None = None,
-    force: bool = False,
-) -> PileUpTails:
-    """Write measured traces less the pile-up tails under them.
-
-    The LH5 file has the columns ``tails_kev`` and ``tails_error_kev``. Traces whose tail
-    cannot be determined are unchanged.
-
-    Parameters
-    ----------
-    data
-        Measured traces of one channel.
-    out
-        File to write.
-    preparation
-        Settings of the preparation; those of the default recipe if None.
-    force
-        Whether to replace an existing file.
-
-    Returns
-    -------
-    PileUpTails
-        The tails, measured.
-
-    Raises
-    ------
-    CpunetError
-        If the tails cannot be measured, or the file exists and `force` is off.
-    """
-    file = pulse_file(data)
-    refuse_existing(Path(out), *file.files, force=force)
-    source = file.open()
-    try:
-        config = preparation or load_recipe("fast").preparation
-        tails = PileUpTails.of(Baselines.of(source.blocks(_BLOCK), config))
-    except CpunetError as error:
-        raise CpunetError(f"{file.path}: {error}") from error
-    attrs = {MADE_BY: f"cpunet subtract_tails {cpunet.__version__}", SIDE: "measured"}
-    with PulseWriter(
-        Path(out), table="geds/raw", waveform_units="ADC", attrs=attrs, force=force
-    ) as writer:
-        for block in source.blocks(_BLOCK):
-            kev = tails.measure(block)
-            error_kev = np.where(np.isfinite(kev), tails.error_kev, np.nan)
-            columns = {"tails_kev": (kev, "keV"), "tails_error_kev": (error_kev, "keV")}
-            writer.append(tails.subtracted_from(block), columns)
-    return tails

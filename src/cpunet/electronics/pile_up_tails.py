@@ -359,13 +359,6 @@ class PileUpTails:
             },
         }
 
-    def subtracted_from(self, raw: Pulses) -> Pulses:
-        """Traces with their tails subtracted; unchanged where these are undetermined."""
-        decay = tail_shape(raw.length, self.dt_ns, self.decay_us)
-        heights = np.nan_to_num(self.measure(raw)) * self.adc_per_kev
-        less = np.asarray(raw.waveforms - heights[:, np.newaxis] * decay, np.float32)
-        return raw.with_waveforms(less)
-
 
 def tails_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Names and texts for the result of `PileUpTails.describe`."""

@@ -12,13 +12,13 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
-from cpunet.electronics.measured import find_tails, measured_noise
+from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
@@ -112,7 +112,7 @@ class TrainingJob:
         model
             Module with ``ren`` and ``iren``.
         recipe
-            Recipe as trained; ringing may have been added to its chain.
+            Recipe as trained; a ringing may have been added to its chain.
         started, seconds
             When the training began, and the time that it took.
         more
@@ -232,128 +232,89 @@ def known_response(run: Run, like: Recipe) -> Readout:
     return known
 
 
-class Matched(NamedTuple):
-    """A fitted chain.
-
-    Parameters
-    ----------
-    model
-        Module with ``ren`` and ``iren``.
-    info
-        What a run keeps of the fit.
-    recipe
-        Recipe of the response as fitted: a ringing or a stretch may have been added.
-    fit
-        Result of the fit.
-    remark
-        Remark on the noise, if any.
-    """
-
-    model: nn.Module
-    info: FitInfo
-    recipe: Recipe
-    fit: Fit
-    remark: str | None
-
-    def log(self) -> None:
-        """Tell which pulses were compared, how well the fit describes them, and why not."""
-        fit, info = self.fit, self.info
-        if self.remark is not None:
-            log.warning(self.remark)
-        compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
-        log.info(f"compared (simulated/measured pulses): {compared}")
-        beside = info.in_no_band
-        if any(beside.values()):
-            log.info(
-                f"in no band, since one side has too few of their energies: {beside['sim']} "
-                f"simulated and {beside['data']} measured pulses"
-            )
-        if fit.poor:
-            log.warning(f"poor fit: {fit.verdict}")
-        else:
-            log.info(f"fit: {fit.verdict}")
-        if fit.drift is not None:
-            log.info(str(fit.drift))
-        for part, gain in fit.gains.items():
-            if part != DRIFT[1] or "drift_stretch" not in info.parameters:
-                log.info(f"{part}: {gain}")
-        for number, cause in enumerate(info.causes, 1):
-            log.info(f"  {number}. {cause}")
-        for found in beyond(info.parameters) + stretched(info.parameters, fit.gains):
-            log.warning(found)
-
-
 def match(
-    sim: InputSet,
-    data: InputSet,
-    recipe: Recipe,
-    seed: int,
-    listen: Listener,
-    known: Readout | None = None,
-    continuum: Continuum | None = None,
-) -> Matched:
-    """Measure the noise, fit the response, and invert it.
+    job: TrainingJob, known: Readout | None, listen: Listener
+) -> tuple[ResponseGenerator, FitInfo]:
+    """Measure the noise, fit the response, and tell how well it describes the data.
 
     Parameters
     ----------
-    sim, data
-        Pulses of both sides.
-    recipe
-        Recipe with a response to fit.
-    seed
-        Seed of all random numbers.
-    listen
-        Function called with step and chi-square.
+    job
+        Pulses of both sides, and a recipe with a response to fit.
     known
         Response to start from, if any.
-    continuum
-        Reads the pulses of both sides away from all lines, if a fit needs them.
+    listen
+        Function called with step and chi-square.
 
     Raises
     ------
     CpunetError
         If there are too few pulses or baselines, or the fit diverges.
     """
-    tails, drawn, tails_info = find_tails(data, recipe.preparation)
-    noise, remark = measured_noise(data, recipe.preparation, tails)
+    recipe, (sim, data) = job.recipe, (job.sim.prepared, job.data.prepared)
+    noise, tails = trace_noise(job.data, recipe.preparation)
     if isinstance(known, ElectronicsResponse):
         allowed = recipe.matching.training.drift_terms
         if known.config.drift_terms > allowed:
             known = with_settings(known, drift_terms=allowed)
         recipe = recipe.model_copy(update={"generator": known.config})
-    simulated, measured = sim.prepared.pulses, data.prepared.pulses
-    rng = np.random.default_rng(seed)
-    sets = PulseSets(simulated, measured, noise, recipe, rng, drawn, continuum)
+    rng, drawn, learned = np.random.default_rng(job.seed), noise.tails, recipe.generator
+    sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)
     decay = None if drawn is None else drawn.known_decay
-    fitter = Fitter(recipe.matching.training, decay, listen, seed)
-    fit_of: Any = fit_learned if isinstance(recipe.generator, LearnedConfig) else fit_response
+    fitter = Fitter(recipe.matching.training, decay, listen, job.seed)
+    fit_of: Any = fit_learned if isinstance(learned, LearnedConfig) else fit_response
     response, fit = fit_of(sets, fitter, known)
     parameters = response.describe()
+    stretches = stretched(parameters, fit.gains)
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     told = asdict(fit) | {
         "parameters": parameters,
         "drift": fit.drift and {"verdict": str(fit.drift), **asdict(fit.drift)},
-        "verdict": "; ".join([fit.verdict, *stretched(parameters, fit.gains)]),
+        "verdict": "; ".join([fit.verdict, *stretches]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
-            "sim": len(sim.prepared) - sum(n for n, _ in counts),
-            "data": len(data.prepared) - sum(m for _, m in counts) - fit.data_left_out,
+            "sim": len(sim) - sum(n for n, _ in counts),
+            "data": len(data) - sum(m for _, m in counts) - fit.data_left_out,
         },
         "noise": {
-            "baselines": noise.n_baselines,
-            "rms": noise.rms,
-            "rms_error": noise.rms_error,
+            "baselines": noise.noise.n_baselines,
+            "rms": noise.noise.rms,
+            "rms_error": noise.noise.rms_error,
         },
-        "tails": tails_info,
+        "tails": tails,
     }
-    recipe = recipe.model_copy(update={"generator": response.config})
-    chain = ResponseGenerator(response.config, sim.dt_ns)
+    chain = ResponseGenerator(response.config, job.sim.dt_ns)
     chain.response = response
-    chain.set_noise(noise)
+    chain.set_noise(noise.noise)
     chain.tails = drawn
-    iren = fit_inverse(chain, simulated.waveforms, simulated.energy_kev, recipe, seed=seed)
-    model = nn.ModuleDict({"ren": chain, "iren": iren})
-    return Matched(model, FitInfo.model_validate(told), recipe, fit, remark)
+    info = FitInfo.model_validate(told)
+    _tell(fit, info, [*beyond(parameters), *stretches])
+    return chain, info
+
+
+def _tell(fit: Fit, info: FitInfo, doubts: list[str]) -> None:
+    """Tell which pulses were compared, how well the fit describes them, and why not."""
+    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+    log.info(f"compared (simulated/measured pulses): {compared}")
+    beside = info.in_no_band
+    if any(beside.values()):
+        log.info(
+            f"in no band, since one side has too few of their energies: {beside['sim']} "
+            f"simulated and {beside['data']} measured pulses"
+        )
+    if fit.poor:
+        log.warning(f"poor fit: {fit.verdict}")
+    else:
+        log.info(f"fit: {fit.verdict}")
+    if fit.drift is not None:
+        log.info(str(fit.drift))
+    for part, gain in fit.gains.items():
+        if part != DRIFT[1] or "drift_stretch" not in info.parameters:
+            log.info(f"{part}: {gain}")
+    for number, cause in enumerate(info.causes, 1):
+        log.info(f"  {number}. {cause}")
+    for doubt in doubts:
+        log.warning(doubt)
 
 
 def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
@@ -370,7 +331,11 @@ def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
             bar.update(1)
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
-        found = match(job.sim, job.data, job.recipe, job.seed, listen, known, job.continuum)
-    found.log()
+        chain, info = match(job, known, listen)
+    # a ringing or a stretch may have been added
+    recipe = job.recipe.model_copy(update={"generator": chain.response.config})
+    sim = job.sim.prepared.pulses
+    iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)
+    model = nn.ModuleDict({"ren": chain, "iren": iren})
     took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
-    return job.run(found.model, found.recipe, began, took, fit=found.info)
+    return job.run(model, recipe, began, took, fit=info)

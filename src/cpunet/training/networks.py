@@ -27,8 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from cpunet.electronics.drawn_pile_up import TraceNoise
-from cpunet.electronics.measured import find_tails, measured_noise
+from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.outputs import (
     FolderKind,
@@ -129,18 +128,14 @@ def outside_noise(
     if recipe.cyclegan.training.noise == "none":
         return None, None
     try:
-        found = find_tails(data, recipe.preparation)
-        noise, note = measured_noise(data, recipe.preparation, found.measured)
+        noise, tails = trace_noise(data, recipe.preparation)
     except CpunetError as error:
         raise CpunetError(
             f"{data.path}: no baselines to draw noise from ({error}); or train "
             "without it (training.noise=none in `settings`)"
         ) from error
-    if note is not None:
-        log.warning(note)
-    drawn = TraceNoise(noise, found.drawn)
-    outside = Outside(drawn, sim.prepared.pulses.energy_kev, recipe.preparation)
-    return outside, FitInfo.model_validate({"tails": found.told})
+    outside = Outside(noise, sim.prepared.pulses.energy_kev, recipe.preparation)
+    return outside, FitInfo.model_validate({"tails": tails})
 
 
 def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:
