@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cpunet.networks.generators import LinearInverse, Sizes, stretch
+from cpunet.networks import generators
+from cpunet.networks.generators import LinearInverse, stretch
 from cpunet.recipes import load_recipe
 
-SIZES = Sizes(length=60, before=12, after=8, baseline=(-12, -8), level=(12, 20))
+STRETCHES = {"before": 12, "after": 20, "baseline": (12, 8), "level_samples": 8}
 
 
 def edges(*starts: int) -> torch.Tensor:
@@ -18,9 +19,11 @@ def edges(*starts: int) -> torch.Tensor:
 
 
 @pytest.fixture
-def identity() -> LinearInverse:
+def identity(monkeypatch: pytest.MonkeyPatch) -> LinearInverse:
     """Gives back what it gets in the region about the half maximum."""
-    network = LinearInverse(SIZES)
+    monkeypatch.setattr(generators, "AFTER", 8)
+    config = load_recipe("fast").matching.training.model_copy(update=STRETCHES)
+    network = LinearInverse(60, config)
     network.half_height.fill_(0.5)
     network.weights.copy_(torch.eye(20))
     return network
@@ -64,8 +67,9 @@ def test_a_window_that_is_no_pulse_has_nothing_to_say_to_others(identity):
 
 def test_sizes_of_a_recipe_fit_its_windows():
     recipe = load_recipe("fast")
-    sizes = Sizes.of(recipe.preparation.length, recipe.matching.training)
-    assert sizes == Sizes(800, 230, 170, (-230, -130), (300, 400))
+    made = LinearInverse(recipe.preparation.length, recipe.matching.training)
+    assert (made.length, made.before, made.after) == (800, 230, 170)
+    assert (made.baseline, made.level) == ((-230, -130), (300, 400))
 
 
 def test_a_stretch_goes_on_with_the_edge_values():

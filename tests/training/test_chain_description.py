@@ -152,35 +152,27 @@ def test_errors_go_with_the_poles_they_belong_to(run):
     assert told["values"]["chi_square_per_moment"] == 1.5
 
 
-def test_seeds_that_agree_by_their_data_are_not_far_from_the_truth(tmp_path):
-    """Noise of 1.98 against 1.95 keV, the same in both runs but for the last digits."""
+def test_differences_are_told_in_their_errors(tmp_path):
+    """Noise of 1.98 against 1.95 keV."""
     density = np.full(NOISE_BINS, (1.98 * 0.8) ** 2)
     noise = {"baselines": 1500, "rms": 1.98 * 0.8, "rms_error": 0.02 * 1.98 * 0.8}
-    runs = [
-        write_response(
-            tmp_path / f"run{tau}",
-            f"generator.poles_ns=[{tau}]",
-            "generator.decay_us=500",
-            noise_density=density * np.exp(2 * 397.5 * DT_NS / 500e3),
-            fit=FIT | {"noise": noise, "errors": {"log_poles_ns.1": 0.02}},
-        )
-        for tau in (50, 50.01)
-    ]
-    told = response(*runs, truth=electronics(bandwidth_poles_ns=[49])).content
-    sigma, spread = told["truth"]["sigma"], told["spread"]
-    assert told["mean"]["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
-    assert spread["noise_rms_kev"] < 1e-3
+    run = write_response(
+        tmp_path / "run",
+        "generator.poles_ns=[50]",
+        "generator.decay_us=500",
+        noise_density=density * np.exp(2 * 397.5 * DT_NS / 500e3),
+        fit=FIT | {"noise": noise, "errors": {"log_poles_ns.1": 0.02}},
+    )
+    told = response(run, truth=electronics(bandwidth_poles_ns=[49])).content
+    (own,), sigma = told["runs"], told["truth"]["sigma"]
+    assert own["values"]["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
     # 2 % of the baselines, and 1 µs of the decay
-    assert told["runs"][0]["errors"]["noise_rms_kev"] == pytest.approx(
+    assert own["errors"]["noise_rms_kev"] == pytest.approx(
         1.98 * np.hypot(0.02, 1 / 500), rel=0.01
     )
     assert sigma["noise_rms_kev"] == pytest.approx(0.03 / (1.98 * 0.0201), rel=0.1)
-    assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)  # of the fit, not of the seeds
-    assert not {"slow_share", "decay_us"} & sigma.keys()  # parts are degenerate
-    assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}
-    # one run and two of the same data say the same
-    alone = response(*runs[:1], truth=electronics(bandwidth_poles_ns=[49])).content["truth"]
-    assert alone["sigma"] == pytest.approx(sigma, rel=0.02)
+    assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)
+    assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}  # parts are degenerate
 
 
 def test_the_closed_form_is_the_chain_of_the_stand():
@@ -236,8 +228,7 @@ def test_the_figure_shows_every_chain_beside_the_truth():
     others = [true_chain_of(electronics(bandwidth_poles_ns=[40 + i])) for i in range(2)]
     for chains, reference, residuals in (
         (others, truth, 2),
-        (others, None, 2),
-        (others[:1], None, 0),
+        (others, None, 0),
     ):
         step, residual, *rest = _panels(response_figure(chains, reference, tail_ns=6400))
         assert len(step.lines) == len(chains) + (reference is not None)
@@ -313,7 +304,7 @@ def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, capsys):
     runs += [write_response(tmp_path / f"another run, {i}", fit=FIT) for i in range(4)]
     assert status_of("response", *runs, "--truth", chain) == 0
     printed = capsys.readouterr().out
-    for text in ("a run of a long name [1]", "another run, 3", "mean ± spread", "known", "σ"):
+    for text in ("a run of a long name [1]", "another run, 3", "known"):
         assert text in printed
     line = next(line for line in printed.splitlines() if "bandwidth pole 1" in line)
     assert line.split()[:9] == ["bandwidth", "pole", "1", "[ns]", "55", *["60"] * 4]

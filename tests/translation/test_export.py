@@ -16,7 +16,7 @@ from dspeed.errors import ProcessingChainError
 from lgdo import Array, Table
 
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import LinearInverse, ResponseGenerator, Sizes
+from cpunet.networks.generators import LinearInverse, ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -37,7 +37,7 @@ def fitted(chain: ResponseGenerator) -> None:
 def unity(_chain: ResponseGenerator) -> LinearInverse:
     """An inverse that changes nothing."""
     recipe = load_recipe("fast")
-    inverse = LinearInverse(Sizes.of(recipe.preparation.length, recipe.matching.training))
+    inverse = LinearInverse(recipe.preparation.length, recipe.matching.training)
     inverse.half_height.fill_(0.4)
     inverse.weights.copy_(torch.eye(len(inverse.weights)))
     return inverse

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,38 +83,6 @@ AFTER = 170  # samples from the half maximum until charge and slow response have
 MIN_LEVEL = 1e-3  # below it, there is no pulse
 
 
-class Sizes(NamedTuple):
-    """Stretches of a window that a `LinearInverse` uses.
-
-    Parameters
-    ----------
-    length
-        Samples of a window.
-    before, after
-        Samples on either side of the half maximum that are translated.
-    baseline, level
-        First sample and stop, from the half maximum, of the parts that are scaled to 0 and 1.
-    """
-
-    length: int
-    before: int
-    after: int
-    baseline: tuple[int, int]
-    level: tuple[int, int]
-
-    @classmethod
-    def of(cls, length: int, config: MatchingConfig) -> Self:
-        """Sizes for the comparison by which a response was matched."""
-        first, stop = config.baseline
-        return cls(
-            length=length,
-            before=first,
-            after=min(AFTER, config.after),
-            baseline=(-first, -stop),
-            level=(config.after - config.level_samples, config.after),
-        )
-
-
 class LinearInverse(nn.Module):
     """Prepared measured windows → simulation-like, almost noise-free pulses.
 
@@ -127,8 +95,17 @@ class LinearInverse(nn.Module):
 
     Parameters
     ----------
-    sizes
-        Stretches of a window that are used.
+    length
+        Samples of a window.
+    config
+        Comparison by which the response was matched, which says where windows are scaled.
+
+    Attributes
+    ----------
+    before, after : int
+        Samples on either side of the half maximum that are translated.
+    baseline, level : tuple of int
+        First sample and stop, from the half maximum, of the parts that are scaled to 0 and 1.
     """
 
     half_height: Tensor
@@ -136,10 +113,14 @@ class LinearInverse(nn.Module):
     mean_out: Tensor
     weights: Tensor
 
-    def __init__(self, sizes: Sizes) -> None:
+    def __init__(self, length: int, config: MatchingConfig) -> None:
         super().__init__()
-        self.sizes = sizes
-        n = sizes.before + sizes.after
+        self.length = length
+        self.before, stop = config.baseline
+        self.after = min(AFTER, config.after)
+        self.baseline = (-self.before, -stop)
+        self.level = (config.after - config.level_samples, config.after)
+        n = self.before + self.after
         # the first: half of the maximum, the same number for all windows
         shapes = {"half_height": (), "mean_in": (n,), "mean_out": (n,), "weights": (n, n)}
         for name, shape in shapes.items():
@@ -166,8 +147,8 @@ class LinearInverse(nn.Module):
         # 0 before the region and 1 after it: one sample on either side stands for the rest
         pulses = nn.functional.pad(pulses, (1, 0), value=0.0)
         pulses = nn.functional.pad(pulses, (0, 1), value=1.0)
-        start = 1 + self.sizes.before - sample
-        return stretch(pulses, start, 0, self.sizes.length).to(windows.dtype)
+        start = 1 + self.before - sample
+        return stretch(pulses, start, 0, self.length).to(windows.dtype)
 
     def half_sample(self, windows: Tensor) -> Tensor:
         """Last sample below half of the maximum before the maximum, shape (n,)."""
@@ -187,13 +168,13 @@ class LinearInverse(nn.Module):
             Sample of the half maximum of each.
         """
         base, level = self.base_and_level(windows, sample)
-        inside = stretch(windows, sample, -self.sizes.before, self.sizes.after)
+        inside = stretch(windows, sample, -self.before, self.after)
         return (inside - base[:, None]) / level.clamp_min(MIN_LEVEL)[:, None]
 
     def base_and_level(self, windows: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
         """Mean before each pulse, and mean of its tail above that."""
-        base = stretch(windows, sample, *self.sizes.baseline).double().mean(dim=1)
-        tail = stretch(windows, sample, *self.sizes.level).double().mean(dim=1)
+        base = stretch(windows, sample, *self.baseline).double().mean(dim=1)
+        tail = stretch(windows, sample, *self.level).double().mean(dim=1)
         return base, tail - base
 
 

@@ -139,7 +139,7 @@ def summary(run: Run) -> list[tuple[str, str]]:
     where = run.name
     response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
     when = run.started[:16].replace("T", " ")
-    known, drift = fit.tails, (fit.model_extra or {}).get("drift") or {}
+    known = fit.tails
     lines = [
         ("run", where),
         (
@@ -154,7 +154,6 @@ def summary(run: Run) -> list[tuple[str, str]]:
         ("off", _deviations(fit.pulls)),
         *(("cause", cause) for cause in fit.causes),
         ("response", _parameters(fit.parameters)),
-        ("drift", str(drift.get("verdict") or "")),
     ]
     if "baselines" in fit.noise:
         size = ""

@@ -85,8 +85,7 @@ def response_figure(
     """Step response and its residuals, impulse response, tail, and spectrum of the noise.
 
     Times are counted from half height, by which pulses are aligned: an overall delay of the
-    chain cannot be inferred from them.  Residuals are differences from the truth, or from
-    the mean of several chains if there is no truth; a single chain has none.
+    chain cannot be inferred from them.  Residuals are differences from the truth.
 
     Parameters
     ----------
@@ -97,8 +96,7 @@ def response_figure(
     tail_ns
         Time after the step up to which the tail is drawn, in ns.
     """
-    compared = truth is not None or len(chains) > 1
-    rows = [row for row in LAYOUT if compared or "residual" not in row]
+    rows = [row for row in LAYOUT if truth is not None or "residual" not in row]
     heights = [1.3 if "residual" in row else 2.2 for row in rows]
     figure = Figure(figsize=(10.5, 2.4 + sum(heights)))
     panels = figure.subplot_mosaic([list(row) for row in rows], height_ratios=heights)
@@ -128,13 +126,12 @@ def response_figure(
             for values in chain.noise
         )
         panels["noise"].loglog(frequency, density, **look)
-    if compared:
-        axes, name = panels["residual"], "mean" if truth is None else "truth"
-        reference = np.mean(steps, axis=0) if truth is None else steps.pop(0)
+    if truth is not None:
+        axes, reference = panels["residual"], steps.pop(0)
         for i, step in enumerate(steps):
             axes.plot(long_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
         axes.axhline(0, color="black", linewidth=0.8)
-        axes.set(ylabel=f"Run − {name}\n[10⁻³ of full charge]")
+        axes.set(ylabel="Run − truth\n[10⁻³ of full charge]")
     _annotate(panels)
     return figure
 

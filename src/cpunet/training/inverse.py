@@ -18,7 +18,7 @@ from torch import Tensor
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import LinearInverse, ResponseGenerator, Sizes, stretch
+from cpunet.networks.generators import LinearInverse, ResponseGenerator, stretch
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
@@ -79,16 +79,15 @@ def fit_inverse(
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(len(sim), min(len(sim), MAX_PULSES), replace=False))
     windows, delay, used = _translated(generator, sim[rows], recipe)
-    inverse = LinearInverse(Sizes.of(recipe.preparation.length, training))
+    inverse = LinearInverse(recipe.preparation.length, training)
     inverse.half_height.fill_(0.5 * float(windows.amax(dim=1).median()))
     sample = inverse.half_sample(windows)
     measured = inverse.region(windows, sample).numpy()
-    before, after = inverse.sizes.before, inverse.sizes.after
     charge = torch.from_numpy(sim[rows[used]])
-    wanted = stretch(charge, sample + delay, -before, after).double().numpy()
+    wanted = stretch(charge, sample + delay, -inverse.before, inverse.after).double().numpy()
     _, level = inverse.base_and_level(windows, sample)
     mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
-    noise = _noise_covariance(generator.noise, inverse.sizes, mean_in)
+    noise = _noise_covariance(generator.noise, inverse, mean_in)
     noise *= float(np.mean(energy_kev[rows] ** -2.0)) / float(level.mean()) ** 2
     measured, wanted = measured - mean_in, wanted - mean_out
     own = measured.T @ measured / len(measured) + noise
@@ -126,7 +125,7 @@ def _translated(
     return torch.from_numpy(prepared.pulses.waveforms), torch.from_numpy(delay), prepared.index
 
 
-def _noise_covariance(noise: BaselineNoise, sizes: Sizes, pulse: Values) -> Values:
+def _noise_covariance(noise: BaselineNoise, sizes: LinearInverse, pulse: Values) -> Values:
     """Covariance of the noise in the region, for a level of 1 and an energy of 1 keV.
 
     The subtracted baseline and the level by which a window is divided are noisy, too: the

@@ -269,7 +269,6 @@ def match(
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     told = asdict(fit) | {
         "parameters": parameters,
-        "drift": fit.drift and {"verdict": str(fit.drift), **asdict(fit.drift)},
         "verdict": "; ".join([fit.verdict, *stretches]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {
@@ -306,8 +305,6 @@ def _tell(fit: Fit, info: FitInfo, doubts: list[str]) -> None:
         log.warning(f"poor fit: {fit.verdict}")
     else:
         log.info(f"fit: {fit.verdict}")
-    if fit.drift is not None:
-        log.info(str(fit.drift))
     for part, gain in fit.gains.items():
         if part != DRIFT[1] or "drift_stretch" not in info.parameters:
             log.info(f"{part}: {gain}")

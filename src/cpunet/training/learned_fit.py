@@ -40,7 +40,7 @@ from cpunet.training.levenberg_marquardt import FIRST_CLIPS
 from cpunet.training.moments import BLOCK, Values
 from cpunet.training.optimal_weights import refine
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_fit import CHECKED, DriftFit, Fit, described
+from cpunet.training.response_fit import CHECKED, Fit, described
 from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
 from cpunet.training.response_starts import RINGS, onset_is_off
 
@@ -73,12 +73,11 @@ def fit_learned(
         found = fitter.fit(ResponseProblem(response.step, near, draws=1), coarse=False)
     if found is None or found.poor:
         response, found = _from_afar(config, dt_ns, far, near, fitter)
-    tried = None
     single: list[Band] = []
     if found.poor and onset_is_off(found.problem):
         if training.drift_terms:
             single = sets.single_sites()
-            tried = fit_drift(response, [*sets.bands(CHECKED), *single], fitter)
+            fit_drift(response, [*sets.bands(CHECKED), *single], fitter)
     elif found.poor and training.ringing_mhz and not response.config.ringing:
         rings = response.config.model_copy(update={"ringing": True})
         other, better = _from_afar(rings, dt_ns, far, near, fitter)
@@ -90,8 +89,7 @@ def fit_learned(
     else:
         everything = changed([*everything, *single], response.drift)
         covariance = fitter.follow(ResponseProblem(response.step, everything, 2)).covariance
-    fit = described(ResponseProblem(response.step, everything), covariance, fitter)
-    return response, replace(fit, drift=tried)
+    return response, described(ResponseProblem(response.step, everything), covariance, fitter)
 
 
 def _from_afar(
@@ -133,7 +131,7 @@ BETAS, WEIGHT_DECAY, MEMORY, WARM_UP = (0.5, 0.99), 1e-2, 0.9, 10
 # units of a typical logarithm of the rate, and of a variance of one sample.
 OF_MEAN, OF_PULSES, TYPICAL = 0.05, 1.0, 0.05
 SHARES = (0.0, 0.5, 1.0)
-SHOWN = 2048  # pulses that show what it does
+UNET = "a U-Net before the readout"
 
 
 def changed(bands: Sequence[Band], drift: DriftUNet | None) -> list[Band]:
@@ -152,7 +150,7 @@ def changed(bands: Sequence[Band], drift: DriftUNet | None) -> list[Band]:
     return out
 
 
-def fit_drift(response: LearnedResponse, bands: Sequence[Band], fitter: Fitter) -> DriftFit:
+def fit_drift(response: LearnedResponse, bands: Sequence[Band], fitter: Fitter) -> None:
     """Train the U-Net in front of a fitted readout, which gets as much of it as is kept.
 
     Parameters
@@ -162,7 +160,7 @@ def fit_drift(response: LearnedResponse, bands: Sequence[Band], fitter: Fitter) 
     bands
         Pulses to train on.
     fitter
-        Fitter of the step response; its seed is that of the network, too.
+        Fitter of the step response; its seed is that of the network, too.  It is told the gain.
     """
     rng = np.random.default_rng(fitter.seed)
     known, held = split(bands, HELD_OUT, rng)
@@ -185,19 +183,15 @@ def fit_drift(response: LearnedResponse, bands: Sequence[Band], fitter: Fitter) 
             fitter.follow(ResponseProblem(step, changed(known, drift), draws=1))
         results.append([HeldOutPulses(changed(held, drift), known, response)])
     gain = compared(results, fitter.seed)
-    chosen = gain.best
-    drift.share.fill_(1.0)
-    shown = torch.from_numpy(np.array(bands[0].sim.sim[:SHOWN]))
-    before_ns, longer, blur_ns2 = drift.effect(shown)
-    quarters = [float(longer[rows].mean()) for rows in before_ns.argsort().tensor_split(4)]
-    variance = float(blur_ns2.mean())
-    blur_ns = math.copysign(math.sqrt(abs(variance)), variance)
-    drift.share.fill_(SHARES[chosen])
-    step.coordinates.data.copy_(torch.lerp(without, whole, SHARES[chosen]))
-    if chosen:
+    share = SHARES[gain.best]
+    drift.share.fill_(share)
+    step.coordinates.data.copy_(torch.lerp(without, whole, share))
+    fitter.gains[UNET] = (
+        f"{100 * share:.0f} % of it kept; {gain}" if share else f"left out; {gain}"
+    )
+    if share:
         response.drift = drift
         response.config = response.config.model_copy(update={"drift": True})
-    return DriftFit(SHARES[chosen], gain.mismatch, gain.error, quarters, blur_ns)
 
 
 class _Trained:

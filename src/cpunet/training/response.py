@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,16 +80,6 @@ class Response:
     truth: Electronics | None = None
 
     @cached_property
-    def mean(self) -> Numbers:
-        """Means of the quantities that all runs have."""
-        return self._of_all(np.mean)
-
-    @cached_property
-    def spread(self) -> Numbers:
-        """Their standard deviations; empty for a single run."""
-        return self._of_all(partial(np.std, ddof=1)) if len(self.runs) > 1 else {}
-
-    @cached_property
     def true_values(self) -> Numbers:
         """The same quantities of the true readout; empty if it is not known."""
         if self.truth is None:
@@ -100,31 +90,25 @@ class Response:
 
     @cached_property
     def difference(self) -> Numbers:
-        """Difference of the run, or of the mean of the runs, from the truth."""
-        known, mean = self.true_values, self.mean
-        return {name: mean[name] - known[name] for name in known if name in mean}
+        """Difference of the first run from the truth."""
+        values = self.runs[0].values
+        return {n: values[n] - true for n, true in self.true_values.items() if n in values}
 
     @cached_property
     def sigma(self) -> Numbers:
-        """Difference from the truth in units of the error or the spread, whichever is larger.
-
-        A quantity without an error has none: the runs share their data, so their spread shows
-        how well they agree, not how accurate they are.  Nor has one of `PARTS` of the chain.
-        """
-        found = {}
-        for name, apart in self.difference.items():
-            errors = [one.errors[name] for one in self.runs if name in one.errors]
-            if len(errors) == len(self.runs) and any(errors) and not PARTS.match(name):
-                found[name] = apart / max(self.spread.get(name, 0.0), float(np.mean(errors)))
-        return found
+        """The same in units of the error; of `PARTS` and what has no error there is none."""
+        errors = self.runs[0].errors
+        return {
+            name: apart / errors[name]
+            for name, apart in self.difference.items()
+            if errors.get(name) and not PARTS.match(name)
+        }
 
     @property
     def content(self) -> dict[str, Any]:
         """As ``response.json`` has it."""
         content: dict[str, Any] = {"cpunet": cpunet.__version__}
         content |= {"dt_ns": self.runs[0].run.dt_ns, "runs": [one.content for one in self.runs]}
-        if self.spread:
-            content |= {"mean": self.mean, "spread": self.spread}
         if self.truth is not None:
             content["truth"] = {
                 "name": self.truth.name,
@@ -136,12 +120,10 @@ class Response:
 
     @property
     def values(self) -> DataFrame:
-        """A row per quantity, a column per run, and ``mean``, ``spread``, ``truth``."""
+        """A row per quantity, a column per run, and ``truth``."""
         from pandas import DataFrame
 
         columns = {one.run.name: one.values for one in self.runs}
-        if self.spread:
-            columns |= {"mean": self.mean, "spread": self.spread}
         if self.truth is not None:
             columns["truth"] = self.true_values
         return DataFrame(columns).reindex(self._names)
@@ -171,22 +153,14 @@ class Response:
 
     def __str__(self) -> str:
         head = ["", *(Path(one.run.name).name for one in self.runs)]
-        if self.spread:
-            head.append("mean ± spread")
         if self.truth is not None:
-            head += [self.truth.name, "difference", "σ"]
+            head += [self.truth.name, *(["difference", "σ"] if len(self.runs) == 1 else [])]
         return text_table(head, list(map(self._cells, self._names)), title="Readout response")
 
     def __repr__(self) -> str:
         truth = "" if self.truth is None else f", beside {self.truth.name}"
         names = ", ".join(Path(one.run.name).name for one in self.runs)
         return f"<{type(self).__name__} of {names}{truth}>"
-
-    def _of_all(self, statistic: Callable[[list[float]], Any]) -> Numbers:
-        """A statistic of each quantity that all runs have."""
-        columns = [one.values for one in self.runs]
-        names = [name for name in columns[0] if all(name in column for column in columns)]
-        return {name: float(statistic([c[name] for c in columns])) for name in names}
 
     @property
     def _names(self) -> list[str]:
@@ -199,15 +173,16 @@ class Response:
         """A row of the table."""
         _, label, unit = _row(name)
         scale = 100.0 if unit == "%" else 1.0
-        # beside several runs there is no room for errors, and the spread says more
-        errors = {} if self.spread else self.runs[0].errors
+        alone = len(self.runs) == 1  # beside several runs there is no room for errors
+        errors = self.runs[0].errors if alone else {}
         cells = [f"{label} [{unit}]" if unit else label]
         cells += (_number(one.values.get(name), scale, errors.get(name)) for one in self.runs)
-        if self.spread:
-            cells.append(_number(self.mean.get(name), scale, self.spread.get(name)))
-        if self.truth is not None:
-            true, sigma = self.true_values.get(name), self.sigma.get(name)
-            cells += [_number(true, scale), _difference(self.difference.get(name), true, unit)]
+        if self.truth is None:
+            return cells
+        true, sigma = self.true_values.get(name), self.sigma.get(name)
+        cells.append(_number(true, scale))
+        if alone:
+            cells.append(_difference(self.difference.get(name), true, unit))
             cells.append("" if sigma is None else f"{sigma:+.1f}")
         return cells
 
@@ -223,7 +198,7 @@ def response(
     Parameters
     ----------
     runs
-        Runs of a readout chain, as of several seeds, with the same sampling and preparation.
+        Runs of a readout chain, as of several detectors, of the same sampling and preparation.
     truth
         True readout: folder of a test stand, ornl, legend200, ringing, or a YAML file.
     out

@@ -49,44 +49,6 @@ ROUNDS = 2
 
 
 @dataclass(frozen=True)
-class DriftFit:
-    """What the U-Net gains on held-out pulses.
-
-    Parameters
-    ----------
-    share
-        How much of it is kept.
-    mismatch
-        Chi-square per moment of the held-out pulses for shares of 0, 1/2 and 1.
-    error
-        Errors of the differences from the first of these.
-    longer
-        Mean relative change of the time from 2 to 98 % of the charge by all of the network, for
-        the quarters of the pulses from the shortest to the longest.
-    blur_ns
-        Root of the mean variance of the blur in ns, negative for pulses that are sharpened.
-    """
-
-    share: float
-    mismatch: list[float]
-    error: list[float]
-    longer: list[float]
-    blur_ns: float
-
-    def __str__(self) -> str:
-        found = ", ".join(f"{value:.2f}" for value in self.mismatch)
-        errors = ", ".join(f"{error:.2f}" for error in self.error[1:])
-        longer = ", ".join(f"{100 * value:+.1f}" for value in self.longer)
-        kept = f"{100 * self.share:.0f} % of it is kept" if self.share else "it is left out"
-        return (
-            f"U-Net before the readout: {kept}; chi-square per moment of held-out pulses is "
-            f"{found} with none, half and all of it (gains ± {errors}); all of it makes the "
-            f"charge of short to long pulses arrive over times longer by {longer} % and blurs "
-            f"by {self.blur_ns:+.0f} ns"
-        )
-
-
-@dataclass(frozen=True)
 class Fit:
     """How well a response describes the data.
 
@@ -112,8 +74,6 @@ class Fit:
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
         the data's, see `amplitude_shift`.
-    drift
-        What a U-Net before a learned readout gains, if one was trained.
     gains
         What held-out pulses say of each part that was tried.
     """
@@ -129,7 +89,6 @@ class Fit:
     bands: dict[str, list[int]]
     amplitude_shift: float
     amplitude_shift_error: float
-    drift: DriftFit | None = None
     gains: dict[str, str] = field(default_factory=dict)
 
     @property

@@ -19,7 +19,7 @@ from cpunet.electronics.finishing import (
     record_length,
     with_room,
 )
-from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator, Sizes
+from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, prepare
@@ -281,5 +281,5 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
         response = run.fill(part, ResponseGenerator(generator, run.dt_ns), device)
         response.tails = run.tails
         return ResponseBackend(response, preparation)
-    inverse = LinearInverse(Sizes.of(preparation.length, recipe.matching.training))
+    inverse = LinearInverse(preparation.length, recipe.matching.training)
     return InverseBackend(run.fill(part, inverse, device), preparation, run.dt_ns)
