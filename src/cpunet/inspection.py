@@ -12,7 +12,7 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing, written_aside
+from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses.channels import ALL, channels_of
 from cpunet.pulses.reading.files import FileOptions, PulseFile, pulse_file
 from cpunet.pulses.reading.source import PulseSource
@@ -89,7 +89,7 @@ class InfoResult:
             If the file exists and `force` is off, or there is no figure.
         """
         path = Path(path)
-        _refuse_picture(path, self.path, force=force)
+        refuse_picture(path, self.path, force=force)
         figure = self.plot()
         with written_aside(path) as aside:
             figure.savefig(aside, format=path.suffix[1:].lower(), dpi=_DPI)
@@ -147,17 +147,11 @@ def info(
     """
     if out is not None:
         given = None if isinstance(detector, Detector) else detector
-        _refuse_picture(Path(out), path, read.energy, given, force=force)
+        refuse_picture(Path(out), path, read.energy, given, force=force)
     found = _look(path, read, detector, frame, key_values(settings))
     if out is not None:
         found.save(out, force)
     return found
-
-
-def _refuse_picture(out: Path, *inputs: str | Path | None, force: bool) -> None:
-    refuse_existing(out, *inputs, force=force)
-    if out.suffix.lower() not in PICTURE_FORMATS:
-        raise CpunetError(f"{out}: pictures are made as {', '.join(PICTURE_FORMATS)}")
 
 
 def load(path: str | Path) -> Loaded:

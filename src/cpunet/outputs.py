@@ -76,6 +76,13 @@ def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
         raise CpunetError(f"{target}: exists already; choose another name or give `force`")
 
 
+def refuse_picture(target: Path, *inputs: Given, force: bool = False) -> None:
+    """Raise a `CpunetError` if no picture can be made there, or like `refuse_existing`."""
+    refuse_existing(target, *inputs, force=force)
+    if target.suffix.lower() not in PICTURE_FORMATS:
+        raise CpunetError(f"{target}: pictures are made as {', '.join(PICTURE_FORMATS)}")
+
+
 def require_kind(target: Path, kind: FolderKind) -> None:
     """Raise a `CpunetError` if `target` is neither missing, empty nor a folder of this kind."""
     empty = target.is_dir() and not any(target.iterdir())

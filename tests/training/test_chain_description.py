@@ -280,12 +280,9 @@ def test_runs_that_cannot_be_described(run, tmp_path):
     refused(run, tmp_path / "none", parts=("none: no finished run",))
     refused(parts=("no run was given",))
     coarse = write_response(tmp_path / "coarse", dt_ns=10.0)
-    refused(run, coarse, parts=(f"{coarse}: trained on pulses sampled every 10 ns", str(run)))
-    other = write_response(tmp_path / "other", "preparation.samples_after=500")
-    refused(run, other, parts=(f"{other}: trained with another preparation",))
     refused(coarse, truth=electronics(), parts=(f"{coarse}: ", "electronics known samples"))
-    (other / "weights.safetensors").write_bytes(b"")
-    refused(other, parts=("weights.safetensors: no readable weights",))
+    (coarse / "weights.safetensors").write_bytes(b"")
+    refused(coarse, parts=("weights.safetensors: no readable weights",))
 
 
 def test_a_network_has_no_closed_form(tmp_path):

@@ -113,12 +113,6 @@ class BaselineNoise:
 
     @classmethod
     def _of_baselines(cls, baselines: Values, n: int, dt_ns: float) -> Self:
-        samples = baselines.shape[1]
-        if samples < 2 * FIRST_CLEAN_BIN:
-            raise CpunetError(
-                f"the baselines have {samples} samples; the noise needs "
-                f"{2 * FIRST_CLEAN_BIN} or more, so raise preparation.baseline_samples"
-            )
         flat = baselines[_flat(baselines)] if len(baselines) else baselines
         if len(flat) < MIN_BASELINES:
             raise CpunetError(

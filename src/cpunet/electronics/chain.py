@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated
 
@@ -186,21 +185,6 @@ class Electronics(Config):
         return int(2**self.adc_bits - 1)
 
     @property
-    def times_ns(self) -> dict[str, float]:
-        """Shortest time scale of each stage in ns, by field name."""
-        times = {"bandwidth_poles_ns": min(self.bandwidth_poles_ns)}
-        if self.slow:
-            times["slow.tau_ns"] = self.slow.tau_ns
-        if self.overshoot:
-            times["overshoot.tau_ns"] = self.overshoot.tau_ns
-        if self.ringing:
-            # an oscillation is resolved if one radian of it is
-            times["ringing.frequency_MHz"] = 1e3 / (2 * math.pi * self.ringing.frequency_MHz)
-            times["ringing.damping_ns"] = self.ringing.damping_ns
-        times["decays.tau_us"] = 1e3 * min(part.tau_us for part in self.decays)
-        return times
-
-    @property
     def transfer(self) -> Exponentials:
         r"""The chain as a sum of exponentials.
 
@@ -237,11 +221,9 @@ class Electronics(Config):
             chain = chain * Exponentials.mixed(sign * part.fraction, tau)
         for tau in taus[:n_poles]:
             chain = chain * Exponentials.low_pass(tau)
-        if self.ringing:
-            ring = self.ringing
-            chain = chain * Exponentials.ringing(
-                ring.fraction, ring.frequency_MHz, ring.damping_ns
-            )
+        if ring := self.ringing:
+            wave = Exponentials.ringing(ring.fraction, ring.frequency_MHz, ring.damping_ns)
+            chain = chain * wave
         return chain
 
 

@@ -85,19 +85,18 @@ def linear_response(
 
 
 def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
-    where = f"electronics {electronics.name}"
+    where, poles = f"electronics {electronics.name}", electronics.bandwidth_poles_ns
     ratio = electronics.dt_ns / pulses.dt_ns
     if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
         raise CpunetError(
             f"{where}: dt_ns = {electronics.dt_ns:g} is no multiple of the pulses' "
             f"{pulses.dt_ns:g} ns; simulate them with 1, 2 or 4 ns"
         )
-    for field, time_ns in electronics.times_ns.items():
-        if time_ns < pulses.dt_ns:
-            raise CpunetError(
-                f"{where}: {field} means {time_ns:.3g} ns, faster than the pulses' grid of "
-                f"{pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
-            )
+    if min(poles) < pulses.dt_ns:
+        raise CpunetError(
+            f"{where}: bandwidth_poles_ns means {min(poles):.3g} ns, faster than the pulses' "
+            f"grid of {pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
+        )
     return round(ratio)
 
 

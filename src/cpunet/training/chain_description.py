@@ -65,7 +65,7 @@ class DescribedChain:
     def content(self) -> dict[str, Any]:
         """As ``response.json`` has it."""
         facts: dict[str, Any] = {"path": self.run.name, "recipe": self.run.recipe.name}
-        facts |= {"peak": self.run.peak, "seed": self.run.seed}
+        facts |= {"peak": self.run.peak, "seed": self.run.seed, "dt_ns": self.run.dt_ns}
         names = ("values", "errors", "parameters", "parameter_errors", "doubts")
         return facts | {name: getattr(self, name) for name in names}
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import PICTURE_FORMATS, refuse_existing, refuse_inputs, written_aside
+from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses.channels import ALL, Pair, paired
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.loading import (
@@ -140,8 +140,7 @@ class CheckResult:
             If the file exists and `force` is off, or has an unknown format.
         """
         picture = Path(path)
-        _require_picture(picture)
-        refuse_existing(picture, force=force)
+        refuse_picture(picture, force=force)
         figure = self.plot()
         with written_aside(picture) as aside:
             figure.savefig(aside, format=picture.suffix[1:].lower(), dpi=DPI)
@@ -216,9 +215,8 @@ def check(
     alone = both[1].table != ALL
     if picture is not None:
         given = None if isinstance(recipe, Recipe) else recipe
-        refuse_inputs(picture, *both[0].files, *both[1].files, given)
-        _require_picture(picture)
-        refuse_existing(picture, force=force or not alone)
+        files = *both[0].files, *both[1].files, given
+        refuse_picture(picture, *files, force=force or not alone)
     chosen = load_recipe(recipe, settings)
     findings: list[Finding] = []
     for name, pair in ({"": both} if alone else paired(*both)).items():
@@ -245,11 +243,6 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
     if len(sets) < 2:
         return CheckResult(findings)
     return CheckResult([*findings, *compare_sides(sets["sim"], sets["data"], selection)], sets)
-
-
-def _require_picture(picture: Path) -> None:
-    if picture.suffix.lower() not in PICTURE_FORMATS:
-        raise CpunetError(f"{picture}: pictures are made as {', '.join(PICTURE_FORMATS)}")
 
 
 def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[Finding]:

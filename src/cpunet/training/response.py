@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +20,7 @@ from cpunet.settings import checked, read_json
 from cpunet.tables import text_table
 from cpunet.training.chain_description import DescribedChain, describe_chain
 from cpunet.training.closed_forms import Numbers, chain_numbers, true_chain_of, true_parameters
-from cpunet.training.run import Run, RunLike, as_run
+from cpunet.training.run import RunLike, as_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,7 +107,7 @@ class Response:
     def content(self) -> dict[str, Any]:
         """As ``response.json`` has it."""
         content: dict[str, Any] = {"cpunet": cpunet.__version__}
-        content |= {"dt_ns": self.runs[0].run.dt_ns, "runs": [one.content for one in self.runs]}
+        content["runs"] = [one.content for one in self.runs]
         if self.truth is not None:
             content["truth"] = {
                 "name": self.truth.name,
@@ -198,7 +197,7 @@ def response(
     Parameters
     ----------
     runs
-        Runs of a readout chain, as of several detectors, of the same sampling and preparation.
+        Runs of a readout chain, as of several detectors.
     truth
         True readout: folder of a test stand, ornl, legend200, ringing, or a YAML file.
     out
@@ -214,7 +213,7 @@ def response(
     Raises
     ------
     CpunetError
-        If a run has no readout chain, or runs or truth are incompatible.
+        If a run has no readout chain, or the truth is not that of the first.
 
     Examples
     --------
@@ -228,7 +227,12 @@ def response(
         refuse_existing(Path(out), place, *(run.folder for run in known), force=force)
     electronics = _electronics(truth)
     result = Response([describe_chain(run) for run in known], electronics)
-    _require_alike(known, electronics)
+    if electronics is not None and not np.isclose(electronics.dt_ns, known[0].dt_ns):
+        raise CpunetError(
+            f"{known[0].name}: trained on pulses sampled every {known[0].dt_ns:g} ns, "
+            f"electronics {electronics.name} samples every {electronics.dt_ns:g} ns; give the "
+            "truth of its data"
+        )
     for one in result.runs:
         for doubt in one.doubts:
             log.warning(f"{Path(one.run.name).name}: {doubt}")
@@ -246,27 +250,6 @@ def _electronics(truth: str | Path | Electronics | None) -> Electronics | None:
     path = Path(truth) / "stand.json"
     content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
     return checked(Electronics, content.get("electronics"), f"{path}: electronics")
-
-
-def _require_alike(runs: Sequence[Run], truth: Electronics | None) -> None:
-    """Raise a `CpunetError` unless all runs have the first's sampling and preparation."""
-    first, *others = runs
-    for run in others:
-        if not np.isclose(run.dt_ns, first.dt_ns):
-            raise CpunetError(
-                f"{run.name}: trained on pulses sampled every {run.dt_ns:g} ns, {first.name} "
-                f"every {first.dt_ns:g} ns; describe them one by one"
-            )
-        if run.recipe.preparation != first.recipe.preparation:
-            raise CpunetError(
-                f"{run.name}: trained with another preparation than {first.name}; describe "
-                "them one by one"
-            )
-    if truth is not None and not np.isclose(truth.dt_ns, first.dt_ns):
-        raise CpunetError(
-            f"{first.name}: trained on pulses sampled every {first.dt_ns:g} ns, electronics "
-            f"{truth.name} samples every {truth.dt_ns:g} ns; give the truth of its data"
-        )
 
 
 def _row(name: str) -> tuple[int, str, str]:
