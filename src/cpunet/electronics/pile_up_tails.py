@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -35,18 +35,8 @@ DISTURBED = 6.0
 MIN_SAMPLES = 64  # minimum length of a baseline
 
 
-class UsableBaselines(NamedTuple):
-    """Baselines of one length, in ADC counts, and what is known of their traces."""
-
-    values: FloatArray
-    energy_kev: FloatArray
-    adc_per_kev: float
-    tail_decay_us: float
-    dt_ns: float
-
-
-def usable(baselines: Baselines) -> UsableBaselines:
-    """Baselines as pile-up tails are measured from them.
+def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
+    """Baselines of one length, the gain in ADC counts per keV, and the decay of tails in us.
 
     Raises
     ------
@@ -82,13 +72,8 @@ def usable(baselines: Baselines) -> UsableBaselines:
             "the tails of the traces do not decay, so nothing is known of earlier pulses; "
             "are these measured traces?"
         )
-    return UsableBaselines(
-        baselines.first.waveforms[:, :length].astype(float),
-        baselines.first.energy_kev,
-        float(np.median(gains)),
-        -1e3 / slope,
-        baselines.first.dt_ns,
-    )
+    values = baselines.first.waveforms[:, :length].astype(float)
+    return values, float(np.median(gains)), -1e3 / slope
 
 
 def tail_shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:
@@ -269,30 +254,30 @@ class PileUpTails:
             If the baselines are too short, the energies are unknown, or too few traces can
             be used.
         """
-        seen = usable(baselines)
-        decay = decay_us or seen.tail_decay_us
-        mean, left, quiet, broadest = _read(seen, decay)
+        values, gain, tail_decay = usable(baselines)
+        dt_ns, decay = baselines.first.dt_ns, decay_us or tail_decay
+        mean, left, quiet, broadest = _read(values, dt_ns, decay)
         level = mode(mean[quiet])
         tilted = left > LARGE * lower_spread(left[quiet])
-        large = seen.values[quiet & tilted] - level
+        large = values[quiet & tilted] - level
         coupled = False
         if len(large) >= MIN_LARGE:  # with DC coupling they are as high as their tilt implies
             high = large[:, : large.shape[1] // 4].mean(axis=1) / left[quiet & tilted]
             coupled = 1 / COUPLED < float(np.median(high)) < COUPLED
-        own = own_decay_us(large, seen.dt_ns) if coupled else None
+        own = own_decay_us(large, dt_ns) if coupled else None
         error: float | None = None
         if own is not None and decay_us is None:
             decay, error = own
-            mean, left, quiet, broadest = _read(seen, decay)
-        samples = seen.values.shape[1]
-        height = tail_shape(samples, seen.dt_ns, decay).mean() * seen.adc_per_kev
-        of_slope, of_level = left / seen.adc_per_kev, (mean - level) / height
+            mean, left, quiet, broadest = _read(values, dt_ns, decay)
+        samples = values.shape[1]
+        height = tail_shape(samples, dt_ns, decay).mean() * gain
+        of_slope, of_level = left / gain, (mean - level) / height
         slope_error = lower_spread(of_slope[quiet])
         level_error = lower_spread(of_level[quiet]) if coupled else np.inf
         weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
-        fit = fit_rate(kev[quiet], guess, decay, seen.energy_kev)
+        fit = fit_rate(kev[quiet], guess, decay, baselines.first.energy_kev)
         _require_empty(fit)
         return cls(
             kev=np.where(quiet, kev - fit.level_kev, np.nan),
@@ -303,11 +288,11 @@ class PileUpTails:
             decay_us=decay,
             decay_error_us=error,
             baseline_adc=level + (fit.level_kev / weight * height if coupled else 0.0),
-            adc_per_kev=seen.adc_per_kev,
+            adc_per_kev=gain,
             widest_adc=broadest,
             fit=fit,
             samples=samples,
-            dt_ns=seen.dt_ns,
+            dt_ns=dt_ns,
         )
 
     def measure(self, raw: Pulses) -> FloatArray:
@@ -377,10 +362,10 @@ def tails_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _read(
-    seen: UsableBaselines, decay_us: float
+    values: FloatArray, dt_ns: float, decay_us: float
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
     """Mean of each baseline, tail, whether it holds no other pulse, and largest RMS."""
-    mean, left, width = read_baselines(seen.values, seen.dt_ns, decay_us)
+    mean, left, width = read_baselines(values, dt_ns, decay_us)
     finite = width[np.isfinite(width)]
     if len(finite) < MIN_BASELINES:
         raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")

@@ -170,14 +170,6 @@ class Training:
         """Read, train and write a run."""
         files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
         networks = self.recipe.training.method == "cyclegan"
-        if go_on and (out is None or not networks):
-            why = (
-                "takes a minute and keeps no checkpoints" if out else "was kept in memory only"
-            )
-            raise CpunetError(
-                f"recipe {self.recipe.name}: {why}",
-                "give what the training was begun with, or leave out `resume`",
-            )
         place: AbstractContextManager[Path | str]
         if out is None:
             place = TemporaryDirectory()

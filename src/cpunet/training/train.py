@@ -61,7 +61,7 @@ def train(
     device
         cpu, cuda, or auto: the GPU if there is one.
     resume
-        Resume OUT.unfinished; give all other options as before.
+        Resume OUT.unfinished; give all other options as before. Chains are fitted anew.
     read
         How the files are read, if they do not tell themselves. All channels of the data
         become runs in the folders ``OUT/CHANNEL``, in a process for each core.
