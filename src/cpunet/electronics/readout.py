@@ -130,7 +130,12 @@ def draw_other_pulses(
     added_kev = _tails(len(pulses), electronics, tails)
     # before piled-up pulses are added
     tails_kev = added_kev[:, 0].copy()
-    piled = _add_piled(pulses, electronics, added_kev, within)
+    others = electronics.pile_up.rate_kHz, electronics.other_pulses_kev, electronics.dt_ns
+    record = electronics.n_pre, electronics.length
+    piled = DrawnPileUp(*others).draw(len(pulses), *record, within)
+    # with shapes of randomly chosen pulses
+    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
+    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
     return added_kev, tails_kev, piled
 
 
@@ -149,18 +154,6 @@ def _tails(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatA
     centres_ns = (np.arange(electronics.length) + 0.5) * electronics.dt_ns
     decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
     return np.ascontiguousarray((heights @ decays).real)
-
-
-def _add_piled(
-    pulses: Pulses, electronics: Electronics, added_kev: FloatArray, rng: np.random.Generator
-) -> InTracePileUp:
-    """Add piled-up pulses anywhere in the record, with shapes of randomly chosen pulses."""
-    dt_ns = electronics.dt_ns
-    others = electronics.pile_up.rate_kHz, electronics.other_pulses_kev, dt_ns
-    piled = DrawnPileUp(*others).draw(len(pulses), electronics.n_pre, electronics.length, rng)
-    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
-    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
-    return piled
 
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
