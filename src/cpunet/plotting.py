@@ -35,8 +35,6 @@ DATA_FILL = "0.80"
 RIGHT = 0.15  # margin of figures in inches
 
 GROUP = "method-"  # begins the group id of what a figure draws of a method
-# suffix of the name of a method without noise
-NO_NOISE = "_no_noise"
 
 LABELS = {
     "data": "Data",
@@ -222,19 +220,9 @@ def _power(value: float) -> str:
     return f"{digit}×10".removeprefix("1×") + str(int(exponent)).translate(_SUPERSCRIPT)
 
 
-def linear_within(axes: Axes, limit: float) -> None:
-    """Make a y axis logarithmic, but linear up to ± `limit`.
-
-    Small differences then show beside those of an untranslated simulation.
-    """
-    axes.set_yscale("symlog", linthresh=limit)
-    axes.yaxis.set_major_formatter("{x:g}")
-
-
 def label(method: str) -> str:
     """Label of a method in legends."""
-    name = method.removesuffix(NO_NOISE)
-    return LABELS.get(name, name) + (", no noise" if name != method else "")
+    return LABELS.get(method, method)
 
 
 def _group_legends(figure: Figure) -> None:

@@ -197,10 +197,9 @@ def test_verdicts_in_words(tmp_path):
 def test_survival_by_ranges_and_the_noise_are_tables(tmp_path):
     survived = {"survival": 33.333, "survival_std": 3.47, "peak": 400}
     ranges = {"Qbb": {"data": survived, "ren": {"missing": "there is no cut", "peak": 2}}}
-    noise = {
-        "SEP": {"ren": {"n": 90, "samples": 200, "rms": 1.0, "rms_std": 0.1, "sigma": -1.5}}
-    }
-    found = {"ae_details": {"survival by energy range": ranges}, "noise": noise}
+    noise = {"ren": {"n": 90, "samples": 200, "rms": 1.0, "rms_std": 0.1, "sigma": -1.5}}
+    peaks = {"SEP": {"missing": "no pulses", "noise": noise}}
+    found = {"ae_details": {"survival by energy range": ranges}, "peaks": peaks}
     write_report(tmp_path, found, {}, [])
     rows = re.findall(r"<tr>(<td.*?)</tr>", (tmp_path / "report.html").read_text())
     told = [re.findall(r">([^<>]+)</td>", row) for row in rows]

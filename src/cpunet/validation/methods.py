@@ -1,8 +1,8 @@
 """All methods of a validation: baseline methods, fitted to the peak of the training, and REN.
 
-Each translates all simulated pulses once, with and without noise.  Only a few numbers are kept
-of a noise-free pulse, and about twenty events are translated again for display: to keep all
-samples would double the memory.
+Each translates all simulated pulses once, with and without noise.  Of a noise-free pulse only
+its difference from the truth is kept, and a few events are translated again for display: to
+keep all samples would double the memory.
 
 Of a virtual test stand the truth is known.  Two pulses are compared with it after both are
 shifted to cross half of their maximum at the same time: a time shift left by the electronics or
@@ -32,7 +32,7 @@ from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block, pulse_parameters
+from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
@@ -248,63 +248,49 @@ def _or_reason(missing: dict[str, str], name: str, make: Callable[[], T]) -> T |
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseFree:
-    """Numbers of the noise-free pulses of one method.
-
-    Parameters
-    ----------
-    parameters
-        Result of `pulse_parameters`, row by row; NaN where a pulse cannot be prepared.
-    whole
-        Mask of the pulses that could be prepared.
-    squares
-        Squared differences from the truth, see `pair_squares`; None if it is unknown.
-    """
-
-    parameters: Mapping[str, Values]
-    whole: Flags
-    squares: Values | None
-
-
-@dataclass(frozen=True, eq=False)
 class Translations:
-    """Translations of the simulated pulses by all methods, row by row.
+    """Pulses of all methods: measured, simulated, and translated row by row.
 
     Parameters
     ----------
-    noisy
-        Windows with noise by method: baseline methods, ``ren`` and ``truth``, or only ``ren``
-        if the noise of the data is unknown.  Rows that cannot be prepared are NaN.
+    windows
+        Windows with noise by method: ``data``, ``raw``, baseline methods, ``ren`` and
+        ``truth``; of translations only ``ren`` if the noise of the data is unknown.  Rows that
+        cannot be prepared are NaN.
     whole
         Mask of the prepared rows, by method.
-    clean
-        Numbers of the same pulses without noise, and of ``raw``.
+    known
+        Mask of the simulated pulses that every method can prepare without noise.
+    squares
+        Squared differences of the noise-free pulses from the truth by method, see
+        `pair_squares`; empty if the truth is unknown.
     truth
         Windows of the noise-free truth, if known.
     """
 
     ren: REN
     baselines: FittedBaselineMethods
-    simulated: Pulses
-    noisy: dict[str, FloatArray] = field(default_factory=dict)
-    whole: dict[str, Flags] = field(default_factory=dict)
-    clean: dict[str, NoiseFree] = field(default_factory=dict)
-    truth: FloatArray | None = None
+    windows: dict[str, FloatArray]
+    whole: dict[str, Flags]
+    known: Flags
+    squares: dict[str, Values]
+    truth: FloatArray | None
 
-    def without_noise(self, rows: npt.NDArray[np.int64]) -> dict[str, FloatArray]:
-        """Noise-free windows of some pulses by method, with the truth if it is known."""
-        pulses, config = self.simulated[rows], self.ren.recipe.preparation
-        found = {"raw": pulses.waveforms}
+    def without_noise(self, row: int) -> dict[str, FloatArray]:
+        """Noise-free window of a pulse by method, with the truth if it is known."""
+        raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
+        found = {"raw": raw}
         for name, method in self.baselines.methods.items():
-            found[name] = method.translate_like_data(pulses.waveforms, config)
-        found["ren"] = self.ren.apply(pulses.waveforms, noise=False)
-        return found if self.truth is None else found | {"truth": self.truth[rows]}
+            found[name] = method.translate_like_data(raw, config)
+        found["ren"] = self.ren.apply(raw, noise=False)
+        return found if self.truth is None else found | {"truth": self.truth[[row]]}
 
 
 def translate_all(
     ren: REN,
     baselines: FittedBaselineMethods,
     sim: InputSet,
+    data: InputSet,
     responses: FloatArray | None,
     seed: int,
 ) -> Translations:
@@ -314,39 +300,38 @@ def translate_all(
     ----------
     ren, baselines
         REN and baseline methods.
-    sim
-        Prepared simulated pulses.
+    sim, data
+        Prepared pulses of both sides.
     responses
-        True noise-free records of these pulses, if known.
+        True noise-free records of the simulated pulses, if known.
     seed
         Seed of the noise, common to all methods.
     """
-    pulses, recipe = sim.prepared.pulses, ren.recipe
-    known: dict[str, FloatArray] = {} if responses is None else {"truth": responses}
-    others = [*baselines.methods, *known]
+    pulses, recipe, noise = sim.prepared.pulses, ren.recipe, baselines.noise
+    given: dict[str, FloatArray] = {} if responses is None else {"truth": responses}
+    others = [*baselines.methods, *given]
     shape = (len(pulses), recipe.preparation.length)
     noisy = {
         name: np.empty(shape, np.float32)
         for name in (*baselines.methods, "ren", "truth")  # from the simplest to the truth
-        if name == "ren" or (name in others and baselines.noise is not None)
+        if name == "ren" or (name in others and noise is not None)
     }
-    truth = None if responses is None else np.empty(shape, np.float32)
+    truth, known = None, np.ones(len(pulses), bool)
+    squares: dict[str, Values] = {}
+    if responses is not None:
+        truth = np.empty(shape, np.float32)
+        squares = {m: np.zeros((len(pulses), 4)) for m in ("raw", *baselines.methods, "ren")}
     generator = ren.seeded(seed)
-    noise = baselines.noise
     # all methods get the same noise
     rngs = {name: np.random.default_rng(seed) for name in others}
-    parts: dict[str, list[NoiseFree]] = {}
     with stage("Translating", len(pulses)) as bar:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
             clean = {"raw": block.waveforms}
             for name in others:
                 method = baselines.methods.get(name)
-                records = (
-                    known[name][rows] if method is None else method.translate(block.waveforms)
-                )
                 finished = finish(
-                    records,
+                    given[name][rows] if method is None else method.translate(block.waveforms),
                     recipe.preparation,
                     dt_ns=block.dt_ns,
                     noise=noise,
@@ -358,14 +343,18 @@ def translate_all(
                     noisy[name][rows] = finished.windows
             clean["ren"] = ren.apply(block.waveforms, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
+            for windows in clean.values():
+                known[rows] &= _whole(windows)
             if truth is not None:
-                truth[rows] = clean["truth"]
-            for name, numbers in _numbers(clean, recipe, sim.dt_ns).items():
-                parts.setdefault(name, []).append(numbers)
+                truth[rows] = clean.pop("truth")
+                found = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
+                for name, of_block in found.items():
+                    squares[name][rows] = of_block
             bar.update(len(block))
-    whole = {name: _whole(windows) for name, windows in noisy.items()}
-    joined = {name: _joined(found) for name, found in parts.items()}
-    return Translations(ren, baselines, pulses, noisy, whole, joined, truth)
+    sides = {"data": data.prepared.pulses.waveforms, "raw": pulses.waveforms}
+    whole = {m: np.ones(len(w), bool) for m, w in sides.items()}
+    whole |= {m: _whole(windows) for m, windows in noisy.items()}
+    return Translations(ren, baselines, sides | noisy, whole, known, squares, truth)
 
 
 def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArray:
@@ -376,38 +365,6 @@ def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArra
         energy_kev=pulses.energy_kev,
         generator=generator,
         tails_kev=drawn_kev(tails, len(pulses), generator),
-    )
-
-
-def _numbers(
-    clean: Mapping[str, FloatArray], recipe: Recipe, dt_ns: float
-) -> dict[str, NoiseFree]:
-    """Numbers of the noise-free pulses of one block."""
-    squares: Mapping[str, Values] = {}
-    if "truth" in clean:
-        methods = {name: windows for name, windows in clean.items() if name != "truth"}
-        squares = pair_squares(methods, clean["truth"], recipe.scores.edge_samples)
-    return {
-        name: NoiseFree(
-            pulse_parameters(
-                Pulses.of(windows, dt_ns=dt_ns), recipe.preparation, recipe.scores
-            ),
-            _whole(windows),
-            squares.get(name),
-        )
-        for name, windows in clean.items()
-    }
-
-
-def _joined(parts: list[NoiseFree]) -> NoiseFree:
-    squares = [part.squares for part in parts if part.squares is not None]
-    return NoiseFree(
-        {
-            name: np.concatenate([part.parameters[name] for part in parts])
-            for name in parts[0].parameters
-        },
-        np.concatenate([part.whole for part in parts]),
-        np.concatenate(squares) if squares else None,
     )
 
 

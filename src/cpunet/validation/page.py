@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cpunet.html_pages import asset, figure_html, joined, part, rendered
-from cpunet.plotting import NO_NOISE, colours, label
+from cpunet.plotting import colours, label
 from cpunet.progress import stage
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
@@ -32,7 +32,6 @@ AE_ENERGY = "A over E and energy"  # figure with a section of its own
 # section of a figure by the end of its name; all others are under Details
 PLACES = {
     "A over E survival": "ae",
-    "A over E": "ae_drift",
     "mean pulse": "first",
     "superpulses": "slices",
     "noise": "noise",
@@ -88,7 +87,7 @@ def write_page(
         ranges=ranges_table(ranges),
         ae_energy=ae_energy,
         multi_site=metrics.get("ae_energy", {}).get("multi_site"),
-        noise=noise_table(metrics.get("noise", {})),
+        noise=noise_table(metrics.get("peaks", {})),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
         script=Markup(asset("report.js")),
@@ -196,8 +195,6 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
     for peak, found in survival.items():
         title = peak
         for method in found.get("survival", {}):
-            if method.endswith(NO_NOISE):
-                continue  # in metrics.json
             kept, apart = (
                 _percent(found[key].get(method), found[f"{key}_std"].get(method))
                 for key in ("survival", "difference")
@@ -225,14 +222,15 @@ def ranges_table(ranges: Mapping[str, Any]) -> Markup:
     return part("table", head, rows, {0, 1, 4}) if rows else Markup()
 
 
-def noise_table(noise: Mapping[str, Any]) -> Markup:
+def noise_table(peaks: Mapping[str, Any]) -> Markup:
     """Return the RMS of the noise before the pulse by peak and method."""
     rows = [
         [peak, label(method), *(number(found.get(key)) for key in ("n", "samples")),
          with_std(found.get("rms"), found.get("rms_std")),
          *(number(found.get(key)) for key in ("rms_ratio", "sigma", "spectrum_sigma"))]
-        for peak, methods in noise.items()
-        for method, found in methods.items()
+        for peak, scores in peaks.items()
+        for method, found in scores.get("noise", {}).items()
+        if method != "frequency_mhz"
     ]  # fmt: skip
     head = ["Peak", "Method", "Pulses", "Samples", "RMS [height]", "Over the data's", "In σ"]
     return part("table", [*head, "Spectrum in σ"], rows, {0, 1}) if rows else Markup()
@@ -267,14 +265,12 @@ def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
 
 
 def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
-    """One row per parameter and method with noise, and one with the ceiling."""
+    """One row per parameter and method, and one with the ceiling."""
     rows = []
     for name, values in parameters.items():
         unit, iou, error = SHAPE_PARAMETERS[name].unit, values["iou"], values["iou_std"]
         title = name.replace("_", " ").capitalize() + (f" [{unit}]" if unit else "")
         for method, distance in values["wasserstein"].items():
-            if method.endswith(NO_NOISE):
-                continue  # in metrics.json
             moved = with_std(distance, values["wasserstein_std"][method])
             apart = with_std(values["ks"][method], values["ks_std"][method])
             score = _percent(iou[method], error[method])

@@ -11,7 +11,6 @@ from typing import Any
 
 import hist
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -25,22 +24,17 @@ from cpunet.plotting import (
     legend_above,
     legend_height,
     line_look,
-    linear_within,
     logarithmic,
     panels,
-    stacked,
     steps,
     styled,
 )
-from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.validation.comparisons import Compared, histogram
-from cpunet.validation.slices import BEFORE, MeanPulse
 
 CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
 AVERAGED = 10  # records in the moving average
-DRIFT_BINS = 12  # of drift time, with as many pulses each
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
@@ -121,37 +115,6 @@ def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 @styled
-def cycle_figure(
-    start: FloatArray,
-    middle: FloatArray,
-    end: FloatArray,
-    titles: tuple[str, str, str],
-    dt_ns: float,
-) -> Figure:
-    """Pulses through one cycle, in three panels (paper, figures of the cycles).
-
-    Parameters
-    ----------
-    start, middle, end
-        Pulses before, half-way through and after the cycle, shape ``(n, length)``; each
-        row is the same event in all three.
-    titles
-        Titles of the three panels.
-    dt_ns
-        Sampling period in ns.
-    """
-    figure, grid = panels((10.5, 3.2), 1, 3, between=(0.2, 0), sharex=True, sharey=True)
-    time_us = np.arange(start.shape[1]) * dt_ns * 1e-3
-    shades = colormaps["viridis"](np.linspace(0, 0.9, len(start)))
-    for axes, waveforms, title in zip(grid[0], (start, middle, end), titles, strict=True):
-        for waveform, shade in zip(waveforms, shades, strict=True):
-            axes.plot(time_us, waveform, color=shade, linewidth=1.0, rasterized=True)
-        axes.set(title=title, xlabel="Time [µs]")
-    grid[0, 0].set(ylabel="Pulse height [normalised]", xlim=(time_us[0], time_us[-1]))
-    return figure
-
-
-@styled
 def parameter_histograms(
     values: Mapping[str, Values],
     axis: hist.axis.Regular,
@@ -221,75 +184,20 @@ def further_histograms(
         Name of the gamma line, for the title.
     """
     rows, methods = -(-len(values) // COLUMNS), list(next(iter(values.values())))
-    figure, ((axes,),) = panels(
-        (10.5, 1.9 * rows + 0.6), left=0.25, top=legend_height(1), bottom=0.1
-    )
+    top, size = legend_height(1) + 0.1, (10.5, 1.9 * rows + 0.4)
+    figure, grid = panels(size, rows, COLUMNS, left=0.3, top=top, between=(0.25, 0.6))
     palette = colours(methods)
-    # panels of a figure each take longer to draw than their content, so they share one
-    for number, (name, by_method) in enumerate(values.items()):
-        axis, x, y = data_axis(by_method["data"], max_bins), number % COLUMNS, number // COLUMNS
-        low, width = axis.edges[0], np.ptp(axis.edges)
-        shares = {m: histogram(v, axis)[1:-2] / max(len(v), 1) for m, v in by_method.items()}
-        height = max(max(share.max() for share in shares.values()), 1e-9)
-        for method, share in shares.items():
-            heights, edges = -y + 0.6 * share / height, x + 0.9 * (axis.edges - low) / width
-            text = "" if number else label(method)
-            steps(axes, heights, edges, method, palette[method], text, baseline=-y)
-        for tick in MaxNLocator(4).tick_values(low, low + width):
-            if low <= tick <= low + width:
-                at = x + 0.9 * (tick - low) / width
-                axes.plot([at, at], [-y - 0.03, -y], "k", lw=0.8)
-                axes.text(
-                    at, -y - 0.05, f"{tick:g}".replace("-", "−"), ha="center", va="top", size=8
-                )
-        axes.plot([x, x + 0.9], [-y, -y], "k", lw=0.8)
-        axes.text(x + 0.45, -y - 0.28, SHAPE_PARAMETERS[name].axis_label, ha="center")
-    axes.set(xlim=(-0.02, COLUMNS), ylim=(-rows + 0.65, 0.65))
-    axes.set_axis_off()
+    for axes, (name, by_method) in zip(grid.flat, values.items(), strict=False):
+        axis = data_axis(by_method["data"], max_bins)
+        for method, of_method in by_method.items():
+            share = histogram(of_method, axis)[1:-2] / max(len(of_method), 1)
+            steps(axes, share, axis.edges, method, palette[method], label(method))
+        axes.set(xlabel=SHAPE_PARAMETERS[name].axis_label, yticks=[])
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+    for empty in grid.flat[len(values) :]:
+        empty.set_axis_off()
     title = f"{peak}: further parameters, fraction of events per bin, in the data's range"
-    legend_above(figure, axes, len(methods), title)
-    return figure
-
-
-@styled
-def mean_pulses(sets: Mapping[str, MeanPulse], dt_ns: float, peak: str) -> Figure:
-    """Mean pulses aligned at half maximum, and their differences from the data.
-
-    Parameters
-    ----------
-    sets
-        Mean pulses by method, the measured one under ``"data"``; methods are drawn in this
-        order, later ones on top.
-    dt_ns
-        Sampling period in ns.
-    peak
-        Name of the gamma line, for the title.
-    """
-    palette = colours(sets)
-    means = {method: averaged.mean for method, averaged in sets.items()}
-    data = sets["data"]
-    time_ns = (np.arange(len(data.mean)) - BEFORE) * dt_ns
-    figure, above, below = stacked((5.6, 4.8))
-    # the translation last, so that it is on top
-    for method in sorted(means, key=lambda name: name == "ren"):
-        mean, text = means[method], f"{label(method)}, n = {sets[method].n}"
-        look = line_look(method, palette[method])
-        above.plot(time_ns, mean, label=text, **look)
-        if method == "raw":
-            # its different height would dominate the difference
-            mean, look["linestyle"] = mean * data.mean[-1] / mean[-1], "dashed"
-            above.plot(time_ns, mean, label=f"{label(method)}, at the data's height", **look)
-        if method != "data":
-            below.plot(time_ns, 100 * (mean - means["data"]), **look)
-    below.axhline(0, color="black", linewidth=0.8)
-    above.set(title=f"{peak}, mean pulse aligned at half maximum", ylabel="Pulse height")
-    above.legend(loc="lower right")
-    below.set(
-        xlabel="Time from half maximum [ns]",
-        ylabel="Method − data\n[% of full charge,\nlinear within ± 1]",
-        xlim=(time_ns[0], time_ns[-1]),
-    )
-    linear_within(below, 1.0)
+    legend_above(figure, grid[0, 0], len(methods), title)
     return figure
 
 
@@ -328,33 +236,6 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     grid[0].yaxis.set_major_formatter("{x:g}")
     grid[0].yaxis.set_minor_formatter("")
     legend_above(figure, grid[0], 3)
-    return figure
-
-
-@styled
-def drift_figure(before_ns: Values, longer: Values, blur_ns2: Values) -> Figure:
-    """What the U-Net before a readout does, against the drift time of the simulated pulse.
-
-    Parameters
-    ----------
-    before_ns, longer, blur_ns2
-        As `cpunet.networks.learned_response.DriftUNet.effect` returns them, shapes (pulses,).
-    """
-    figure, ((left, right),) = panels((8.4, 3.4), 1, 2, between=(0.75, 0))
-    edges = np.unique(np.quantile(before_ns, np.linspace(0, 1, DRIFT_BINS + 1)))
-    in_bin = np.clip(np.searchsorted(edges, before_ns, "right") - 1, 0, len(edges) - 2)
-    blur_ns = np.sign(blur_ns2) * np.sqrt(np.abs(blur_ns2))
-    filled = np.unique(in_bin)
-    for axes, values in zip((left, right), (100 * longer, blur_ns), strict=True):
-        axes.plot(before_ns, values, ".", color=COLOURS["raw"], markersize=1.5, alpha=0.3)
-        middle = [np.median(values[in_bin == number]) for number in filled]
-        at = [np.median(before_ns[in_bin == number]) for number in filled]
-        axes.plot(at, middle, color=COLOURS["ren"], marker="o", markersize=3, label="median")
-        axes.axhline(0, color="black", linewidth=0.8)
-        axes.set(xlabel="Simulated time from 2 to 98 % of the charge [ns]")
-    left.set(ylabel="Longer by [%]", title="Clock of the U-Net")
-    right.set(ylabel="Gaussian σ [ns], negative: sharpened", title="Blur of the U-Net")
-    left.legend()
     return figure
 
 

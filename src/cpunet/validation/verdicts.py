@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from cpunet.plotting import NO_NOISE, label
+from cpunet.plotting import label
 from cpunet.pulses.parameters import PARAMETERS
 
 AGREES = 2.0  # sigma
@@ -194,8 +194,6 @@ def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdi
 def verdict_table(metrics: Metrics) -> dict[str, dict[str, dict[str, Words]]]:
     """Verdicts on all methods, ready for JSON.
 
-    Methods without noise are left out, since the missing noise alone makes them differ.
-
     Parameters
     ----------
     metrics
@@ -254,13 +252,13 @@ def summary(metrics: Metrics, peak: str, method: str) -> str:
 
 
 def methods_of(metrics: Metrics, peak: str) -> list[str]:
-    """Methods with noise in the scores of a peak, in their order there."""
+    """Methods in the scores of a peak, in their order there."""
     scores = part(metrics, "peaks", peak)
     names = [
         *(m for p in part(scores, "parameters") for m in part(scores, "parameters", p, "iou")),
         *part(scores, "two_sample"),
     ]
-    return [m for m in dict.fromkeys(names) if m != "ceiling" and not m.endswith(NO_NOISE)]
+    return [m for m in dict.fromkeys(names) if m != "ceiling"]
 
 
 def part(metrics: Any, *keys: str) -> Mapping[str, Any]:
