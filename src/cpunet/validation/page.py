@@ -24,7 +24,6 @@ from cpunet.settings import flat
 from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
-from cpunet.validation.side_by_side import peak_figure
 from cpunet.validation.verdicts import Metrics
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
@@ -69,11 +68,9 @@ def write_page(
     ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))
-    scores = joined(
-        peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()
-    )
+    scores = [peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()]
     # of each method that is drawn, for the page's legend
-    palette = colours(re.findall('data-method="([^"]*)"', joined([*drawn.values(), scores])))
+    palette = colours(re.findall('data-method="([^"]*)"', joined(drawn.values())))
     html = rendered(
         "report.html",
         title="CPU-Net validation",
@@ -82,7 +79,7 @@ def write_page(
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts", {})),
         methods=[{"name": m, "label": label(m), "colour": c} for m, c in palette.items()],
-        scores=scores,
+        scores=joined(scores),
         survival=survival_html(metrics.get("ae_survival", {})),
         ranges=ranges_table(ranges),
         ae_energy=ae_energy,
@@ -141,16 +138,11 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
     """Return the section of one peak: numbers of events and tables."""
     chief, others = scores.get("parameters", {}), scores.get("further", {})
     n_sim, n_data = (number(scores.get(name)) for name in ("n_sim", "n_data"))
-    parts = [
-        part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses"),
-        part("p", f"Not scored: {scores['missing']}.")
-        if "missing" in scores
-        else part(
-            "grid", "figures", [figure_html(f"{peak} scores", peak_figure(peak, scores))]
-        ),
-    ]
+    parts = [part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses")]
+    if "missing" in scores:
+        parts.append(part("p", f"Not scored: {scores['missing']}."))
     if chief:
-        parts.append(part("folded", "Scores as a table", _parameter_table(chief)))
+        parts.append(_parameter_table(chief))
     if others:
         title = f"Further parameters: {len(others)}"
         parts.append(part("folded", title, _parameter_table(others), screen=True))
@@ -168,7 +160,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
             else [label(method), *(with_std(found[one], found[std]) for one, std in pairs)]
             for method, found in tested.items()
         ]
-        tables.append(part("folded", "The classifier as a table", part("table", head, rows)))
+        tables.append(part("table", head, rows))
     if paired := scores.get("paired", {}):
         head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
         rows = [
