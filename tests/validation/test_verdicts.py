@@ -140,20 +140,6 @@ def test_the_summary_quotes_the_worst_first():
     )
 
 
-def test_many_parameters_are_counted():
-    changed = metrics()
-    sep = changed["peaks"]["SEP"]
-    sep["parameters"] = {f"p{i}": one(86.0) for i in range(20)}
-    assert summary(changed, "SEP", "ren") == (
-        "REN, SEP: all 22 scores agree with the data within errors"
-    )
-    sep["parameters"]["p3"] = one(60.0)
-    assert summary(changed, "SEP", "ren") == (
-        "REN, SEP: 21 of 22 scores agree with the data within errors (by chance about 2 would "
-        "not); p3 off by 28.8 sigma (IoU 60.0 of 85.9)"
-    )
-
-
 def test_what_is_not_scored_says_why():
     changed = metrics()
     sep = changed["peaks"]["SEP"]

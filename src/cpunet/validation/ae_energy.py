@@ -15,7 +15,7 @@ import scipy.optimize
 from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.plotting import GROUP, colours, group, label, stacked, styled
+from cpunet.plotting import COLOURS, GROUP, group, label, stacked, styled
 from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP, Range
 
@@ -225,9 +225,8 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
         ``methods`` of `against_energy`.
     """
     figure, above, below = stacked((6.4, 5.6), top=0.15)
-    palette = colours(methods)
     for method, found in methods.items():
-        colour, line = palette[method], found.mean
+        colour, line = COLOURS[method], found.mean
         energy, mean, error, sigma, sigma_error = _columns(found.points)
         look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
         for axes, value, spread in (

@@ -16,7 +16,6 @@ from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise
-from cpunet.validation.page import AE_ENERGY
 from cpunet.validation.peaks import PeakSets
 from cpunet.validation.pulse_figures import nearest, shape_figure
 from cpunet.validation.run_figures import (
@@ -30,7 +29,6 @@ from cpunet.validation.slices import AFTER, BEFORE, MeanPulse
 # methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
-LOSSES, ROC = "losses", "A over E survival"
 
 Drawing = Callable[[], Figure]
 T = TypeVar("T")
@@ -40,7 +38,7 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
     if found.ae_energy.methods:
-        drawn[AE_ENERGY] = partial(ae_energy_figure, found.ae_energy.methods)
+        drawn["A over E and energy"] = partial(ae_energy_figure, found.ae_energy.methods)
     for peak in found.sets:
         if peak.name in found.values:
             of_peak = _of_peak(peak, found)
@@ -50,9 +48,9 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
             name: {m: v["current_amplitude"] for m, v in _shown(of_peak).items()}
             for name, of_peak in found.values.items()
         }
-        drawn[ROC] = partial(roc_figure, ae, DEP)
+        drawn["A over E survival"] = partial(roc_figure, ae, DEP)
     if found.run.records:
-        drawn[LOSSES] = partial(loss_curves, found.run.records)
+        drawn["losses"] = partial(loss_curves, found.run.records)
     return drawn
 
 

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cpunet.html_pages import asset, figure_html, joined, part, rendered
-from cpunet.plotting import colours, label
+from cpunet.plotting import COLOURS, label
 from cpunet.progress import stage
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
@@ -27,10 +27,10 @@ from cpunet.validation.report import PAGE
 from cpunet.validation.verdicts import Metrics
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
-AE_ENERGY = "A over E and energy"  # figure with a section of its own
 # section of a figure by the end of its name; all others are under Details
 PLACES = {
     "A over E survival": "ae",
+    "A over E and energy": "ae_energy",
     "mean pulse": "first",
     "superpulses": "slices",
     "noise": "noise",
@@ -65,12 +65,11 @@ def write_page(
             stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
             drawn[name] = figure_html(name.replace("_", " "), draw(), folder / f"{stem}.svg")
             bar.update(1)
-    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))
     scores = [peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()]
     # of each method that is drawn, for the page's legend
-    palette = colours(re.findall('data-method="([^"]*)"', joined(drawn.values())))
+    methods = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn.values())))
     html = rendered(
         "report.html",
         title="CPU-Net validation",
@@ -78,11 +77,11 @@ def write_page(
         placed=placed,
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts", {})),
-        methods=[{"name": m, "label": label(m), "colour": c} for m, c in palette.items()],
+        methods=[{"name": m, "label": label(m), "colour": COLOURS[m]} for m in methods],
         scores=joined(scores),
         survival=survival_html(metrics.get("ae_survival", {})),
         ranges=ranges_table(ranges),
-        ae_energy=ae_energy,
+        ae_energy=ae_energy_html(metrics.get("ae_energy", {})),
         multi_site=metrics.get("ae_energy", {}).get("multi_site"),
         noise=noise_table(metrics.get("peaks", {})),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
@@ -228,8 +227,8 @@ def noise_table(peaks: Mapping[str, Any]) -> Markup:
     return part("table", [*head, "Spectrum in σ"], rows, {0, 1}) if rows else Markup()
 
 
-def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
-    """Return a table of the lines, and the figure."""
+def ae_energy_html(found: Mapping[str, Any]) -> Markup:
+    """Return a table of the lines."""
     if "methods" not in found:
         return part("gap", found["missing"]) if found else Markup()
     rows = []
@@ -247,7 +246,7 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
         )
     head = ["Method", "Slope [% per MeV]", "χ² / degrees", "Width at all energies [%]"]
     head += ["Noise [keV]", f"Width at {REFERENCE_KEV:g} keV [%]"]
-    return joined([part("table", head, rows, {0}), part("grid", "figures", [figure])])
+    return part("table", head, rows, {0})
 
 
 def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.plotting import (
+    COLOURS,
     GROUP,
-    colours,
     label,
     legend_above,
     legend_height,
@@ -49,7 +49,7 @@ def shape_figure(
         Title of the figure.
     """
     methods, n = list(next(iter(columns.values()))), len(columns)
-    palette, per_line = colours(methods), len(methods) if n > 1 else 3
+    per_line = len(methods) if n > 1 else 3
     shared: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
     top = legend_height(len(methods), per_line) + 0.25
     size = (2.0 + 2.7 * n if n > 1 else 5.6, 4.9)
@@ -58,14 +58,14 @@ def shape_figure(
         data = pulses["data"]
         time_ns = dt_ns * np.arange(-BEFORE, len(data.mean) - BEFORE, dtype=float)
         for method, pulse in pulses.items():
-            mean, look = pulse.mean, line_look(method, palette[method])
+            mean, look = pulse.mean, line_look(method)
             if method == "raw":
                 mean = mean * (data.mean[-1] / mean[-1])
             above.plot(time_ns, mean, label=label(method), **look)
             if method != "data":
                 middle = 100 * (mean - data.mean)
                 error = 100 * np.hypot(pulse.error, data.error)
-                band = {"color": palette[method], "gid": GROUP + method, "alpha": 0.2, "lw": 0}
+                band = {"color": COLOURS[method], "gid": GROUP + method, "alpha": 0.2, "lw": 0}
                 below.plot(time_ns, middle, **look)
                 below.fill_between(time_ns, middle - error, middle + error, **band)
         counts = "n = " + ", ".join(str(pulse.n) for pulse in pulses.values())

@@ -19,12 +19,10 @@ from cpunet.errors import CpunetError
 from cpunet.plotting import (
     COLOURS,
     GROUP,
-    colours,
     label,
     legend_above,
     legend_height,
     line_look,
-    logarithmic,
     panels,
     steps,
     styled,
@@ -93,7 +91,6 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
         if axes.lines:
             axes.legend()
     grid[0, 0].set(ylabel="Loss", yscale="log")
-    logarithmic(grid[0, 0].yaxis)
     figure.supxlabel(f"Lines: mean of {AVERAGED} records", fontsize=8, x=0.99, ha="right")
     return figure
 
@@ -110,7 +107,6 @@ def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
     )
     axes.set(xlabel="Step", ylabel="χ² of the moments", yscale="log")
     axes.set_title("Response matched to data")
-    logarithmic(axes.yaxis)
     return figure
 
 
@@ -140,7 +136,6 @@ def parameter_histograms(
     comparison
         Result of `comparisons.compare` for the parameter.
     """
-    palette = colours(values)
     # a bar at either end holds underflow and overflow
     low, high = axis.edges[[0, -1]]
     bar = max(high - low, np.spacing(high)) / 25
@@ -152,7 +147,7 @@ def parameter_histograms(
         score, missing = comparison["iou"].get(name), int(np.isnan(values[method]).sum())
         text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
         text += f", n = {len(values[method])}" + (f", {missing} undefined" if missing else "")
-        steps(axes, heights, edges, method, palette[method], text)
+        steps(axes, heights, edges, method, text)
     # the outermost bars can be as high as 1 and would flatten everything in between
     top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
     axes.set(
@@ -161,7 +156,7 @@ def parameter_histograms(
         xlim=(edges[0], edges[-1]),
         ylim=(0, top),
     )
-    _mark_flow(axes, edges, fractions, palette)
+    _mark_flow(axes, edges, fractions)
     title = f"{peak}: bars beyond the dotted lines hold all events outside"
     legend_above(figure, axes, title=title)
     return figure
@@ -186,12 +181,11 @@ def further_histograms(
     rows, methods = -(-len(values) // COLUMNS), list(next(iter(values.values())))
     top, size = legend_height(1) + 0.1, (10.5, 1.9 * rows + 0.4)
     figure, grid = panels(size, rows, COLUMNS, left=0.3, top=top, between=(0.25, 0.6))
-    palette = colours(methods)
     for axes, (name, by_method) in zip(grid.flat, values.items(), strict=False):
         axis = data_axis(by_method["data"], max_bins)
         for method, of_method in by_method.items():
             share = histogram(of_method, axis)[1:-2] / max(len(of_method), 1)
-            steps(axes, share, axis.edges, method, palette[method], label(method))
+            steps(axes, share, axis.edges, method, label(method))
         axes.set(xlabel=SHAPE_PARAMETERS[name].axis_label, yticks=[])
         axes.xaxis.set_major_locator(MaxNLocator(4))
     for empty in grid.flat[len(values) :]:
@@ -215,7 +209,6 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     """
     others = [peak for peak in ae if peak != dep]
     methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
-    palette = colours(methods)
     size, top = (3.4 * len(others) + 0.6, 3.8), legend_height(len(methods), 3, titled=False)
     figure, (grid,) = panels(size, 1, len(others), top=top + 0.2, between=(0.3, 0), sharey=True)
     accepted = np.linspace(0.0, 1.0, ROC_POINTS)
@@ -228,7 +221,7 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
                 continue
             cuts = np.quantile(single, 1 - accepted)
             left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
-            look = line_look(method, palette[method])
+            look = line_look(method)
             axes.plot(100 * accepted, 100 * left, label=label(method), **look)
         axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
     # useful cuts leave few multi-site events
@@ -239,9 +232,7 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     return figure
 
 
-def _mark_flow(
-    axes: Axes, edges: Values, fractions: Mapping[str, Values], palette: Mapping[str, str]
-) -> None:
+def _mark_flow(axes: Axes, edges: Values, fractions: Mapping[str, Values]) -> None:
     """Separate the outermost bars, and label those that exceed the axis."""
     top = axes.get_ylim()[1]
     for bar, edge, side in ((0, edges[1], "left"), (-1, edges[-2], "right")):
@@ -255,7 +246,7 @@ def _mark_flow(
                 textcoords="offset points",
                 ha=side,
                 va="top",
-                color=palette[method],
+                color=COLOURS[method],
                 fontsize=8.5,
                 gid=GROUP + method,
             )

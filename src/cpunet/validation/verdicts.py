@@ -26,8 +26,6 @@ from cpunet.pulses.parameters import PARAMETERS
 
 AGREES = 2.0  # sigma
 TOO_CLOSE = 4.0  # sigma on the good side: not by chance, but the same events on both sides
-LISTED = 6  # agreeing quantities listed by name; more are only counted
-BY_CHANCE = 0.08  # fraction of a perfect translation's parameters off in IoU or distance
 WITHIN = "agrees within errors"
 
 Worse = Literal["lower", "higher", "both"]
@@ -245,7 +243,11 @@ def summary(metrics: Metrics, peak: str, method: str) -> str:
             worst = max(known.values(), key=lambda v: v.severity)
             quoted = f" ({worst.numbers})" if worst.numbers else ""
             off.append((worst.severity, f"{_called(name)} {worst.words}{quoted}"))
-    parts = [_agreement(agreeing, len(off))] if agreeing else []
+    parts = []
+    if agreeing:
+        *first, last = agreeing
+        names = f"{', '.join(first)} and {last}" if first else last
+        parts = [f"{names} {'agree' if first else 'agrees'} with the data within errors"]
     parts += [text for _, text in sorted(off, key=lambda pair: -pair[0])]
     head = f"{_SHORT.get(method, label(method))}, {peak}"
     return f"{head}: {'; '.join(parts + silent) or 'not scored'}"
@@ -279,18 +281,6 @@ def number(metrics: Any, *keys: str) -> float | None:
 def _called(quantity: str) -> str:
     named = {_AUC: "classifier", _SURVIVAL: "A/E survival"}
     return named.get(quantity, quantity.replace("_", " "))
-
-
-def _agreement(agreeing: list[str], n_off: int) -> str:
-    """List the agreeing quantities, or only their number if they are too many for a line."""
-    if len(agreeing) > LISTED:
-        total = len(agreeing) + n_off
-        count = f"{len(agreeing)} of {total}" if n_off else f"all {total}"
-        chance = f" (by chance about {BY_CHANCE * total:.0f} would not)" if n_off else ""
-        return f"{count} scores agree with the data within errors{chance}"
-    *first, last = agreeing
-    names = f"{', '.join(first)} and {last}" if first else last
-    return f"{names} {'agree' if first else 'agrees'} with the data within errors"
 
 
 def judged_scores(metrics: Metrics, method: str) -> tuple[int, int]:
