@@ -30,7 +30,6 @@ COLOURS = {
 }
 SPARE_COLOURS = ("#8C6D1F", "#5B3A8C", "#9E2A2B", "#4F6D7A", "#B8A200")
 DATA_FILL = "0.80"
-RIGHT, BOTTOM = 0.15, 0.5  # margins of figures in inches
 
 GROUP = "method-"  # begins the group id of what a figure draws of a method
 
@@ -90,62 +89,13 @@ def group(drawn: Container, method: str) -> None:
 
 
 def panels(
-    size: tuple[float, float],
-    rows: int = 1,
-    columns: int = 1,
-    *,
-    left: float = 0.85,
-    top: float = 0.35,
-    between: tuple[float, float] = (0.65, 0.4),
-    **how: Any,
+    size: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any
 ) -> tuple[Figure, npt.NDArray[Any]]:
-    """A figure with panels in fixed places; to fit them to labels takes as long as to draw.
-
-    Parameters
-    ----------
-    size
-        Width and height of the figure in inches.
-    rows, columns
-        Numbers of panels.
-    left, top
-        Margins in inches.
-    between
-        Gaps in inches between columns and between rows.
-    how
-        Further arguments of `Figure.subplots`.
-    """
+    """A figure of a size in inches with a grid of panels, made as `Figure.subplots` says."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size)
-    figure.set_layout_engine("none")
-    width, height = size[0] - left - RIGHT, size[1] - top - BOTTOM
-    of_one = [
-        (whole - (n - 1) * gap) / n
-        for whole, n, gap in zip((width, height), (columns, rows), between, strict=True)
-    ]
-    places = {
-        "left": left / size[0],
-        "right": 1 - RIGHT / size[0],
-        "bottom": BOTTOM / size[1],
-        "top": 1 - top / size[1],
-        "wspace": between[0] / of_one[0],
-        "hspace": between[1] / of_one[1],
-    }
-    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=places, **how)
-
-
-def stacked(
-    size: tuple[float, float], left: float = 1.05, top: float = 0.35
-) -> tuple[Figure, Any, Any]:
-    """A figure with two panels above each other, the lower one smaller, see `panels`."""
-    how: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
-    figure, ((above,), (below,)) = panels(size, 2, left=left, top=top, between=(0, 0.15), **how)
-    return figure, above, below
-
-
-def legend_height(entries: int, columns: int = 1, *, titled: bool = True) -> float:
-    """Room in inches for `legend_above`."""
-    return 0.16 + 0.178 * -(-entries // columns) + 0.2 * titled
+    return figure, figure.subplots(rows, columns, squeeze=False, **how)
 
 
 def legend_above(

@@ -17,7 +17,6 @@ from cpunet.plotting import (
     GROUP,
     label,
     legend_above,
-    legend_height,
     line_look,
     panels,
     styled,
@@ -51,9 +50,7 @@ def shape_figure(
     methods, n = list(next(iter(columns.values()))), len(columns)
     per_line = len(methods) if n > 1 else 3
     shared: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
-    top = legend_height(len(methods), per_line) + 0.25
-    size = (2.0 + 2.7 * n if n > 1 else 5.6, 4.9)
-    figure, grid = panels(size, 2, n, left=1.1, top=top, between=(0.2, 0.2), **shared)
+    figure, grid = panels((2.0 + 2.7 * n if n > 1 else 5.6, 4.9), 2, n, **shared)
     for (above, below), (name, pulses) in zip(grid.T, columns.items(), strict=True):
         data = pulses["data"]
         time_ns = dt_ns * np.arange(-BEFORE, len(data.mean) - BEFORE, dtype=float)

@@ -21,7 +21,6 @@ from cpunet.plotting import (
     GROUP,
     label,
     legend_above,
-    legend_height,
     line_look,
     panels,
     steps,
@@ -75,7 +74,7 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     if CHI_SQUARE in records[0]["losses"]:
         return _chi_square_curve(records)
     iteration = np.array([record["iteration"] for record in records], dtype=float)
-    figure, grid = panels((10.5, 3.6), 1, len(LOSS_PANELS), between=(0.5, 0))
+    figure, grid = panels((10.5, 3.6), 1, len(LOSS_PANELS))
     for axes, (title, losses) in zip(grid[0], LOSS_PANELS.items(), strict=True):
         for name, (text, colour) in losses.items():
             series = np.array([record["losses"].get(name, np.nan) for record in records], float)
@@ -141,7 +140,7 @@ def parameter_histograms(
     bar = max(high - low, np.spacing(high)) / 25
     edges = np.concatenate([[low - bar], axis.edges, [high + bar]])
     fractions = {m: histogram(v, axis)[:-1] / max(len(v), 1) for m, v in values.items()}
-    figure, ((axes,),) = panels((5.6, 4.2), top=legend_height(len(values)))
+    figure, ((axes,),) = panels((5.6, 4.2))
     for method, heights in fractions.items():
         name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
         score, missing = comparison["iou"].get(name), int(np.isnan(values[method]).sum())
@@ -179,8 +178,7 @@ def further_histograms(
         Name of the gamma line, for the title.
     """
     rows, methods = -(-len(values) // COLUMNS), list(next(iter(values.values())))
-    top, size = legend_height(1) + 0.1, (10.5, 1.9 * rows + 0.4)
-    figure, grid = panels(size, rows, COLUMNS, left=0.3, top=top, between=(0.25, 0.6))
+    figure, grid = panels((10.5, 1.9 * rows + 0.4), rows, COLUMNS)
     for axes, (name, by_method) in zip(grid.flat, values.items(), strict=False):
         axis = data_axis(by_method["data"], max_bins)
         for method, of_method in by_method.items():
@@ -209,8 +207,8 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     """
     others = [peak for peak in ae if peak != dep]
     methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
-    size, top = (3.4 * len(others) + 0.6, 3.8), legend_height(len(methods), 3, titled=False)
-    figure, (grid,) = panels(size, 1, len(others), top=top + 0.2, between=(0.3, 0), sharey=True)
+    size = (3.4 * len(others) + 0.6, 3.8)
+    figure, (grid,) = panels(size, 1, len(others), sharey=True)
     accepted = np.linspace(0.0, 1.0, ROC_POINTS)
     for axes, peak in zip(grid, others, strict=True):
         for method in sorted(methods, key=lambda name: name == "ren"):
