@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -84,7 +85,7 @@ def whole(run, files) -> Evaluation:
 def test_a_sample_of_both_sides_is_compared(run, files) -> None:
     how = {"baselines": False, "device": "cpu", "max_pulses": 250}
     few = evaluate(run, files["sim"], files["data"], **how)
-    assert len(few.sim.prepared) == 250
+    assert len(few.sets[0].translations.windows["raw"]) == 250
     assert few.metrics["rejections"]["sim"]["not_drawn"] == 130
 
 
@@ -115,9 +116,10 @@ def test_every_figure_can_be_drawn(whole) -> None:
         assert drawing().axes
 
 
-def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole, run) -> None:
+def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) -> None:
+    sides = [SimpleNamespace(path=Path(f), detector=None, read_as={}) for f in ("sim", "data")]
     unknown = {"seed": None, "sim": UNKNOWN, "data": UNKNOWN, "started": ""}
-    told = _compared(run.model_copy(update=unknown), whole.sim, whole.data)
+    told = _compared(run.model_copy(update=unknown), *sides)
     assert told["trained"] == (
         "recipe fast on FEP, an unknown number of simulated and an unknown number of measured "
         "pulses"
@@ -177,8 +179,8 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     raw = peak.rows["raw"]
     assert all(len(p) == len(raw) for m, p in pulses.items() if m != "data")
     again = peak.translations.ren.apply(
-        found.sim.prepared.pulses.waveforms,
-        energy_kev=found.sim.prepared.pulses.energy_kev,
+        peak.translations.windows["raw"],
+        energy_kev=peak.translations.energy_kev["raw"],
         generator=peak.translations.ren.seeded(0),
     )
     np.testing.assert_array_equal(pulses["ren"], again[raw])

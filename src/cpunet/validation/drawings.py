@@ -59,7 +59,7 @@ def _shown(by_method: Mapping[str, T], methods: Collection[str] = DRAWN) -> dict
 
 
 def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
-    name, dt_ns, bins = peak.name, peak.dt_ns, found.run.recipe.scores.max_bins
+    name, dt_ns, bins = peak.name, found.run.dt_ns, found.run.recipe.scores.max_bins
     scores, values = found.metrics["peaks"][name], _shown(found.values[name])
     drawn: dict[str, Drawing] = {}
     further: dict[str, dict[str, Values]] = {}
@@ -108,5 +108,5 @@ def _single_pulse(peak: PeakSets) -> Drawing | None:
             pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
             title = f"{peak.name}: a simulated pulse without noise, and the measured one\n"
             title += f"nearest to its REN translation (RMS difference {rms:.4f})"
-            return partial(shape_figure, {"": pulses}, peak.dt_ns, title)
+            return partial(shape_figure, {"": pulses}, peak.translations.ren.dt_ns, title)
     return None

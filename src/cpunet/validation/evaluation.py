@@ -12,12 +12,7 @@ import cpunet
 from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices
 from cpunet.progress import stage
-from cpunet.pulses.loading import (
-    InputSet,
-    load_pulses,
-    require_same_sampling,
-)
-from cpunet.pulses.parameters import Values, current_amplitude
+from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
@@ -33,7 +28,12 @@ from cpunet.validation.a_over_e import (
 )
 from cpunet.validation.ae_energy import AgainstEnergy, against_energy
 from cpunet.validation.comparisons import Missing
-from cpunet.validation.methods import fit_baseline_methods, translate_all, true_responses
+from cpunet.validation.methods import (
+    Translations,
+    fit_baseline_methods,
+    translate_all,
+    true_responses,
+)
 from cpunet.validation.peaks import ByMethod, PeakScores, PeakSets, score_peak
 from cpunet.validation.report import as_stored
 from cpunet.validation.slices import Slices, aligned_means, slice_table
@@ -50,8 +50,6 @@ class Evaluation:
     ----------
     run
         The run.
-    sim, data
-        Prepared pulses of both sides.
     sets, values, slices
         Pulses, and parameters and mean pulses by method, each by peak.  The latter two exist
         only for scored peaks.
@@ -62,8 +60,6 @@ class Evaluation:
     """
 
     run: Run
-    sim: InputSet
-    data: InputSet
     sets: list[PeakSets]
     values: Mapping[str, ByMethod]
     slices: Mapping[str, Mapping[str, Slices]]
@@ -108,19 +104,8 @@ def evaluate(
         fitted=baselines,
     )
     translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
-    simulated, measured = sim_set.prepared.pulses, data_set.prepared.pulses
-    # of each whole side at once, so that peaks that overlap share them
-    amplitudes = {m: current_amplitude(windows) for m, windows in translations.windows.items()}
-    sets = [
-        PeakSets.of(
-            name,
-            parse_selection(name, recipe.peaks),
-            (simulated, measured),
-            translations,
-            amplitudes,
-        )
-        for name in names
-    ]
+    selections = {name: parse_selection(name, recipe.peaks) for name in names}
+    sets = [PeakSets.of(name, one, translations) for name, one in selections.items()]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
@@ -144,12 +129,10 @@ def evaluate(
         },
         seed=seed,
     )
-    sides = {m: measured if m == "data" else simulated for m in amplitudes}
-    energies = {method: side.energy_kev for method, side in sides.items()}
     known = None if run.fit is None else run.fit.tails
     ae_energy = against_energy(
-        {method: amplitudes[method] for method in ("data", "ren")},
-        energies,
+        {method: translations.amplitudes[method] for method in ("data", "ren")},
+        translations.energy_kev,
         {name: span for name, (span, _) in _lines(recipe).items()},
     )
     metrics = {
@@ -157,7 +140,7 @@ def evaluate(
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
-            "survival by energy range": _range_survivals(amplitudes, energies, kept, recipe)
+            "survival by energy range": _range_survivals(translations, kept, recipe)
         },
         "ae_energy": ae_energy,
         "drift_slices": {
@@ -182,7 +165,7 @@ def evaluate(
         "summary": [summary(stored, name, "ren") for name in values],
         "table": verdict_table(stored),
     }
-    return Evaluation(run, sim_set, data_set, sets, values, slices, ae_energy, stored)
+    return Evaluation(run, sets, values, slices, ae_energy, stored)
 
 
 def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
@@ -194,8 +177,7 @@ def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
 
 
 def _range_survivals(
-    amplitudes: Mapping[str, Values],
-    energies: Mapping[str, Values],
+    translations: Translations,
     ae_survival: dict[str, SurvivalRow] | Missing,
     recipe: Recipe,
 ) -> dict[str, dict[str, RangeSurvival]] | Missing:
@@ -207,8 +189,10 @@ def _range_survivals(
     ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
     return {
         name: {
-            method: peak_survival(values, energies[method], cuts[method], span, sidebands)
-            for method, values in amplitudes.items()
+            method: peak_survival(
+                values, translations.energy_kev[method], cuts[method], span, sidebands
+            )
+            for method, values in translations.amplitudes.items()
             if method in cuts
         }
         for name, (span, sidebands) in ranges.items()

@@ -32,7 +32,7 @@ from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block
+from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
@@ -257,8 +257,8 @@ class Translations:
         Windows with noise by method: ``data``, ``raw``, baseline methods, ``ren`` and
         ``truth``; of translations only ``ren`` if the noise of the data is unknown.  Rows that
         cannot be prepared are NaN.
-    whole
-        Mask of the prepared rows, by method.
+    whole, energy_kev, amplitudes
+        Mask of the prepared rows, energies and current amplitudes, by method.
     known
         Mask of the simulated pulses that every method can prepare without noise.
     squares
@@ -272,6 +272,8 @@ class Translations:
     baselines: FittedBaselineMethods
     windows: dict[str, FloatArray]
     whole: dict[str, Flags]
+    energy_kev: dict[str, Values]
+    amplitudes: dict[str, Values]
     known: Flags
     squares: dict[str, Values]
     truth: FloatArray | None
@@ -351,10 +353,19 @@ def translate_all(
                 for name, of_block in found.items():
                     squares[name][rows] = of_block
             bar.update(len(block))
-    sides = {"data": data.prepared.pulses.waveforms, "raw": pulses.waveforms}
-    whole = {m: np.ones(len(w), bool) for m, w in sides.items()}
-    whole |= {m: _whole(windows) for m, windows in noisy.items()}
-    return Translations(ren, baselines, sides | noisy, whole, known, squares, truth)
+    measured = data.prepared.pulses
+    every = {"data": measured.waveforms, "raw": pulses.waveforms} | noisy
+    return Translations(
+        ren,
+        baselines,
+        every,
+        {method: _whole(windows) for method, windows in every.items()},
+        {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
+        {method: current_amplitude(windows) for method, windows in every.items()},
+        known,
+        squares,
+        truth,
+    )
 
 
 def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArray:

@@ -36,39 +36,25 @@ class PeakSets:
         Name of a peak of the recipe, or a range in keV.
     translations
         Pulses of all methods.
-    amplitudes
-        Current amplitudes of all pulses of each method, with noise.
     rows
         Rows of the pulses with noise, by method: the data, then from the simplest method to the
         truth; of translations those that can be prepared.
-    dt_ns
-        Sampling period in ns.
     """
 
     name: str
     translations: Translations
-    amplitudes: Mapping[str, Values]
     rows: dict[str, Rows]
-    dt_ns: float
 
     @classmethod
-    def of(
-        cls,
-        name: str,
-        chosen: EnergySelection,
-        sides: tuple[Pulses, Pulses],
-        translations: Translations,
-        amplitudes: Mapping[str, Values],
-    ) -> Self:
+    def of(cls, name: str, chosen: EnergySelection, translations: Translations) -> Self:
         """Select the pulses of a peak, of both sides and of the translations."""
-        sim, data = (chosen.select(side.energy_kev) for side in sides)
         rows = {
-            method: np.flatnonzero((data if method == "data" else sim) & whole)
+            method: np.flatnonzero(chosen.select(translations.energy_kev[method]) & whole)
             for method, whole in translations.whole.items()
         }
         always = ("data", "raw", "ren")
         rows = {m: r for m, r in rows.items() if m in always or len(r) >= MIN_PULSES}
-        return cls(name, translations, amplitudes, rows, sides[0].dt_ns)
+        return cls(name, translations, rows)
 
     def windows(self, method: str) -> FloatArray:
         """Pulses with noise of a method, copied from its whole dataset."""
@@ -86,8 +72,8 @@ class PeakSets:
 
     def not_prepared(self) -> dict[str, int]:
         """Number of translated pulses that cannot be prepared like data, by method."""
-        whole = {m: kept for m, kept in self.translations.whole.items() if m != "data"}
-        counts = {name: int((~kept[self.rows["raw"]]).sum()) for name, kept in whole.items()}
+        raw, whole = self.rows["raw"], self.translations.whole
+        counts = {m: int((~kept[raw]).sum()) for m, kept in whole.items() if m != "data"}
         return {name: count for name, count in counts.items() if count}
 
     def missing(self) -> str | None:
@@ -152,13 +138,13 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, Pea
     counted = PeakScores(len(peak.rows["raw"]), len(peak.rows["data"]), peak.not_prepared())
     if (missing := peak.missing()) is not None:
         return {}, replace(counted, missing=missing)
-    dt_ns, samples = peak.dt_ns, recipe.preparation.baseline_samples
+    dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
     values = {
         method: all_parameters(
             Pulses.of(peak.windows(method), dt_ns=dt_ns),
             recipe.preparation,
             recipe.scores,
-            amplitudes=peak.amplitudes[method][rows],
+            amplitudes=peak.translations.amplitudes[method][rows],
         )
         for method, rows in peak.rows.items()
     }
