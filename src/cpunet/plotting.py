@@ -45,6 +45,9 @@ LABELS = {
     "ceiling": "Ceiling",
 }
 
+# two panels above each other, the lower one smaller
+STACKED: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
+
 _STYLE = {
     "font.size": 10.0,
     "axes.labelsize": 10.0,

@@ -15,7 +15,7 @@ import scipy.optimize
 from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.plotting import COLOURS, GROUP, group, label, panels, styled
+from cpunet.plotting import COLOURS, GROUP, STACKED, group, label, panels, styled
 from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP, Range
 
@@ -224,8 +224,7 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
     methods
         ``methods`` of `against_energy`.
     """
-    how = {"sharex": True, "height_ratios": (3, 2)}
-    figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **how)
+    figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
     for method, found in methods.items():
         colour, line = COLOURS[method], found.mean
         energy, mean, error, sigma, sigma_error = _columns(found.points)

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
-from cpunet.plotting import COLOURS, group, label, panels, styled
+from cpunet.plotting import COLOURS, STACKED, group, label, panels, styled
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 
@@ -116,8 +116,7 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     """
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
     frequency = np.asarray(found["frequency_mhz"])
-    how = {"sharex": True, "height_ratios": (3, 2)}
-    figure, ((above,), (below,)) = panels((5.6, 4.4), 2, **how)
+    figure, ((above,), (below,)) = panels((5.6, 4.4), 2, **STACKED)
     data = np.asarray(found["data"]["power"])
     for method in methods:
         power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))

@@ -7,7 +7,6 @@ simulated pulse is therefore shown beside the measured one nearest to its transl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from cpunet.plotting import (
     COLOURS,
     GROUP,
+    STACKED,
     label,
     legend_above,
     line_look,
@@ -49,8 +49,8 @@ def shape_figure(
     """
     methods, n = list(next(iter(columns.values()))), len(columns)
     per_line = len(methods) if n > 1 else 3
-    shared: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
-    figure, grid = panels((2.0 + 2.7 * n if n > 1 else 5.6, 4.9), 2, n, **shared)
+    width = 2.0 + 2.7 * n if n > 1 else 5.6
+    figure, grid = panels((width, 4.9), 2, n, sharey="row", **STACKED)
     for (above, below), (name, pulses) in zip(grid.T, columns.items(), strict=True):
         data = pulses["data"]
         time_ns = dt_ns * np.arange(-BEFORE, len(data.mean) - BEFORE, dtype=float)

@@ -11,47 +11,20 @@ from typing import Any
 
 import hist
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from cpunet.errors import CpunetError
-from cpunet.plotting import (
-    COLOURS,
-    GROUP,
-    label,
-    legend_above,
-    line_look,
-    panels,
-    steps,
-    styled,
-)
+from cpunet.plotting import label, legend_above, line_look, panels, steps, styled
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.validation.comparisons import Compared, histogram
 
-CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
-AVERAGED = 10  # records in the moving average
+AVERAGED = 10  # maximum number of records in a moving average
+OUTSIDE = 0.01  # share of events outside the range from which it is told
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
-# Panels of the loss figure: losses with their label and colour.
-LOSS_PANELS: Mapping[str, Mapping[str, tuple[str, str]]] = {
-    "Cycle and identity": {
-        "cycle_forward": ("cycle, sim → data → sim", COLOURS["ren"]),
-        "cycle_backward": ("cycle, data → sim → data", COLOURS["iren"]),
-        "identity_data": ("identity, data", COLOURS["data"]),
-        "identity_sim": ("identity, simulation", COLOURS["raw"]),
-    },
-    "Generators, adversarial": {
-        "adversarial_ren": ("REN", COLOURS["ren"]),
-        "adversarial_iren": ("IREN", COLOURS["iren"]),
-    },
-    "Discriminators": {
-        "discriminator_data": ("data", COLOURS["data"]),
-        "discriminator_sim": ("simulation", COLOURS["raw"]),
-    },
-}
 
 
 @styled
@@ -71,41 +44,18 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     """
     if not records:
         raise CpunetError("the training log is empty: there are no losses to draw; train first")
-    if CHI_SQUARE in records[0]["losses"]:
-        return _chi_square_curve(records)
-    iteration = np.array([record["iteration"] for record in records], dtype=float)
-    figure, grid = panels((10.5, 3.6), 1, len(LOSS_PANELS))
-    for axes, (title, losses) in zip(grid[0], LOSS_PANELS.items(), strict=True):
-        for name, (text, colour) in losses.items():
-            series = np.array([record["losses"].get(name, np.nan) for record in records], float)
-            there = ~np.isnan(series)  # discriminators are not updated in every iteration
-            if not there.any():
-                continue
-            at, series = iteration[there], series[there]
-            axes.plot(at, series, color=colour, alpha=0.25, linewidth=0.7)
-            width = min(AVERAGED, len(series))
-            average = np.convolve(series, np.full(width, 1 / width), mode="valid")
-            axes.plot(at[len(at) - len(average) :], average, colour, label=text)
-        axes.set(title=title, xlabel="Iteration")
-        if axes.lines:
-            axes.legend()
-    grid[0, 0].set(ylabel="Loss", yscale="log")
-    figure.supxlabel(f"Lines: mean of {AVERAGED} records", fontsize=8, x=0.99, ha="right")
-    return figure
-
-
-def _chi_square_curve(records: Sequence[Mapping[str, Any]]) -> Figure:
-    """Chi-square of a fitted chain after each step of the fit."""
-    figure, ((axes,),) = panels((4.6, 3.4))
-    axes.plot(
-        [record["iteration"] for record in records],
-        [record["losses"].get(CHI_SQUARE, np.nan) for record in records],
-        color="black",
-        marker="o",
-        markersize=3,
-    )
-    axes.set(xlabel="Step", ylabel="χ² of the moments", yscale="log")
-    axes.set_title("Response matched to data")
+    figure, ((axes,),) = panels((7.5, 4.2))
+    for name in dict.fromkeys(name for record in records for name in record["losses"]):
+        # discriminators are not updated in every iteration
+        there = [record for record in records if name in record["losses"]]
+        at = [record["iteration"] for record in there]
+        series = [record["losses"][name] for record in there]
+        width = min(AVERAGED, -(-len(series) // 5))
+        average = np.convolve(series, np.full(width, 1 / width), mode="valid")
+        (line,) = axes.plot(at[width - 1 :], average, label=name.replace("_", " "))
+        axes.plot(at, series, color=line.get_color(), alpha=0.25, linewidth=0.7)
+    axes.set(xlabel="Iteration", ylabel="Loss", yscale="log")
+    axes.legend(title=f"Moving averages over {AVERAGED} records or a fifth of them")
     return figure
 
 
@@ -119,8 +69,8 @@ def parameter_histograms(
 ) -> Figure:
     """Distributions of one parameter: the data filled, each method as a line.
 
-    All histograms sum to one.  The outermost bars are underflow and overflow.  The legend
-    gives each method's IoU and the ceiling.
+    All histograms sum to one, with the events outside the range, whose share is in the legend
+    beside each method's IoU and the ceiling.
 
     Parameters
     ----------
@@ -135,29 +85,18 @@ def parameter_histograms(
     comparison
         Result of `comparisons.compare` for the parameter.
     """
-    # a bar at either end holds underflow and overflow
-    low, high = axis.edges[[0, -1]]
-    bar = max(high - low, np.spacing(high)) / 25
-    edges = np.concatenate([[low - bar], axis.edges, [high + bar]])
-    fractions = {m: histogram(v, axis)[:-1] / max(len(v), 1) for m, v in values.items()}
     figure, ((axes,),) = panels((5.6, 4.2))
-    for method, heights in fractions.items():
+    for method, of_method in values.items():
         name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
-        score, missing = comparison["iou"].get(name), int(np.isnan(values[method]).sum())
+        score, missing = comparison["iou"].get(name), int(np.isnan(of_method).sum())
         text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
-        text += f", n = {len(values[method])}" + (f", {missing} undefined" if missing else "")
-        steps(axes, heights, edges, method, text)
-    # the outermost bars can be as high as 1 and would flatten everything in between
-    top = 1.1 * max(max(h[1:-1].max() for h in fractions.values()), 1e-3)
-    axes.set(
-        xlabel=PARAMETERS[parameter].axis_label,
-        ylabel="Fraction of events per bin",
-        xlim=(edges[0], edges[-1]),
-        ylim=(0, top),
-    )
-    _mark_flow(axes, edges, fractions)
-    title = f"{peak}: bars beyond the dotted lines hold all events outside"
-    legend_above(figure, axes, title=title)
+        text += f", n = {len(of_method)}" + (f", {missing} undefined" if missing else "")
+        below, *shares, above, _ = histogram(of_method, axis) / max(len(of_method), 1)
+        if below + above >= OUTSIDE:
+            text += f", {100 * (below + above):.0f} % outside"
+        steps(axes, shares, axis.edges, method, text)
+    axes.set(xlabel=PARAMETERS[parameter].axis_label, ylabel="Fraction of events per bin")
+    legend_above(figure, axes, title=peak)
     return figure
 
 
@@ -228,23 +167,3 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     grid[0].yaxis.set_minor_formatter("")
     legend_above(figure, grid[0], 3)
     return figure
-
-
-def _mark_flow(axes: Axes, edges: Values, fractions: Mapping[str, Values]) -> None:
-    """Separate the outermost bars, and label those that exceed the axis."""
-    top = axes.get_ylim()[1]
-    for bar, edge, side in ((0, edges[1], "left"), (-1, edges[-2], "right")):
-        axes.axvline(edge, color="0.55", linewidth=0.8, linestyle=":")
-        high = [method for method, heights in fractions.items() if heights[bar] > top]
-        for line, method in enumerate(high):
-            axes.annotate(
-                f"{100 * fractions[method][bar]:.0f} %",
-                (edge, top),
-                xytext=(6 if side == "left" else -6, -4 - 12 * line),
-                textcoords="offset points",
-                ha=side,
-                va="top",
-                color=COLOURS[method],
-                fontsize=8.5,
-                gid=GROUP + method,
-            )
