@@ -16,10 +16,7 @@ from cpunet.recipes import load_recipe
 from cpunet.training.figures import sides_figure
 from cpunet.validation import run_figures
 from cpunet.validation.comparisons import compare
-from cpunet.validation.pulse_figures import (
-    nearest,
-    shape_figure,
-)
+from cpunet.validation.run_figures import nearest, shape_figure
 from cpunet.validation.slices import MeanPulse
 from synthetic import LOSS_NAMES, require_drawn
 

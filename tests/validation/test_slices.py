@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import align_half_maximum
 from cpunet.validation.methods import true_responses
-from cpunet.validation.pulse_figures import shape_figure
+from cpunet.validation.run_figures import shape_figure
 from cpunet.validation.slices import (
     AFTER,
     BEFORE,

@@ -17,12 +17,13 @@ from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise
 from cpunet.validation.peaks import PeakSets
-from cpunet.validation.pulse_figures import nearest, shape_figure
 from cpunet.validation.run_figures import (
     further_histograms,
     loss_curves,
+    nearest,
     parameter_histograms,
     roc_figure,
+    shape_figure,
 )
 from cpunet.validation.slices import AFTER, BEFORE, MeanPulse
 
