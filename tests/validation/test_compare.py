@@ -93,7 +93,7 @@ def test_other_data_are_noted(change, words):
     other = copy.deepcopy(scores())
     change(other)
     note = of(a=scores(), b=other, c=scores()).note
-    assert note.startswith("b scored on other pulses than a (")
+    assert note.startswith("b: other pulses than those of a (")
     assert words in note
 
 

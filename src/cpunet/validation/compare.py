@@ -85,7 +85,8 @@ class Row(NamedTuple):
     @property
     def texts(self) -> list[str]:
         """Scores as displayed; the best are marked."""
-        return [f"{c.text}{'*' * (i in self.best)}" for i, c in enumerate(self.cells)]
+        best = self.best
+        return [f"{cell.text}{'*' * (i in best)}" for i, cell in enumerate(self.cells)]
 
     @property
     def over(self) -> str:
@@ -162,10 +163,8 @@ class Comparison:
         apart = {name: [k for k in known if of[k] != known[k]] for name, of in others}
         names = ", ".join(name for name, differences in apart.items() if differences)
         words = ", ".join(_union(apart.values()))
-        text = (
-            f"scored on other pulses than {first} ({words}): scores differ for that reason, too"
-        )
-        return f"{names} {text}" if names else ""
+        text = f"other pulses than those of {first} ({words}), so scores differ for that, too"
+        return f"{names}: {text}" if names else ""
 
     @property
     def of_seeds(self) -> bool:
