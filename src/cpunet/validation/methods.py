@@ -12,11 +12,10 @@ the alignment is not a difference of shape.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +41,6 @@ from cpunet.translation.translator import REN
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
 Flags = npt.NDArray[np.bool_]
 
 
@@ -219,32 +217,26 @@ def fit_baseline_methods(
     kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
     there = tails is not None and tails.law.rate_khz > 0
     found = tails_of(data)[0] if there else None
-    noise = _or_reason(result.missing, "noise", lambda: noise_of(data, found))
-    if noise is not None:
+    try:
+        noise = noise_of(data, found)
         result.noise = TraceNoise(noise, tails) if there else noise
+    except CpunetError as error:
+        result.missing["noise"] = str(error)
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
     )
     with stage("Fitting baseline methods", len(kinds)) as bar:
         for name, kind in kinds.items():
-            fit = partial(kind.fit, fit_sim, fit_data, sim.dt_ns, config.samples_before)
-            method = _or_reason(result.missing, name, fit)
-            if method is not None:
+            try:
+                method = kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
                 result.methods[name] = method
+            except CpunetError as error:
+                result.missing[name] = str(error)
             bar.update(1)
     for name, reason in result.missing.items():
         log.info(f"{name} is left out: {reason}")
     return result
-
-
-def _or_reason(missing: dict[str, str], name: str, make: Callable[[], T]) -> T | None:
-    """The result of `make`, or None, with the reason recorded in `missing`."""
-    try:
-        return make()
-    except CpunetError as error:
-        missing[name] = str(error)
-        return None
 
 
 @dataclass(frozen=True, eq=False)
