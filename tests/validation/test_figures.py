@@ -56,12 +56,12 @@ def test_further_parameters_are_drawn_each():
 
 
 def test_all_eight_losses_are_drawn_with_their_moving_average():
-    figure = run_figures.loss_curves(log(50))
+    figure = run_figures.loss_curves(log(500))
     require_drawn(figure)
-    (axes,) = figure.axes
-    assert len(axes.lines) == 2 * len(LOSS_NAMES) == 16
-    average = axes.lines[0].get_xydata()
-    assert average.shape == (41, 2)
+    assert [len(axes.lines) for axes in figure.axes] == [4] * 4
+    assert sum(len(axes.lines) for axes in figure.axes) == 2 * len(LOSS_NAMES) == 16
+    average = figure.axes[1].lines[0].get_xydata()
+    assert average.shape == (491, 2)
     assert average[0].tolist() == pytest.approx([90, np.mean(1 / np.arange(1, 11))])
 
 
@@ -70,11 +70,10 @@ def test_a_loss_of_every_third_iteration_is_drawn():
     for record in records:
         if record["iteration"] % 30:
             del record["losses"]["discriminator_data"]
-    (axes,) = run_figures.loss_curves(records).axes
-    average, raw = axes.lines[-4:-2]
+    average, raw = run_figures.loss_curves(records).axes[3].lines[:2]
     assert average.get_label() == "discriminator data"
     np.testing.assert_array_equal(raw.get_xdata(), np.arange(0, 600, 30))
-    assert len(average.get_ydata()) == 17  # of four of 20 records each
+    assert np.isfinite(average.get_ydata()).sum() == 20
 
 
 def test_histogram_legend_tells_scores_and_counts():

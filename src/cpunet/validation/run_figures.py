@@ -35,7 +35,7 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.validation.comparisons import Compared, histogram
 from cpunet.validation.slices import AFTER, BEFORE, MeanPulse
 
-AVERAGED = 10  # maximum number of records in a moving average
+AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is told
 LINEAR = 0.1  # percent of full charge, up to which the scale of differences is linear
 COLUMNS = 4  # panels of further parameters in a row
@@ -45,7 +45,7 @@ ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
 
 @styled
 def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
-    """Losses during the training: each record faint, the moving average on top.
+    """Losses during the training, each kind in a panel: records faint, moving averages on top.
 
     Parameters
     ----------
@@ -60,18 +60,22 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     """
     if not records:
         raise CpunetError("the training log is empty: there are no losses to draw; train first")
-    figure, ((axes,),) = panels((7.5, 4.2))
-    for name in dict.fromkeys(name for record in records for name in record["losses"]):
+    names = list(dict.fromkeys(name for record in records for name in record["losses"]))
+    kinds = list(dict.fromkeys(name.partition("_")[0] for name in names))
+    figure, (grid,) = panels((1.4 + 3.2 * len(kinds), 3.6), 1, len(kinds))
+    for name in names:
+        axes = grid[kinds.index(name.partition("_")[0])]
         # discriminators are not updated in every iteration
         there = [record for record in records if name in record["losses"]]
         at = [record["iteration"] for record in there]
         series = [record["losses"][name] for record in there]
-        width = min(AVERAGED, -(-len(series) // 5))
+        width = max(1, len(series) // AVERAGES)
         average = np.convolve(series, np.full(width, 1 / width), mode="valid")
         (line,) = axes.plot(at[width - 1 :], average, label=name.replace("_", " "))
         axes.plot(at, series, color=line.get_color(), alpha=0.25, linewidth=0.7)
-    axes.set(xlabel="Iteration", ylabel="Loss", yscale="log")
-    axes.legend(title=f"Moving averages over {AVERAGED} records or a fifth of them")
+        axes.set(xlabel="Iteration (lines: moving averages)", yscale="log")
+        axes.legend()
+    grid[0].set_ylabel("Loss")
     return figure
 
 
