@@ -112,6 +112,7 @@ def test_what_is_compared(whole) -> None:
 def test_every_figure_can_be_drawn(whole) -> None:
     made = drawings(whole)
     assert {"FEP mean pulse", "SEP superpulses", "SEP single pulse", "losses"} <= set(made)
+    assert {"FEP cycle of simulation", "FEP cycle of data"} <= set(made)
     for drawing in made.values():
         assert drawing().axes
 

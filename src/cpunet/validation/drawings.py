@@ -8,16 +8,21 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
+from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
 from cpunet.pulses.shape_parameters import data_axis
+from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise
 from cpunet.validation.peaks import PeakSets
 from cpunet.validation.run_figures import (
+    cycle_figure,
+    drift_figure,
     further_histograms,
     loss_curves,
     nearest,
@@ -30,6 +35,7 @@ from cpunet.validation.slices import AFTER, BEFORE, MeanPulse
 # methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
+SHOWN, IN_DRIFT = 10, 2048  # pulses in a figure of cycles, as in the paper, and of the U-Net
 
 Drawing = Callable[[], Figure]
 T = TypeVar("T")
@@ -50,8 +56,32 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
             for name, of_peak in found.values.items()
         }
         drawn["A over E survival"] = partial(roc_figure, ae, DEP)
+    fullest = max(found.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values()))
+    drawn |= _of_networks(fullest, found.run.iren)
     if found.run.records:
         drawn["losses"] = partial(loss_curves, found.run.records)
+    return drawn
+
+
+def _of_networks(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
+    """Cycles of both networks, and what a U-Net before a readout does."""
+    ren = peak.translations.ren
+    drawn: dict[str, Drawing] = {}
+    simulated = peak.windows("raw")
+    for there, back, start, names in (
+        (ren, iren, simulated, ("Simulation", "REN", "IREN of REN")),
+        (iren, ren, peak.windows("data"), ("Data", "IREN", "REN of IREN")),
+    ):
+        middle = there.apply(start[:SHOWN], noise=False)
+        stages = start[:SHOWN], middle, back.apply(middle, noise=False)
+        drawn[f"{peak.name} cycle of {names[0].lower()}"] = partial(
+            cycle_figure, dict(zip(names, stages, strict=True)), ren.dt_ns
+        )
+    drift = getattr(getattr(ren.backend.network, "response", None), "drift", None)
+    if isinstance(drift, DriftUNet):
+        effect = drift.effect(torch.from_numpy(simulated[:IN_DRIFT]))
+        of_pulses = (values.numpy() for values in effect)
+        drawn["clock and blur of the U-Net"] = partial(drift_figure, *of_pulses)
     return drawn
 
 
