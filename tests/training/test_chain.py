@@ -123,7 +123,6 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
     assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
     told = fit["tails"]
-    assert np.all(np.diff(told["sizes"]["percent_above"]) <= 0)
     assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
     assert any(note.startswith("pile-up tails: ") for note in caplog.messages)
     ren = REN.load(tmp_path / "run")

@@ -18,7 +18,6 @@ from cpunet.recipes.schema import PreparationConfig
 
 log = logging.getLogger(__name__)
 
-LARGEST_KEV, SIZES = 2600.0, 40  # sizes at which the distribution is stored
 NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
 MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
 
@@ -51,7 +50,7 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         log.info(f"pile-up tails are not measured: {reason}")
     else:
         likely = drawn_like(found, data, config)
-        told = found.describe() | {"sizes": _sizes(found), "drawn": likely.describe()}
+        told = found.describe() | {"drawn": likely.describe()}
     if found is not None and found.law is not None:
         drawn, tenth = likely, told["percent_above"]["10_kev"]["law"]
         alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
@@ -159,11 +158,3 @@ def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
 def _baselines(data: InputSet) -> Baselines:
     assert data.baselines is not None  # these are measured pulses
     return data.baselines
-
-
-def _sizes(tails: PileUpTails) -> dict[str, list[float]]:
-    """Percentages of the traces above sizes in keV, for a figure."""
-    kev = np.geomspace(max(tails.error_kev, 0.01), LARGEST_KEV, SIZES)
-    told = np.sort(tails.kev[np.isfinite(tails.kev)])
-    above = 1 - np.searchsorted(told, kev, side="right") / max(len(told), 1)
-    return {"kev": kev.round(4).tolist(), "percent_above": (100 * above).round(3).tolist()}
