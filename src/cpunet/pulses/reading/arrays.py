@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +58,17 @@ class ArraySource(PulseSource):
     """An array of shape ``(events, samples)``, with columns of values per event."""
 
     def __init__(
-        self, options: PulseFile, format: str, name: str, waveforms: Any, columns: Columns
+        self,
+        options: PulseFile,
+        format: str,
+        name: str,
+        waveforms: Any,
+        columns: Columns,
+        period_hint: str = "",
     ) -> None:
         self._waveforms = waveforms
         layout = Layout.of_array(options.path, format, name, waveforms.shape, columns)
-        super().__init__(options, layout)
+        super().__init__(options, replace(layout, period_hint=period_hint))
 
     def _traces(self, size: int) -> Iterator[Traces]:
         for start in range(0, len(self._waveforms), size):

@@ -171,7 +171,7 @@ class Format(NamedTuple):
 HDF5 = Format("HDF5", (".lh5", ".h5", ".hdf5", ".hdf"), "hdf5", "open_hdf5")
 FLASHCAM = Format("FlashCam", (".fcio",), "flashcam", "FlashCamSource")
 NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "open_arrays")
-PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "PickleSource")
+PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "open_pickles")
 SPECTRUM = Format("spectrum", (".spe",), "siggen", "SpectrumSource")
 TEXT = Format("text", (), "siggen", "TextSource")
 
