@@ -1,4 +1,4 @@
-"""Pulse-shape libraries in files: the ideal ones to be translated, found and checked."""
+"""Pulse-shape libraries in files: ideal ones found and checked, those of currents merged."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, text_attribute
+from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.provenance import recorded_detector
 from cpunet.pulses.reading.energies import TIME_UNITS
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.writing import FileInTheMaking
 from cpunet.settings import read_values
 from cpunet.training.run import Run
 
@@ -265,3 +267,70 @@ def put_array(
     )
     made.attrs.update({"datatype": f"array<{len(shape)}>{{real}}", "units": units})
     return made
+
+
+def describe(group: h5py.Group) -> None:
+    """Add LH5's attribute to a complete library and to every level above it."""
+    while group.name != "/":
+        group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
+        group = group.parent
+
+
+def merge_libraries(
+    sources: Sequence[str | Path], out: str | Path, *, force: bool = False
+) -> list[str]:
+    """Copy current libraries of several detectors into one file, as in production.
+
+    Parameters
+    ----------
+    sources
+        Files that `cpunet library translate` made, each of one detector or more.
+    out
+        File to write.
+    force
+        Whether to replace an existing file.
+
+    Returns
+    -------
+    list of str
+        Names of the detectors.
+
+    Raises
+    ------
+    CpunetError
+        If a file contains no current library, or two libraries belong to one detector.
+    """
+    paths, out = [*map(Path, sources)], Path(out)
+    refuse_existing(out, *paths, force=force)
+    first: dict[str, Path] = {}
+    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        for path in paths:
+            with opened(path) as file:
+                names = _current_libraries(file)
+                if not names:
+                    raise CpunetError(
+                        f"{path}: no current library; make it with `cpunet library translate`"
+                    )
+                for name in names:
+                    if name in first:
+                        raise CpunetError(
+                            f"{path}: a second library of {name}, which {first[name]} has "
+                            "already; give one of each detector"
+                        )
+                    first[name] = path
+                    file.copy(name, made.h5, name)
+                    describe(made.h5[name].parent)
+    return sorted(first)
+
+
+def _current_libraries(file: h5py.File) -> list[str]:
+    """Paths of libraries whose times are relative to the maxima, as those of currents are."""
+    found: list[str] = []
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        held = set(item) if isinstance(item, h5py.Group) else set()
+        if {"r", "z", "dt", "t0"} <= held and any(map(WAVEFORM.fullmatch, held)):
+            found.extend([name] if item["t0"][()].item() < 0 else [])
+
+    file.visititems(visit)
+    return found

@@ -25,15 +25,11 @@ import torch
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.legend.current_library import TOLD, NewLibrary, describe
 from cpunet.legend.currents import (
     LENGTH,
-    MAX_TEMPLATES,
     PEAK,
     RINGS,
     Floats,
-    Loss,
-    components,
     continued,
     currents_about_peak,
     most_frequent,
@@ -44,8 +40,11 @@ from cpunet.legend.library_files import (
     PERIOD_NS,
     IdealLibrary,
     chosen_libraries,
+    describe,
     known_detector,
     n_not_ending,
+    put_array,
+    put_column,
     require_charge,
     require_complete,
 )
@@ -120,8 +119,6 @@ class LibraryNumbers:
         A/E by which currents are divided.
     delay_ns
         Time that is subtracted from drift times.
-    rank, loss
-        Number of components and their errors, see `Loss`; None for whole templates.
     """
 
     templates: int
@@ -130,22 +127,13 @@ class LibraryNumbers:
     healed: int
     mode_per_ns: float
     delay_ns: float
-    rank: int | None = None
-    loss: dict[str, float] | None = None
 
     def __str__(self) -> str:
         healed = f", {self.healed} of them within it" if self.healed else ""
-        text = (
+        return (
             f"{self.translated} of {self.templates} templates translated, {self.padded} added "
             f"about the crystal{healed}; A/E is most often {self.mode_per_ns:.4g}/ns"
         )
-        if loss := self.loss:
-            text += (
-                f"\n{self.rank} components: samples within {loss['largest']:.1e} of the most "
-                f"frequent A/E (RMS {loss['rms']:.1e}), A/E within "
-                f"{loss['a_over_e_percent']:.2g} % (RMS {loss['a_over_e_rms_percent']:.2g} %)"
-            )
-        return text
 
 
 @dataclass(frozen=True)
@@ -174,7 +162,6 @@ def translate_library(
     *,
     detector: Sequence[str] = (),
     rings: int = RINGS,
-    low_rank: int | None = None,
     force: bool = False,
 ) -> TranslatedLibrary:
     """Translate every template of a library without noise, to currents for LEGEND's production.
@@ -203,8 +190,6 @@ def translate_library(
         the run was trained with, or all if it is unknown.
     rings
         Rings of nodes beyond the crystal; 3 as production.
-    low_rank
-        Number of components in place of whole templates, see `cpunet.read_library`.
     force
         Replace an existing file.
 
@@ -225,8 +210,6 @@ def translate_library(
     """
     if not 0 <= rings <= 100:
         raise CpunetError(f"`rings` {rings}: give 0 to 100 rings of padding")
-    if low_rank is not None and not 1 <= low_rank <= 1000:
-        raise CpunetError(f"`low_rank` {low_rank}: give 1 to 1000 components")
     run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
     translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
@@ -239,10 +222,9 @@ def translate_library(
             for one in ideal:
                 looked = _look(translate, one, given[one.path], source)
                 group = made.h5.require_group(one.path)
-                found = looked.write(given[one.path], group, rings, low_rank)
-                told = {k: v for k, v in asdict(found).items() if v is not None}
-                content = {"cpunet": cpunet.__version__, "rings": rings} | made_from | told
-                group.attrs[TOLD] = json.dumps(content)
+                found = looked.write(given[one.path], group, rings)
+                content = {"cpunet": cpunet.__version__, "rings": rings, **made_from}
+                group.attrs["cpunet"] = json.dumps(content | asdict(found))
                 describe(group)
                 numbers[one.path] = found
     return TranslatedLibrary(out, numbers)
@@ -256,27 +238,26 @@ class _Looked:
     library: IdealLibrary
     delay_ns: float
     mode: float
-    kept: Floats
     inside: dict[str, npt.NDArray[np.bool_]]
 
-    def write(
-        self, given: h5py.Group, group: h5py.Group, rings: int, rank: int | None
-    ) -> LibraryNumbers:
+    def write(self, given: h5py.Group, group: h5py.Group, rings: int) -> LibraryNumbers:
         """Write currents, and drift times within the crystal and beside it."""
         library = self.library
         r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
         z_mm = padded_axis(library.z_mm, rings, rings)
-        basis = None if rank is None else components(self.kept, rank)
-        made = NewLibrary.begin(group, r_mm, z_mm, PERIOD_NS, basis)
+        put_column(group, "r", r_mm, "mm")
+        put_column(group, "z", z_mm, "mm")
+        put_column(group, "dt", PERIOD_NS, "ns")
+        put_column(group, "t0", -PEAK * PERIOD_NS, "ns")
         padded = healed = 0
-        loss = Loss()
+        shape = (len(r_mm), len(z_mm))
         for angle, mask in self.inside.items():
-            values, drift_times = made.arrays(angle)
-            times = np.full((len(r_mm), len(z_mm)), np.nan)
+            values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
+            drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
+            times = np.full(shape, np.nan)
             with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
                 for rows, currents, when in self._rows(given[f"waveform_{angle}"], rings, bar):
-                    values[rows] = made.stored(currents, loss)
-                    times[rows] = when
+                    values[rows], times[rows] = currents, when
             times = continued(times, rings)
             drift_times[...] = times
             padded += int(np.isfinite(times).sum() - mask.sum())
@@ -289,8 +270,6 @@ class _Looked:
             healed=healed,
             mode_per_ns=self.mode,
             delay_ns=self.delay_ns,
-            rank=None if basis is None else len(basis),
-            loss=None if basis is None else loss.told(),
         )
 
     def _rows(
@@ -324,9 +303,7 @@ def _look(
     step = np.zeros((1, STEP_LENGTH), np.float32)
     step[:, STEP_SAMPLE:] = 1
     _, delay = currents_about_peak(translate(step))
-    rng = np.random.default_rng(0)
-    share = min(1.0, 2 * MAX_TEMPLATES / max(library.n_templates, 1))
-    amplitudes, kept, inside = [], [], {}
+    amplitudes, inside = [], {}
     moving = not_ending = 0
     with stage(f"A/E of {library.path}", library.n_templates) as bar:
         for angle in library.angles:
@@ -341,17 +318,12 @@ def _look(
                 moving += int(good.sum())
                 not_ending += n_not_ending(templates[good])
                 amplitudes.append(currents[good, PEAK].astype(float))
-                kept.append(currents[good][rng.random(int(good.sum())) < share])
                 bar.update(block.shape[0] * block.shape[1])
             inside[angle] = np.concatenate(masks)
     require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
     require_complete(inside, library, source)
     mode = most_frequent(np.concatenate(amplitudes))
-    some = np.concatenate(kept)
-    if len(some) > MAX_TEMPLATES:
-        some = some[np.sort(rng.choice(len(some), MAX_TEMPLATES, replace=False))]
-    delay_ns = float(delay[0]) - STEP_SAMPLE
-    return _Looked(translate, library, delay_ns, mode, some / np.float32(mode), inside)
+    return _Looked(translate, library, float(delay[0]) - STEP_SAMPLE, mode, inside)
 
 
 def _blocks(given: h5py.Dataset, library: IdealLibrary, source: Path) -> Iterator[Floats]:
