@@ -224,8 +224,8 @@ def test_channels_with_traces_are_listed_and_counted(tmp_path):
     records.append(event(1, {3: trace(2)}, sparse=True))
     path = write(tmp_path / "run.fcio", *records)
     assert tables_of(path) == ["0", "3"]
-    told = info(path).values
-    assert {name: one["n_pulses"] for name, one in told.items()} == {"0": 1, "3": 2}
+    rows = [line.split()[:2] for line in str(info(path)).splitlines()]
+    assert rows[1:3] == [["0", "1"], ["3", "2"]]
     one = write(tmp_path / "one.fcio", config(1), event(0, {0: trace(0)}))
     assert tables_of(one) == ["0"]
     path.write_bytes(path.read_bytes()[:-30])

@@ -234,15 +234,15 @@ def test_the_options_of_a_translation_are_told(busy, tmp_path):
     raw = {"adc": True, "scale": Adc(baseline=0.0)}
     for number, (options, said) in enumerate(
         [
-            ({}, None),
+            ({}, "noise True"),
             ({"noise": False}, "noise False"),
-            ({"seed": 4, "tails": "learned"}, "seed 4, tails learned"),
+            ({"seed": 4, "tails": "learned"}, "seed 4, realisations 1, tails learned"),
             (raw | {"realisations": 2}, "realisations 2, adc baseline 0.0"),
         ]
     ):
         out = tmp_path / f"{number}.lh5"
         translate(busy, source, out, **options)
-        assert provenance(open_pulses(out)).get("options") == said
+        assert said in provenance(open_pulses(out))["options"]
 
 
 # --- noise and bytes
