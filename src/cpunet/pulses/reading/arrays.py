@@ -1,7 +1,8 @@
-"""Read NumPy files: ``.npz`` with columns of values per event, ``.npy`` without."""
+"""Arrays of pulses: in memory, in NumPy's ``.npz`` and ``.npy``, and in siggen's ``.spe``."""
 
 from __future__ import annotations
 
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -21,6 +22,10 @@ from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_tab
 from cpunet.tables import shortened
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
+
+# Radware's spectrum, written by siggen's `stester`: one Fortran record of 24 bytes
+# (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
+_SPE = struct.Struct("<i8siiiiii")
 
 Arrays = dict[str, npt.NDArray[Any]]
 Columns = dict[str, MemoryColumn]
@@ -111,3 +116,19 @@ def open_arrays(options: PulseFile) -> ArraySource:
         if values.ndim <= 1 and values.dtype.kind in "iufb"
     }
     return ArraySource(options, "NumPy", name, arrays[name], columns)
+
+
+def open_spectrum(options: PulseFile) -> ArraySource:
+    """Open a ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
+    path, size = options.path, options.path.stat().st_size
+    with path.open("rb") as file:
+        _, _, length, n_rows, _, _, _, n_bytes = _SPE.unpack(file.read(_SPE.size))
+    if length < 1 or n_rows < 1 or n_bytes != 4 * length * n_rows:
+        raise CpunetError(f"{path}: its header is damaged; write it again")
+    if size < _SPE.size + n_bytes:
+        raise CpunetError(
+            f"{path}: is cut off after {max(size - _SPE.size, 0) // 4} of "
+            f"{length * n_rows} samples; write it again"
+        )
+    values = np.memmap(path, "<f4", "r", _SPE.size, (n_rows, length))
+    return ArraySource(options, "siggen spectrum", "", values, {})
