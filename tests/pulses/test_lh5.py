@@ -18,7 +18,7 @@ from lh5.compression import ULEB128ZigZagDiff
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.row_columns import RowColumns, repeated
+from cpunet.pulses.row_columns import RowColumns
 from cpunet.pulses.writing import PulseWriter
 from synthetic import waveform_table, write_pulses
 
@@ -348,21 +348,17 @@ def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
 
 def test_other_columns_are_read_by_rows(tmp_path):
     path = tmp_path / "pulses.lh5"
-    columns = {"a": (np.arange(6), "mm"), "realisation": (np.arange(6), "")}
+    columns = {"a": (np.arange(6), "mm"), "tails_kev": (np.arange(6), "")}
     write_pulses(path, some(), columns=columns)
-    own = {"waveform", "energy", "event_number", "realisation"}
+    own = {"waveform", "energy", "event_number", "tails_kev"}
     others = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
     assert (others.names, others.left_out) == (
-        {"a": "a", "realisation": "realisation_source"},
+        {"a": "a", "tails_kev": "tails_kev_source"},
         {},
     )
-    found = others.read(2, 3, repeats=2)
-    assert found["a"].nda.tolist() == [2, 2, 3, 3, 4, 4]
+    found = others.read(2, 3)
+    assert found["a"].nda.tolist() == [2, 3, 4]
     assert found["a"].attrs["units"] == "mm"
-    inner = Table({"x": Array(np.arange(2)), "y": VectorOfVectors([[1], [2, 3]])})
-    twice = repeated(inner, 2)
-    assert twice.x.nda.tolist() == [0, 0, 1, 1]
-    assert [list(row) for row in twice.y] == [[1], [1], [2, 3], [2, 3]]
 
 
 def test_no_column_replaces_another(tmp_path):

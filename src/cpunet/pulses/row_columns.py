@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import lh5
 import numpy as np
-from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
+from lgdo import LGDO, Array, ArrayOfEqualSizedArrays
 
 from cpunet.hdf5_files import lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.energies import ENERGY_UNITS, Column
@@ -87,8 +87,8 @@ class RowColumns:
         ]
         return cls(path, names=_renamed(names, own), columns=columns)
 
-    def read(self, start: int, n: int, repeats: int = 1) -> dict[str, LGDO]:
-        """The `n` rows from `start` on, each repeated `repeats` times."""
+    def read(self, start: int, n: int) -> dict[str, LGDO]:
+        """The `n` rows from `start` on."""
         if not self.names:
             return {}
         if self.columns:
@@ -97,23 +97,7 @@ class RowColumns:
             with opened(self.path) as file:
                 group = file[self.table]
                 found = {name: _rows(group[name], start, n) for name in self.names}
-        return {
-            self.names[name]: repeated(column, repeats) if repeats > 1 else column
-            for name, column in found.items()
-        }
-
-
-def repeated(column: LGDO, repeats: int) -> LGDO:
-    """An LH5 object with each row repeated `repeats` times."""
-    attrs = {k: v for k, v in column.attrs.items() if k != "datatype"}
-    if isinstance(column, Table):
-        inner = {name: repeated(values, repeats) for name, values in column.items()}
-        return Table(inner, attrs=attrs)
-    if isinstance(column, VectorOfVectors):
-        values = column.view_as("ak")
-        return VectorOfVectors(values[np.repeat(np.arange(len(values)), repeats)], attrs=attrs)
-    rows = np.repeat(column.nda, repeats, axis=0)
-    return type(column)(nda=rows, attrs=dict(column.attrs))
+        return {self.names[name]: column for name, column in found.items()}
 
 
 def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:

@@ -30,7 +30,6 @@ from cpunet.translation.forms import (
     AdcTraces,
     Windows,
     adc_scale,
-    interleaved,
     wanted_pile_up,
     wanted_tails,
 )
@@ -43,7 +42,7 @@ BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 OWN_COLUMNS = frozenset(
-    {"waveform", "energy", "event_number", "rejection", "realisation", "tails_kev"}
+    {"waveform", "energy", "event_number", "rejection", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
 )
 
@@ -157,13 +156,12 @@ class FileTranslation:
         refuse_existing(out, force=force)
         pulses = self.opened(source)
         others = _other_columns(pulses)
-        counts, times = Counts(), self.options.realisations
+        counts = Counts()
         give_back_large_arrays()
         with self.writer(out, force=force) as writer:
             for block in self._blocks(pulses, noise_key):
-                first, given = counts.read // times, len(block.codes) // times
-                columns = {**block.columns, **others.read(first, given, times)}
-                writer.append(block.pulses, columns)
+                beside = others.read(counts.read, len(block.codes))
+                writer.append(block.pulses, {**block.columns, **beside})
                 counts += Counts.of(block)
             self._require_some(source, counts)
             if source_print(source) != before:
@@ -239,15 +237,9 @@ class FileTranslation:
         """Translate block by block; the noise depends only on the order of the pulses."""
         with stage("Translating", pulses.n_pulses) as bar:
             for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
-                seeds = (
-                    noise_seed(self.options.seed, noise_key, number, realisation)
-                    for realisation in range(self.options.realisations)
-                )
-                generators = map(self.translator.seeded, seeds)
-                noise = self.options.noise
-                yield interleaved(
-                    [self.form(block, noise=noise, generator=one) for one in generators]
-                )
+                seed = noise_seed(self.options.seed, noise_key, number)
+                generator = self.translator.seeded(seed)
+                yield self.form(block, noise=self.options.noise, generator=generator)
 
 
 def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
@@ -294,7 +286,7 @@ def source_print(source: PulseFile) -> str:
     return hashlib.sha256(repr(known).encode(errors="surrogateescape")).hexdigest()
 
 
-def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> int:
+def noise_seed(seed: int, key: str | None, block: int) -> int:
     """Seed of the noise of a block of a file.
 
     Parameters
@@ -306,14 +298,12 @@ def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> 
         `seed` itself, as in `cpunet.translation.translator.Translator.translate`.
     block
         Number of the block in the file.
-    realisation
-        Number of times that its noise was drawn before.
     """
-    if key is None and block == realisation == 0:
+    if key is None and block == 0:
         return int(seed)
     # names of files need not be UTF-8
     digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
-    words = [seed, block, realisation, int.from_bytes(digest[:16])]
+    words = [seed, block, 0, int.from_bytes(digest[:16])]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 

@@ -9,7 +9,6 @@ baseline before them and with the decay fitted to their end after them, both wit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -198,19 +197,6 @@ class AdcTraces(Windows):
                 levels += other.added(shapes, energies, dt_ns, self.length)
             traces[rows] = levels
         return traces, codes
-
-
-def interleaved(realisations: Sequence[TranslatedPulses]) -> TranslatedPulses:
-    """Realisations of the same pulses as numbered rows: all of a pulse, then of the next."""
-    if len(realisations) == 1:
-        return realisations[0]
-    number, given = len(realisations), len(realisations[0].codes)
-    rows = np.arange(number * given).reshape(number, given).T.ravel()
-    whole = TranslatedPulses.joined(realisations)
-    truth = {name: (values[rows], units) for name, (values, units) in whole.truth.items()}
-    truth["realisation"] = (np.tile(np.arange(number), given), "")
-    saturated = None if whole.saturated is None else whole.saturated[rows]
-    return TranslatedPulses(whole.pulses[rows], whole.codes[rows], saturated, truth)
 
 
 def to_adc(

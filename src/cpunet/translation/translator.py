@@ -52,7 +52,7 @@ class TranslatedPulses:
     truth
         What is known of each pulse, arrays of shape (n,) with their units: ``tails_kev``
         with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
-        pulses, see `InTracePileUp.largest`; ``realisation`` with several.
+        pulses, see `InTracePileUp.largest`.
     """
 
     pulses: Pulses
