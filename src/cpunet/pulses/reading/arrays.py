@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.energies import MemoryColumn
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 from cpunet.tables import shortened
@@ -28,7 +28,7 @@ _WAVEFORMS = ("waveform", "waveforms", "values")
 _SPE = struct.Struct("<i8siiiiii")
 
 Arrays = dict[str, npt.NDArray[Any]]
-Columns = dict[str, MemoryColumn]
+Columns = dict[str, Column]
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -83,9 +83,9 @@ class ArraySource(PulseSource):
 def open_memory(options: PulseFile, pulses: Pulses) -> ArraySource:
     """Pulses in memory as a source."""
     columns = {
-        "energy_kev": MemoryColumn(pulses.energy_kev),
-        "event_number": MemoryColumn(pulses.event_number),
-        "dt_ns": MemoryColumn(np.array(pulses.dt_ns)),
+        "energy_kev": Column.of(pulses.energy_kev),
+        "event_number": Column.of(pulses.event_number),
+        "dt_ns": Column.of(np.array(pulses.dt_ns)),
     }
     return ArraySource(options, "memory", "", pulses.waveforms, columns)
 
@@ -111,7 +111,7 @@ def open_arrays(options: PulseFile) -> ArraySource:
             f"{options.path}: array {name or 'in it'} is of {kind}; save plain numbers"
         )
     columns = {
-        name: MemoryColumn(values)
+        name: Column.of(values)
         for name, values in arrays.items()
         if values.ndim <= 1 and values.dtype.kind in "iufb"
     }

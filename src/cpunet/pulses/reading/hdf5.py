@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import Hdf5Column, columns_of, lh5_rows, opened, text_attribute
+from cpunet.hdf5_files import is_column, lh5_rows, opened, text_attribute
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.published import MajoranaSource, is_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
@@ -117,7 +118,7 @@ def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
 
 
 def _rows_of_contact(
-    path: Path, columns: dict[str, Hdf5Column], contact: str
+    path: Path, columns: dict[str, Column], contact: str
 ) -> tuple[int, int] | None:
     """First row and number of rows of a contact, where a table holds several one by one."""
     column = columns.get(_CONTACT)
@@ -312,3 +313,39 @@ def _tables(group: h5py.Group) -> list[str]:
 
     group.visititems(note)
     return tables or list(group)
+
+
+def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
+    """Columns of a group: its numeric datasets of one dimension, and its scalars."""
+    members = {name: group.get(name) for name in group}
+    return {name: _stored(path, m) for name, m in members.items() if is_column(m)}
+
+
+def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
+    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such file or column; the message lists the other columns of the group.
+    """
+    with opened(path) as file:
+        found = file.get(name)
+        if is_column(found):
+            return _stored(path, found), columns_of(path, found.parent)
+        parent = file.get(name.strip("/").rpartition("/")[0] or "/")
+        known = list(columns_of(path, parent)) if isinstance(parent, h5py.Group) else list(file)
+    raise CpunetError(f"{path}: no column {name}; there are {shortened(known)}")
+
+
+def _stored(path: Path, dataset: h5py.Dataset) -> Column:
+    """A dataset as a column; the file is open only while reading."""
+    name, is_constant = dataset.name, dataset.ndim == 0
+
+    def read(start: int, stop: int) -> npt.NDArray[Any]:
+        with opened(path) as file:
+            if is_constant:
+                return np.full(stop - start, file[name][()])
+            return np.asarray(file[name][start:stop])
+
+    return Column(read, dataset.size, text_attribute(dataset, "units"), is_constant)

@@ -31,7 +31,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened
 from cpunet.pulses.reading.arrays import ArraySource
-from cpunet.pulses.reading.energies import MemoryColumn
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 
@@ -63,7 +63,7 @@ class MajoranaSource(PulseSource):
             dataset = file[WAVEFORMS]
             self._rows = _rows(options, file, dataset.shape[0])
             columns = {
-                name: MemoryColumn(values[self._rows], units)
+                name: Column.of(values[self._rows], units)
                 for name, values, units in _columns(file)
             }
             layout = Layout(
@@ -169,10 +169,10 @@ def open_pickles(options: PulseFile) -> ArraySource:
                 f"{path}: entry {place}: {trace.size} samples, before it {length}; {_OTHERS}"
             )
         traces.append(trace)
-    columns = {"event_number": MemoryColumn(np.array(events, np.int64))}
+    columns = {"event_number": Column.of(np.array(events, np.int64))}
     for name in sorted(set().union(*numbers)):
         values = np.array([row.get(name, np.nan) for row in numbers])
-        columns[name] = MemoryColumn(values, "keV" if name == "energy" else "")
+        columns[name] = Column.of(values, "keV" if name == "energy" else "")
     hint = "CPU-Net's pulses are sampled every 16 ns"
     waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
     return ArraySource(options, "pickled pulses", "", waveforms, columns, hint)
