@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, text_attribute
-from cpunet.outputs import refuse_existing, written_aside
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.provenance import recorded_detector
 from cpunet.pulses.reading.energies import TIME_UNITS
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.writing import FileInTheMaking
+from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import read_values
 from cpunet.training.run import Run
 
@@ -303,7 +303,7 @@ def merge_libraries(
     paths, out = [*map(Path, sources)], Path(out)
     refuse_existing(out, *paths, force=force)
     first: dict[str, Path] = {}
-    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+    with written_hdf5(out) as (made, _):
         for path in paths:
             with opened(path) as file:
                 names = _current_libraries(file)
@@ -318,8 +318,8 @@ def merge_libraries(
                             "already; give one of each detector"
                         )
                     first[name] = path
-                    file.copy(name, made.h5, name)
-                    describe(made.h5[name].parent)
+                    file.copy(name, made, name)
+                    describe(made[name].parent)
     return sorted(first)
 
 

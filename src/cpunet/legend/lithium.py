@@ -22,8 +22,8 @@ import scipy.linalg
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.legend.library_files import put_column
-from cpunet.outputs import refuse_existing, written_aside
-from cpunet.pulses.writing import FileInTheMaking
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.writing import written_hdf5
 
 Values = npt.NDArray[np.float64]
 
@@ -194,8 +194,8 @@ def lithium_table(layer: LithiumLayer, out: str | Path, *, force: bool = False) 
         "arrived": (share.T.copy(), ""),
         "activeness": (share[:, -1].copy(), ""),
     }
-    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
-        group = made.h5.create_group("lithium")
+    with written_hdf5(out) as (made, _):
+        group = made.create_group("lithium")
         for key, (values, units) in arrays.items():
             put_column(group, key, values, units)
         group.attrs["datatype"] = f"struct{{{','.join(arrays)}}}"

@@ -49,10 +49,10 @@ from cpunet.legend.library_files import (
     require_complete,
 )
 from cpunet.networks.response_layer import PADDING_BEFORE
-from cpunet.outputs import refuse_existing, written_aside
+from cpunet.outputs import refuse_existing
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.writing import FileInTheMaking
+from cpunet.pulses.writing import written_hdf5
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.translator import BATCH, REN
 
@@ -218,10 +218,10 @@ def translate_library(
         names = chosen_libraries(given, source, detector, known_detector(run))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
         made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
-        with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        with written_hdf5(out) as (made, _):
             for one in ideal:
                 looked = _look(translate, one, given[one.path], source)
-                group = made.h5.require_group(one.path)
+                group = made.require_group(one.path)
                 found = looked.write(given[one.path], group, rings)
                 content = {"cpunet": cpunet.__version__, "rings": rings, **made_from}
                 group.attrs["cpunet"] = json.dumps(content | asdict(found))

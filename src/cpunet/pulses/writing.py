@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -96,14 +94,12 @@ class PulseWriter:
         self._attrs = dict(attrs or {})
         self._shape: tuple[int, float, tuple[str, ...]] | None = None
         self._stack = ExitStack()
-        self._file: FileInTheMaking  # within the writer's with block
+        self._file: h5py.File  # within the writer's with block
+        self._held: HeldFile
         refuse_existing(self.path, force=force)
 
     def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            aside = stack.enter_context(written_aside(self.path))
-            self._file = stack.enter_context(FileInTheMaking(aside, self.path))
-            self._stack = stack.pop_all()
+        self._file, self._held = self._stack.enter_context(written_hdf5(self.path))
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -141,9 +137,7 @@ class PulseWriter:
                     f"{len(pulses)} pulses; give one value per pulse"
                 )
             content[name] = _column(column)
-        block = Table(col_dict=content, attrs=dict(self._attrs))
-        group, _, name = self._table.rpartition("/")
-        self._file.write(block, name, group or "/")
+        self._write(Table(col_dict=content, attrs=dict(self._attrs)), self._table)
         self.n_pulses += len(pulses)
 
     def append_rows(self, table: str, columns: Columns) -> None:
@@ -156,14 +150,18 @@ class PulseWriter:
         columns
             Name → (array of shape ``(rows,)``, units); the same names each time.
         """
-        group, _, name = table.strip("/").rpartition("/")
         content = {key: _column(column) for key, column in columns.items()}
         if len(next(iter(content.values()))) > 0:
-            self._file.write(Table(content), name, group or "/")
+            self._write(Table(content), table.strip("/"))
+
+    def _write(self, rows: Table, table: str) -> None:
+        group, _, name = table.rpartition("/")
+        lh5.write(rows, name, self._file, group=group or "/", wo_mode="append")
+        self._held.require_written()
 
     def annotate(self, name: str, text: str, *, file: bool = False) -> None:
         """Set an attribute of the table of pulses after the first block, or of the `file`."""
-        item = self._file.h5 if file else self._file.h5[self._table]
+        item = self._file if file else self._file[self._table]
         item.attrs[name] = text
 
     def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
@@ -192,18 +190,6 @@ def _column(column: tuple[npt.ArrayLike, str] | LGDO) -> LGDO:
 def _in_words(shape: tuple[int, float, tuple[str, ...]]) -> str:
     length, dt_ns, names = shape
     return f"{length} samples of {dt_ns:g} ns with columns {', '.join(names) or '(none)'}"
-
-
-@contextmanager
-def write_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the HDF5 library, such as a full disk, into a `CpunetError`."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        raise CpunetError(
-            f"{path}: cannot be written ({os_reason(error)}); make room there, or choose "
-            "another place"
-        ) from error
 
 
 class HeldFile(io.FileIO):
@@ -235,53 +221,21 @@ class HeldFile(io.FileIO):
             self.failure = error
         return 0 if size is None else size
 
-
-class FileInTheMaking:
-    """An HDF5 file being written, whose errors are raised as `CpunetError`.
-
-    Parameters
-    ----------
-    aside
-        Temporary path that is written.
-    target
-        Final path, for error messages.
-    """
-
-    def __init__(self, aside: Path, target: Path) -> None:
-        self._target = target
-        with write_errors(target):
-            self._held = HeldFile(aside, "w+")
-            self.h5 = h5py.File(self._held, "w")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with write_errors(self._target):
-            try:
-                self.h5.close()
-            finally:
-                self._held.close()
-            self._raise_failure()
-
-    def write(self, item: LGDO, name: str, group: str) -> None:
-        """Append rows to the object `name` in `group`."""
-        with write_errors(self._target):
-            lh5.write(item, name, self.h5, group=group, wo_mode="append")
-            self._raise_failure()
-
-    def _raise_failure(self) -> None:
-        if self._held.failure is not None:
-            raise self._held.failure
+    def require_written(self) -> None:
+        """Raise the failure, if there was one."""
+        if self.failure is not None:
+            raise self.failure
 
 
-def os_reason(error: Exception) -> str:
-    """The operating system's reason, which HDF5 hides in a message of many lines."""
-    number = error.errno if isinstance(error, OSError) else None
-    hidden = re.search(r"errno = (\d+)", str(error))
-    if number is None and hidden is not None:
-        number = int(hidden.group(1))
-    return os.strerror(number) if number else " ".join(str(error).split())
+@contextmanager
+def written_hdf5(target: Path) -> Iterator[tuple[h5py.File, HeldFile]]:
+    """Yield an HDF5 file that is written aside, and its stream; see `written_aside`."""
+    with written_aside(target) as aside, HeldFile(aside, "w+") as held:
+        try:
+            with h5py.File(held, "w") as file:
+                yield file, held
+        finally:
+            held.require_written()
 
 
 def waveform_table(
