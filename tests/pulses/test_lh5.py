@@ -18,7 +18,7 @@ from lh5.compression import ULEB128ZigZagDiff
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.row_columns import RowColumns
+from cpunet.pulses.row_columns import other_columns
 from cpunet.pulses.writing import PulseWriter
 from synthetic import waveform_table, write_pulses
 
@@ -351,25 +351,24 @@ def test_other_columns_are_read_by_rows(tmp_path):
     columns = {"a": (np.arange(6), "mm"), "tails_kev": (np.arange(6), "")}
     write_pulses(path, some(), columns=columns)
     own = {"waveform", "energy", "event_number", "tails_kev"}
-    others = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
-    assert (others.names, others.left_out) == (
-        {"a": "a", "tails_kev": "tails_kev_source"},
-        {},
-    )
-    found = others.read(2, 3)
-    assert found["a"].nda.tolist() == [2, 3, 4]
-    assert found["a"].attrs["units"] == "mm"
+    readers, left_out = other_columns(open_pulses(path), own)
+    assert ([*readers], left_out) == (["a", "tails_kev_source"], {})
+    found = readers["a"](2, 3)
+    assert found.nda.tolist() == [2, 3, 4]
+    assert found.attrs["units"] == "mm"
 
 
 def test_no_column_replaces_another(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    names = ("rejection", "rejection_source", "scale")
-    write_pulses(path, some(), columns={name: (np.full(6, len(name)), "") for name in names})
+    columns = {
+        name: np.full(6, len(name)) for name in ("rejection", "rejection_source", "scale")
+    }
+    with_units = {name: (values, "") for name, values in columns.items()}
+    write_pulses(tmp_path / "pulses.lh5", some(), columns=with_units)
+    np.savez(tmp_path / "pulses.npz", waveform=some().waveforms, **columns)
     own = {"waveform", "energy", "event_number", "rejection"}
-    in_file = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
-    beside = RowColumns.of_columns(path, open_pulses(path).columns, own)
-    for others in (in_file, beside):
-        values = {name: column.nda[0] for name, column in others.read(0, 6).items()}
+    for name in ("pulses.lh5", "pulses.npz"):
+        readers, _ = other_columns(open_pulses(tmp_path / name, dt_ns=16), own)
+        values = {name: read(0, 6).nda[0] for name, read in readers.items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
 
 

@@ -23,7 +23,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
-from cpunet.pulses.row_columns import RowColumns
+from cpunet.pulses.row_columns import other_columns
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import (
@@ -155,12 +155,15 @@ class FileTranslation:
             return replace(finished(out, provenance), skipped=1)
         refuse_existing(out, force=force)
         pulses = self.opened(source)
-        others = _other_columns(pulses)
+        others, left_out = other_columns(pulses, OWN_COLUMNS)
+        for column, reason in left_out.items():
+            log.warning(f"{source.path.name}: column {column} is left out: {reason}")
         counts = Counts()
         give_back_large_arrays()
         with self.writer(out, force=force) as writer:
             for block in self._blocks(pulses, noise_key):
-                beside = others.read(counts.read, len(block.codes))
+                rows = counts.read, len(block.codes)
+                beside = {name: read(*rows) for name, read in others.items()}
                 writer.append(block.pulses, {**block.columns, **beside})
                 counts += Counts.of(block)
             self._require_some(source, counts)
@@ -247,18 +250,6 @@ def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
     for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
         yield block
         bar.update(len(block))
-
-
-def _other_columns(pulses: PulseSource) -> RowColumns:
-    """Find the columns to be copied to the output, and report those left out."""
-    if pulses.layout.format in ("LH5", "HDF5"):
-        n_pulses, table = pulses.n_pulses or 0, pulses.layout.table
-        others = RowColumns.of_hdf5(pulses.path, table, n_pulses, OWN_COLUMNS)
-    else:
-        others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
-    for column, reason in others.left_out.items():
-        log.warning(f"{pulses.path.name}: column {column} is left out: {reason}")
-    return others
 
 
 def source_print(source: PulseFile) -> str:
