@@ -41,11 +41,10 @@ def write_majorana(path: Path, n: int = 2 * N, *, labels: bool = True, length: i
     return traces
 
 
-def test_one_detector_of_the_majorana_release(tmp_path, monkeypatch):
+def test_one_detector_of_the_majorana_release(tmp_path):
     file = tmp_path / "MJD_Train_0.hdf5"
     traces = write_majorana(file, 50, length=40)
     assert tables_of(file) == ["5", "9"]
-    monkeypatch.setattr("cpunet.pulses.reading.published._SLAB_BYTES", 7 * 40 * 8)
     source = open_pulses(file, table="9", dt_ns=10)
     rows = np.arange(1, 50, 3)
     assert (source.n_pulses, source.length, source.dt_ns) == (len(rows), 40, 10)

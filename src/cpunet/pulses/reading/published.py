@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,6 @@ from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_tab
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
 _RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
-_SLAB_BYTES = 1 << 25  # of traces read at a time
 
 
 def is_majorana(file: h5py.File) -> bool:
@@ -77,22 +75,9 @@ class MajoranaSource(PulseSource):
         super().__init__(options, layout)
 
     def _traces(self, size: int) -> Iterator[Traces]:
-        rows = self._single()
-        while some := list(islice(rows, size)):
-            yield Traces(np.stack(some))
-
-    def _single(self) -> Iterator[npt.NDArray[np.float32]]:
-        # whole slabs: row by row, the chunks of a compressed file would be unpacked repeatedly
         with opened(self.path) as file:
-            dataset = file[WAVEFORMS]
-            slab = max(1, _SLAB_BYTES // (dataset.dtype.itemsize * self.length))
-            for start in range(0, dataset.shape[0], slab):
-                chosen = self._rows[np.searchsorted(self._rows, start) :]
-                chosen = chosen[chosen < start + slab] - start
-                if len(chosen):
-                    with np.errstate(over="ignore"):  # overflows become infinite
-                        found = dataset[start : start + slab][chosen].astype(np.float32)
-                    yield from found
+            for start in range(0, len(self._rows), size):
+                yield Traces(file[WAVEFORMS][self._rows[start : start + size]])
 
 
 def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
