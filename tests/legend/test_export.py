@@ -19,7 +19,7 @@ from cpunet.legend.export import (
     export_legend,
     kernel_step,
 )
-from cpunet.legend.lithium import LithiumLayer, arrived, delayed, lithium_table
+from cpunet.legend.lithium import LithiumLayer, arrived, lithium_table
 from cpunet.networks.generators import ResponseGenerator
 from synthetic import write_chain
 
@@ -191,19 +191,6 @@ def test_reboosts_model() -> None:
         # in cells of 10 µm and steps of 1 ns
         theirs = surface.get_surface_response(1000, init=1000 * mm)
         np.testing.assert_allclose(share[1:], theirs[: len(share) - 1], atol=0.01)
-
-
-def test_a_delayed_pulse_ends_at_what_arrives() -> None:
-    layer = LithiumLayer(1.0)
-    time = np.arange(8000.0)
-    pulse = np.clip((time - 300) / 400, 0, 1)[np.newaxis].astype(np.float32)
-    share = arrived(layer, [0.8], time)
-    late = delayed(pulse, share)
-    assert late[0, -1] == pytest.approx(share[0, -1], abs=2e-3)
-    half = np.argmax(late[0] > 0.5 * late[0, -1])
-    assert half > np.argmax(pulse[0] > 0.5) + 100
-    at_once = delayed(pulse, np.ones_like(share))
-    np.testing.assert_allclose(at_once, pulse, atol=1e-5)
 
 
 @pytest.mark.parametrize(

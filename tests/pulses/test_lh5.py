@@ -314,19 +314,6 @@ def test_no_pulses_leave_no_file(tmp_path, blocks):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_columns_must_fit(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    with pytest.raises(CpunetError, match="column a has shape"):
-        write_pulses(path, [some(3), some(3, start=3)], columns={"a": (np.arange(5), "")})
-    with pytest.raises(CpunetError, match="column energy is the pulses' own"):
-        write_pulses(path, some(), columns={"energy": (np.arange(6), "keV")})
-    with PulseWriter(path) as writer:
-        writer.append(some(), {"a": (np.arange(6), "")})
-        with pytest.raises(CpunetError, match="separate files"):
-            writer.append(some())
-    assert open_pulses(path).n_pulses == 6
-
-
 def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
     path = tmp_path / "pulses.lh5"
     pulses = Pulses.of(np.arange(12).reshape(4, 3) * 5000, dt_ns=16)
@@ -335,8 +322,6 @@ def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
         for rows in (slice(0, 1), slice(1, 4)):
             column = VectorOfVectors(hits[rows], dtype=np.float64)
             writer.append(pulses[rows], {"edep": column})
-        with pytest.raises(CpunetError, match="write them to separate files"):
-            writer.append(pulses)
         writer.annotate("made", "by hand", file=True)
     table = lh5.read("geds/sim", path)
     assert table.waveform.values.nda.dtype == np.uint16

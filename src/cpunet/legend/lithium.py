@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 import scipy.linalg
 
 import cpunet
@@ -115,28 +114,6 @@ def arrived(layer: LithiumLayer, depth_mm: npt.ArrayLike, time_ns: npt.ArrayLike
     final = np.interp(depth, nodes, ends)
     there = final[:, None] - here @ np.exp(values[:, None] * time.reshape(-1))
     return np.asarray(np.clip(there, 0, 1), np.float64)
-
-
-def delayed(charge: npt.NDArray[np.floating], share: Values) -> npt.NDArray[np.float32]:
-    """Pulses of charge that reaches the boundary gradually.
-
-    Parameters
-    ----------
-    charge
-        Pulses of charge released at the boundary, shape (n, samples).
-    share
-        Fraction that has arrived at each sample, shape (n, samples) or (samples,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Float32 (n, samples), in units of the charge released in the layer.
-    """
-    n_samples = charge.shape[1]
-    coming = np.diff(np.broadcast_to(share, charge.shape), axis=1, prepend=0)
-    length = scipy.fft.next_fast_len(2 * n_samples, real=True)
-    spectra = scipy.fft.rfft(charge.astype(float), length) * scipy.fft.rfft(coming, length)
-    return np.asarray(scipy.fft.irfft(spectra, length)[:, :n_samples], np.float32)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.ndimage import binary_fill_holes
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -262,7 +263,7 @@ class _Looked:
             drift_times[...] = times
             padded += int(np.isfinite(times).sum() - mask.sum())
             inner = np.isfinite(times[: len(mask), rings:][:, : mask.shape[1]])
-            healed += int((inner & ~mask & enclosed(mask)).sum())
+            healed += int((inner & ~mask & binary_fill_holes(mask)).sum())
         return LibraryNumbers(
             templates=library.n_templates,
             translated=sum(int(mask.sum()) for mask in self.inside.values()),
@@ -348,12 +349,3 @@ def _charge(values: npt.NDArray[Any]) -> Floats:
     charge = np.array(values, np.float32)
     charge[~charge.any(axis=2)] = np.nan
     return charge
-
-
-def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Mask of grid points between others on all four sides, at any distance."""
-    held = np.ones_like(mask)
-    for axis in (0, 1):
-        back = np.flip(np.logical_or.accumulate(np.flip(mask, axis), axis), axis)
-        held &= np.logical_or.accumulate(mask, axis) & back
-    return held

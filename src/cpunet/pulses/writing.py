@@ -33,6 +33,8 @@ _GZIP_LEVEL = 1
 class PulseWriter:
     """Writer of an LH5 file: append blocks of pulses, then leave the ``with`` block.
 
+    All blocks have the same length, sampling and columns.
+
     The table contains ``waveform`` (t0, dt, values; times in ns), ``energy`` (keV),
     ``event_number`` and the columns of the blocks, with the LH5 library's compression.
     The file appears only when it is complete.
@@ -57,8 +59,7 @@ class PulseWriter:
     Raises
     ------
     CpunetError
-        If the file exists (without `force`) or cannot be written, if blocks differ
-        in length, sampling or columns, or if no block was written.
+        If the file exists (without `force`) or cannot be written, or if no block was written.
 
     Examples
     --------
@@ -92,7 +93,6 @@ class PulseWriter:
         self._waveform_units = waveform_units
         self._t0_ns = t0_ns
         self._attrs = dict(attrs or {})
-        self._shape: tuple[int, float, tuple[str, ...]] | None = None
         self._stack = ExitStack()
         self._file: h5py.File  # within the writer's with block
         self._held: HeldFile
@@ -119,8 +119,6 @@ class PulseWriter:
             Further values per event: name → (array of shape ``(n,)``, units), or an LH5 object
             of n rows.
         """
-        extra = dict(columns or {})
-        self._require_same(pulses, extra)
         if len(pulses) == 0:
             return
         content: dict[str, LGDO] = {
@@ -130,13 +128,7 @@ class PulseWriter:
             "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
             "event_number": Array(pulses.event_number),
         }
-        for name, column in extra.items():
-            if isinstance(column, tuple) and np.shape(column[0]) != (len(pulses),):
-                raise CpunetError(
-                    f"{self.path}: column {name} has shape {np.shape(column[0])} beside "
-                    f"{len(pulses)} pulses; give one value per pulse"
-                )
-            content[name] = _column(column)
+        content |= {name: _column(column) for name, column in (columns or {}).items()}
         self._write(Table(col_dict=content, attrs=dict(self._attrs)), self._table)
         self.n_pulses += len(pulses)
 
@@ -164,32 +156,12 @@ class PulseWriter:
         item = self._file if file else self._file[self._table]
         item.attrs[name] = text
 
-    def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
-        taken = {"waveform", "energy", "event_number"} & set(extra)
-        if taken:
-            raise CpunetError(
-                f"{self.path}: column {taken.pop()} is the pulses' own; choose another name"
-            )
-        shape = (pulses.length, pulses.dt_ns, tuple(sorted(extra)))
-        if self._shape is None:
-            self._shape = shape
-        if shape != self._shape:
-            raise CpunetError(
-                f"{self.path}: a block of {_in_words(shape)} after one of "
-                f"{_in_words(self._shape)}; write them to separate files"
-            )
-
 
 def _column(column: tuple[npt.ArrayLike, str] | LGDO) -> LGDO:
     if not isinstance(column, tuple):
         return column
     values, units = column
     return Array(np.asarray(values), attrs={"units": units} if units else {})
-
-
-def _in_words(shape: tuple[int, float, tuple[str, ...]]) -> str:
-    length, dt_ns, names = shape
-    return f"{length} samples of {dt_ns:g} ns with columns {', '.join(names) or '(none)'}"
 
 
 class HeldFile(io.FileIO):
