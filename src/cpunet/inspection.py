@@ -273,14 +273,20 @@ def _pulses(file: PulseFile, recipe: Recipe) -> list[tuple[str, str]]:
 
 def _is_measured(source: PulseSource) -> bool:
     """Whether they are raw traces, by what the file records or by the shape of the pulses."""
-    from cpunet.pulses.provenance import apparent_side, recorded_side
+    from cpunet.pulses.provenance import (
+        TRANSLATED_BY,
+        apparent_side,
+        recorded_attributes,
+        recorded_side,
+    )
 
     found = recorded_side(source)
     if found is None:
         first = next(iter(source.blocks(_FIRST_PULSES)), None)
         found = None if first is None else apparent_side(first.waveforms)
     # translated windows look measured, but are not raw traces
-    return found is not None and found.side == "measured" and "translated" not in found.why
+    translated = TRANSLATED_BY in recorded_attributes(source)
+    return found is not None and found.side == "measured" and not translated
 
 
 def _traces(source: PulseSource, recipe: Recipe) -> list[tuple[str, str]]:

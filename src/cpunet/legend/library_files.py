@@ -27,8 +27,6 @@ PERIOD_NS = 1.0
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
-# Templates of charge end near their maximum; templates of current do not.
-_MIN_END = 0.5
 
 Values = npt.NDArray[np.float64]
 
@@ -141,20 +139,12 @@ def chosen_libraries(
         If there is no library, a named one is missing, or none belongs to the detector of the
         run.
     """
-    found: set[str] = set()
-
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        group, _, last = name.rpartition("/")
-        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
-            found.add(group)
-
-    file.visititems(visit)
-    if not found:
+    there = _libraries(file)
+    if not there:
         raise CpunetError(
             f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
             "struct{r, z, dt, t0, waveform_000_deg}"
         )
-    there = sorted(found)
     held = ", ".join(path or "/" for path in there)
     for name in wanted:
         if name not in there:
@@ -170,6 +160,24 @@ def chosen_libraries(
             "all the same"
         )
     return [known]
+
+
+def _libraries(file: h5py.File) -> list[str]:
+    """Paths of the groups that hold templates."""
+    found: set[str] = set()
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        group, _, last = name.rpartition("/")
+        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
+            found.add(group)
+
+    file.visititems(visit)
+    return sorted(found)
+
+
+def _is_current(library: h5py.Group) -> bool:
+    """Whether times are relative to the maxima, as those of currents are."""
+    return {"r", "z", "dt", "t0"} <= library.keys() and library["t0"][()].item() < 0
 
 
 def known_detector(run: Run) -> str | None:
@@ -213,34 +221,6 @@ def require_complete(
                     f"others, the first at {name} {axis[missing[0]]:g} mm; simulate these "
                     "places again"
                 )
-
-
-def n_not_ending(templates: npt.NDArray[np.floating]) -> int:
-    """Number of templates that end below half of their height, as those of current do."""
-    return int((templates[:, -1] < _MIN_END * np.abs(templates).max(axis=1)).sum())
-
-
-def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
-    """Raise an error if none of `n` templates has a signal, or most are no charge pulses.
-
-    Parameters
-    ----------
-    where
-        File, and library in it, for the message.
-    n, moving, not_ending
-        Numbers of templates, of those with a translated signal, and among these of those
-        that end low (`n_not_ending`).
-    """
-    if not moving:
-        raise CpunetError(
-            f"{where}: none of {n} templates can be translated; are they charge pulses?"
-        )
-    if 2 * not_ending > moving:
-        raise CpunetError(
-            f"{where}: {not_ending} of {moving} templates end below half of their maximum: "
-            "these are currents, of negative sign, or behind electronics already; give the "
-            "library of charge pulses"
-        )
 
 
 def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
@@ -306,7 +286,7 @@ def merge_libraries(
     with written_hdf5(out) as (made, _):
         for path in paths:
             with opened(path) as file:
-                names = _current_libraries(file)
+                names = [name for name in _libraries(file) if name and _is_current(file[name])]
                 if not names:
                     raise CpunetError(
                         f"{path}: no current library; make it with `cpunet library translate`"
@@ -321,16 +301,3 @@ def merge_libraries(
                     file.copy(name, made, name)
                     describe(made[name].parent)
     return sorted(first)
-
-
-def _current_libraries(file: h5py.File) -> list[str]:
-    """Paths of libraries whose times are relative to the maxima, as those of currents are."""
-    found: list[str] = []
-
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        held = set(item) if isinstance(item, h5py.Group) else set()
-        if {"r", "z", "dt", "t0"} <= held and any(map(WAVEFORM.fullmatch, held)):
-            found.extend([name] if item["t0"][()].item() < 0 else [])
-
-    file.visititems(visit)
-    return found

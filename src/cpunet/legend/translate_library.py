@@ -43,10 +43,8 @@ from cpunet.legend.library_files import (
     chosen_libraries,
     describe,
     known_detector,
-    n_not_ending,
     put_array,
     put_column,
-    require_charge,
     require_complete,
 )
 from cpunet.networks.response_layer import PADDING_BEFORE
@@ -103,6 +101,7 @@ class TemplateTranslator:
 
 
 ROWS = 16  # rows of r translated at a time
+MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
@@ -317,11 +316,22 @@ def _look(
                 there[there] = good
                 masks.append(there)
                 moving += int(good.sum())
-                not_ending += n_not_ending(templates[good])
+                ends, heights = templates[good, -1], np.abs(templates[good]).max(axis=1)
+                not_ending += int((ends < MIN_END * heights).sum())
                 amplitudes.append(currents[good, PEAK].astype(float))
                 bar.update(block.shape[0] * block.shape[1])
             inside[angle] = np.concatenate(masks)
-    require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
+    if not moving:
+        raise CpunetError(
+            f"{source}: {library.path}: none of {library.n_templates} templates can be "
+            "translated; are they charge pulses?"
+        )
+    if 2 * not_ending > moving:
+        raise CpunetError(
+            f"{source}: {library.path}: {not_ending} of {moving} templates end below half of "
+            "their maximum: these are currents, of negative sign, or behind electronics "
+            "already; give the library of charge pulses"
+        )
     require_complete(inside, library, source)
     mode = most_frequent(np.concatenate(amplitudes))
     return _Looked(translate, library, float(delay[0]) - STEP_SAMPLE, mode, inside)

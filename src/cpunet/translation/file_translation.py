@@ -20,7 +20,12 @@ from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
+from cpunet.pulses.provenance import (
+    TRANSLATED_BY,
+    TRANSLATION,
+    recorded_attributes,
+    require_side,
+)
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import other_columns
@@ -201,8 +206,7 @@ class FileTranslation:
         pulses = source.open()
         self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
         remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
-        found = recorded_side(pulses)
-        if found is not None and "translated" in found.why:
+        if TRANSLATED_BY in recorded_attributes(pulses):
             remedy = f"translate the {self.kind.takes} ones that they were made of"
         require_side(pulses, self.kind.takes, remedy, insist=source.insist)
         return pulses
