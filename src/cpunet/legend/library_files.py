@@ -177,7 +177,7 @@ def _libraries(file: h5py.File) -> list[str]:
 
 def _is_current(library: h5py.Group) -> bool:
     """Whether times are relative to the maxima, as those of currents are."""
-    return {"r", "z", "dt", "t0"} <= library.keys() and library["t0"][()].item() < 0
+    return {"r", "z", "dt", "t0"} <= library.keys() and bool(library["t0"][()] < 0)
 
 
 def known_detector(run: Run) -> str | None:

@@ -15,11 +15,9 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.ndimage import binary_fill_holes
 
@@ -31,6 +29,7 @@ from cpunet.legend.currents import (
     PEAK,
     RINGS,
     Floats,
+    Values,
     continued,
     currents_about_peak,
     most_frequent,
@@ -49,7 +48,7 @@ from cpunet.legend.library_files import (
 )
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.outputs import refuse_existing
-from cpunet.progress import Stage, stage
+from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.writing import written_hdf5
 from cpunet.training.run import RunLike, as_run, resolve_device
@@ -100,7 +99,7 @@ class TemplateTranslator:
         return results
 
 
-ROWS = 16  # rows of r translated at a time
+ROWS = 16  # rows of r read at a time
 MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
@@ -168,8 +167,8 @@ def translate_library(
 
     A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
     charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
-    `cpunet.make_library` make them; a file may hold several, at any depth.  Files are
-    streamed.
+    `cpunet.make_library` make them; a file may hold several, at any depth.  The currents of
+    one are in memory: 16 kB for each template.
 
     Each template is translated, differentiated, averaged three times over 48 ns and shifted so
     that its maximum is at sample 1,000 of 4,001.  All are divided by the mode of A/E of the
@@ -220,9 +219,8 @@ def translate_library(
         made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
         with written_hdf5(out) as (made, _):
             for one in ideal:
-                looked = _look(translate, one, given[one.path], source)
                 group = made.require_group(one.path)
-                found = looked.write(given[one.path], group, rings)
+                found = _write(translate, one, given[one.path], group, rings, source)
                 content = {"cpunet": cpunet.__version__, "rings": rings, **made_from}
                 group.attrs["cpunet"] = json.dumps(content | asdict(found))
                 describe(group)
@@ -230,118 +228,72 @@ def translate_library(
     return TranslatedLibrary(out, numbers)
 
 
-@dataclass(frozen=True, eq=False)
-class _Looked:
-    """Results of a first pass over all templates of a library, which a second pass writes."""
-
-    translate: TemplateTranslator
-    library: IdealLibrary
-    delay_ns: float
-    mode: float
-    inside: dict[str, npt.NDArray[np.bool_]]
-
-    def write(self, given: h5py.Group, group: h5py.Group, rings: int) -> LibraryNumbers:
-        """Write currents, and drift times within the crystal and beside it."""
-        library = self.library
-        r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
-        z_mm = padded_axis(library.z_mm, rings, rings)
-        put_column(group, "r", r_mm, "mm")
-        put_column(group, "z", z_mm, "mm")
-        put_column(group, "dt", PERIOD_NS, "ns")
-        put_column(group, "t0", -PEAK * PERIOD_NS, "ns")
-        padded = healed = 0
-        shape = (len(r_mm), len(z_mm))
-        for angle, mask in self.inside.items():
-            values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
-            drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
-            times = np.full(shape, np.nan)
-            with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
-                for rows, currents, when in self._rows(given[f"waveform_{angle}"], rings, bar):
-                    values[rows], times[rows] = currents, when
-            times = continued(times, rings)
-            drift_times[...] = times
-            padded += int(np.isfinite(times).sum() - mask.sum())
-            inner = np.isfinite(times[: len(mask), rings:][:, : mask.shape[1]])
-            healed += int((inner & ~mask & binary_fill_holes(mask)).sum())
-        return LibraryNumbers(
-            templates=library.n_templates,
-            translated=sum(int(mask.sum()) for mask in self.inside.values()),
-            padded=padded,
-            healed=healed,
-            mode_per_ns=self.mode,
-            delay_ns=self.delay_ns,
-        )
-
-    def _rows(
-        self, given: h5py.Dataset, rings: int, bar: Stage
-    ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
-        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
-        n_r, n_z, _ = given.shape
-        for first in range(0, n_r + rings, ROWS):
-            last = min(first + ROWS, n_r + rings)
-            # a padded grid point depends only on rows at most `rings` away
-            low, high = max(0, first - rings), min(last + rings, n_r)
-            shape = (last + rings - low, n_z + 2 * rings)
-            currents = np.full((*shape, LENGTH), np.nan, np.float32)
-            times = np.full(shape, np.nan)
-            if high > low:
-                charge = _charge(given[low:high])
-                there = ~np.isnan(charge[:, :, 0])
-                of_these, when = currents_about_peak(self.translate(charge[there]))
-                inner = (slice(0, high - low), slice(rings, rings + n_z))
-                currents[inner][there] = of_these / np.float32(self.mode)
-                times[inner][there] = when - self.delay_ns
-            own = slice(first - low, last - low)
-            yield slice(first, last), with_rings(currents, rings)[own], times[own]
-            bar.update(last - first)
-
-
-def _look(
-    translate: TemplateTranslator, library: IdealLibrary, given: h5py.Group, source: Path
-) -> _Looked:
-    """First pass over all templates, to find the mode of A/E before any is written."""
+def _write(
+    translate: TemplateTranslator,
+    library: IdealLibrary,
+    given: h5py.Group,
+    group: h5py.Group,
+    rings: int,
+    source: Path,
+) -> LibraryNumbers:
+    """Write currents, and drift times within the crystal and beside it."""
     step = np.zeros((1, STEP_LENGTH), np.float32)
     step[:, STEP_SAMPLE:] = 1
-    _, delay = currents_about_peak(translate(step))
-    amplitudes, inside = [], {}
-    moving = not_ending = 0
-    with stage(f"A/E of {library.path}", library.n_templates) as bar:
+    delay_ns = float(currents_about_peak(translate(step))[1][0]) - STEP_SAMPLE
+    r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
+    z_mm = padded_axis(library.z_mm, rings, rings)
+    shape, inner = (len(r_mm), len(z_mm)), np.s_[: len(library.r_mm), rings : len(z_mm) - rings]
+    currents, times = dict[str, Floats](), dict[str, Values]()
+    not_ending = 0
+    with stage(f"Translating {library.path}", library.n_templates) as bar:
         for angle in library.angles:
-            masks = []
-            for block in _blocks(given[f"waveform_{angle}"], library, source):
-                there = ~np.isnan(block[:, :, 0])
-                templates = block[there]
-                currents, times = currents_about_peak(translate(templates))
-                good = np.isfinite(times)
-                there[there] = good
-                masks.append(there)
-                moving += int(good.sum())
-                ends, heights = templates[good, -1], np.abs(templates[good]).max(axis=1)
-                not_ending += int((ends < MIN_END * heights).sum())
-                amplitudes.append(currents[good, PEAK].astype(float))
-                bar.update(block.shape[0] * block.shape[1])
-            inside[angle] = np.concatenate(masks)
-    if not moving:
-        raise CpunetError(
-            f"{source}: {library.path}: none of {library.n_templates} templates can be "
-            "translated; are they charge pulses?"
-        )
-    if 2 * not_ending > moving:
-        raise CpunetError(
-            f"{source}: {library.path}: {not_ending} of {moving} templates end below half of "
-            "their maximum: these are currents, of negative sign, or behind electronics "
-            "already; give the library of charge pulses"
-        )
+            currents[angle] = np.full((*shape, LENGTH), np.nan, np.float32)
+            times[angle] = np.full(shape, np.nan)
+            there = currents[angle][inner], times[angle][inner]
+            for rows, charge in _blocks(given[f"waveform_{angle}"], library, source):
+                held = ~np.isnan(charge[:, :, 0])
+                templates = charge[held]
+                there[0][rows][held], when = currents_about_peak(translate(templates))
+                there[1][rows][held] = when - delay_ns
+                ends, heights = templates[:, -1], np.abs(templates).max(axis=1)
+                not_ending += int((np.isfinite(when) & (ends < MIN_END * heights)).sum())
+                bar.update(held.size)
+    inside = {angle: np.isfinite(found[inner]) for angle, found in times.items()}
+    translated = sum(int(mask.sum()) for mask in inside.values())
+    _require_charge(f"{source}: {library.path}", library.n_templates, translated, not_ending)
     require_complete(inside, library, source)
-    mode = most_frequent(np.concatenate(amplitudes))
-    return _Looked(translate, library, float(delay[0]) - STEP_SAMPLE, mode, inside)
+    amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
+    mode = most_frequent(np.concatenate(amplitudes).astype(float))
+
+    put_column(group, "r", r_mm, "mm")
+    put_column(group, "z", z_mm, "mm")
+    put_column(group, "dt", PERIOD_NS, "ns")
+    put_column(group, "t0", -PEAK * PERIOD_NS, "ns")
+    padded = healed = 0
+    for angle, mask in inside.items():
+        values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
+        drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
+        currents[angle] /= np.float32(mode)
+        values[...] = with_rings(currents.pop(angle), rings)
+        drift_times[...] = filled = continued(times[angle], rings)
+        padded += int(np.isfinite(filled).sum() - mask.sum())
+        healed += int((np.isfinite(filled[inner]) & ~mask & binary_fill_holes(mask)).sum())
+    return LibraryNumbers(library.n_templates, translated, padded, healed, mode, delay_ns)
 
 
-def _blocks(given: h5py.Dataset, library: IdealLibrary, source: Path) -> Iterator[Floats]:
-    """Rows of charge templates; raise an error if only a part of a template is NaN."""
+def _blocks(
+    given: h5py.Dataset, library: IdealLibrary, source: Path
+) -> Iterator[tuple[slice, Floats]]:
+    """Rows of charge templates, NaN for those of only zeros.
+
+    Raises
+    ------
+    CpunetError
+        If only a part of a template is NaN.
+    """
     for first in range(0, given.shape[0], ROWS):
-        values = np.asarray(given[first : first + ROWS], np.float32)
-        bad = np.isnan(values)
+        charge = np.array(given[first : first + ROWS], np.float32)
+        bad = np.isnan(charge)
         part = bad.any(axis=2) & ~bad.all(axis=2)
         if part.any():
             i, j = np.argwhere(part)[0]
@@ -351,11 +303,19 @@ def _blocks(given: h5py.Dataset, library: IdealLibrary, source: Path) -> Iterato
                 f"{library.z_mm[j]:g} mm; simulate the library again, with longer records if "
                 "charge was late"
             )
-        yield _charge(values)
+        charge[~charge.any(axis=2)] = np.nan
+        yield slice(first, first + len(charge)), charge
 
 
-def _charge(values: npt.NDArray[Any]) -> Floats:
-    """Templates as float32; those of only zeros become NaN."""
-    charge = np.array(values, np.float32)
-    charge[~charge.any(axis=2)] = np.nan
-    return charge
+def _require_charge(where: str, n: int, translated: int, not_ending: int) -> None:
+    """Raise an error if none of `n` templates has a signal, or most end below their height."""
+    if not translated:
+        raise CpunetError(
+            f"{where}: none of {n} templates can be translated; are they charge pulses?"
+        )
+    if 2 * not_ending > translated:
+        raise CpunetError(
+            f"{where}: {not_ending} of {translated} templates end below half of their maximum: "
+            "these are currents, of negative sign, or behind electronics already; give the "
+            "library of charge pulses"
+        )
