@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
 import hdf5plugin  # noqa: F401 - provides the compression filters of LEGEND's files
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 
@@ -67,3 +69,20 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
 def is_column(item: object) -> bool:
     """Whether an object of a file is a one-dimensional array of numbers, or one number."""
     return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRows:
+    """Rows of a dataset, all or some of them; the file is open only while they are read."""
+
+    path: Path
+    dataset: str
+    shape: tuple[int, ...]
+    rows: npt.NDArray[np.int64] | None = None
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, part: slice) -> Any:
+        with opened(self.path) as file:
+            return file[self.dataset][part if self.rows is None else self.rows[part]]

@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, lh5_rows, opened, text_attribute
+from cpunet.hdf5_files import StoredRows, is_column, lh5_rows, opened, text_attribute
+from cpunet.pulses.reading.arrays import ArraySource
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.published import MajoranaSource, is_majorana
+from cpunet.pulses.reading.published import is_majorana, open_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 from cpunet.tables import shortened
 
@@ -32,12 +33,14 @@ def open_hdf5(options: PulseFile) -> PulseSource:
     """Open the waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
     with opened(options.path) as file:
         if is_majorana(file):
-            return MajoranaSource(options)
+            return open_majorana(options, file)
         table, _, contact = (options.table or "").partition(f"{_CONTACT}=")
         chosen = choose_waveforms(options.path, file, table)
-    if chosen.is_lh5:
-        return Lh5Source(options, chosen, contact)
-    return Hdf5Source(options, chosen)
+        if chosen.is_lh5:
+            return Lh5Source(options, chosen, contact)
+        values = StoredRows(options.path, chosen.path, file[chosen.path].shape)
+        columns = columns_of(options.path, file[chosen.table or "/"])
+    return ArraySource(options, "HDF5", chosen.path, values, columns)
 
 
 class Lh5Source(PulseSource):
@@ -141,24 +144,6 @@ def _rows_of_contact(
             "write those of a contact one after another",
         )
     return int(rows[0]), len(rows)
-
-
-class Hdf5Source(PulseSource):
-    """A dataset of shape ``(events, samples)``, and the columns beside it."""
-
-    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
-        self._values = chosen.path
-        with opened(options.path) as file:
-            dataset = file[chosen.path]
-            columns = columns_of(options.path, file[chosen.table or "/"])
-            layout = Layout.of_array(options.path, "HDF5", chosen.path, dataset.shape, columns)
-        super().__init__(options, layout)
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        with opened(self.path) as file:
-            dataset = file[self._values]
-            for start in range(0, self.n_pulses or 0, size):
-                yield Traces(dataset[start : start + size])
 
 
 def _n_rows(values: h5py.Group | h5py.Dataset) -> int:

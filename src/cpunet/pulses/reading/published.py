@@ -28,11 +28,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened
+from cpunet.hdf5_files import StoredRows, is_column
 from cpunet.pulses.reading.arrays import ArraySource
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
+from cpunet.pulses.reading.source import choose_table
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
@@ -52,51 +52,24 @@ def detectors(file: h5py.File) -> list[str]:
     return [str(number) for number in np.unique(file[DETECTOR][()])]
 
 
-class MajoranaSource(PulseSource):
-    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
-
-    def __init__(self, options: PulseFile) -> None:
-        path = options.path
-        with opened(path) as file:
-            dataset = file[WAVEFORMS]
-            self._rows = _rows(options, file, dataset.shape[0])
-            columns = {
-                name: Column.of(values[self._rows], units)
-                for name, values, units in _columns(file)
-            }
-            layout = Layout(
-                format="Majorana release",
-                table=options.table or WAVEFORMS,
-                n_pulses=len(self._rows),
-                length=dataset.shape[1],
-                columns=columns,
-                period_hint="the Majorana Demonstrator's digitisers ran at 100 MHz: 10",
-            )
-        super().__init__(options, layout)
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        with opened(self.path) as file:
-            for start in range(0, len(self._rows), size):
-                yield Traces(file[WAVEFORMS][self._rows[start : start + size]])
-
-
-def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
-    """Rows of the chosen detector, in order."""
-    if options.table == WAVEFORMS:
-        return np.arange(n)
-    remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
-    chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
-    return np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
-
-
-def _columns(file: h5py.File) -> Iterator[tuple[str, npt.NDArray[np.generic], str]]:
-    """Yield name, values and units of each column beside the traces (a few bytes per event)."""
+def open_majorana(options: PulseFile, file: h5py.File) -> ArraySource:
+    """Open the traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
+    number, length = file[WAVEFORMS].shape
+    rows = np.arange(number)
+    if options.table != WAVEFORMS:
+        remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
+        chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
+        rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
+    columns = {}
     for name in file:
-        column = file.get(name)
-        if not is_column(column) or column.ndim == 0:
-            continue
-        shown, units = _RENAMED.get(name, (name, ""))
-        yield shown, np.asarray(column[()]), units
+        item = file.get(name)
+        if is_column(item) and item.ndim:
+            shown, units = _RENAMED.get(name, (name, ""))
+            columns[shown] = Column.of(item[()][rows], units)
+    values = StoredRows(options.path, WAVEFORMS, (len(rows), length), rows)
+    hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
+    table = options.table or WAVEFORMS
+    return ArraySource(options, "Majorana release", table, values, columns, hint)
 
 
 # NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
