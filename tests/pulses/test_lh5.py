@@ -336,11 +336,11 @@ def test_other_columns_are_read_by_rows(tmp_path):
     columns = {"a": (np.arange(6), "mm"), "tails_kev": (np.arange(6), "")}
     write_pulses(path, some(), columns=columns)
     own = {"waveform", "energy", "event_number", "tails_kev"}
-    readers, left_out = other_columns(open_pulses(path), own)
-    assert ([*readers], left_out) == (["a", "tails_kev_source"], {})
-    found = readers["a"](2, 3)
-    assert found.nda.tolist() == [2, 3, 4]
-    assert found.attrs["units"] == "mm"
+    read, left_out = other_columns(open_pulses(path), own)
+    found = read(2, 3)
+    assert ([*found], left_out) == (["a", "tails_kev_source"], {})
+    assert found["a"].nda.tolist() == [2, 3, 4]
+    assert found["a"].attrs["units"] == "mm"
 
 
 def test_no_column_replaces_another(tmp_path):
@@ -352,8 +352,8 @@ def test_no_column_replaces_another(tmp_path):
     np.savez(tmp_path / "pulses.npz", waveform=some().waveforms, **columns)
     own = {"waveform", "energy", "event_number", "rejection"}
     for name in ("pulses.lh5", "pulses.npz"):
-        readers, _ = other_columns(open_pulses(tmp_path / name, dt_ns=16), own)
-        values = {name: read(0, 6).nda[0] for name, read in readers.items()}
+        read, _ = other_columns(open_pulses(tmp_path / name, dt_ns=16), own)
+        values = {name: column.nda[0] for name, column in read(0, 6).items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from functools import partial
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import h5py
@@ -19,12 +17,10 @@ from cpunet.pulses.reading.source import PulseSource
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
 _NUMBERS = "iufb"
 
-Read: TypeAlias = Callable[[int, int], LGDO]  # from a row on, so many rows
+Read: TypeAlias = Callable[[int, int], dict[str, LGDO]]  # from a row on, so many rows
 
 
-def other_columns(
-    source: PulseSource, own: Collection[str]
-) -> tuple[dict[str, Read], dict[str, str]]:
+def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict[str, str]]:
     """Columns beside the waveforms of a file.
 
     Parameters
@@ -37,39 +33,43 @@ def other_columns(
 
     Returns
     -------
-    readers
-        What reads rows as LH5 objects, by name in the output.
+    read
+        Reads rows of all columns as LH5 objects, by name in the output.
     left_out
         The reason for each column that cannot be copied.
     """
-    readers, left_out = dict[str, Read](), dict[str, str]()
-    if source.layout.format in ("LH5", "HDF5"):
-        table, _, chosen = source.layout.table.rpartition("/")
-        with opened(source.path) as file:
-            group = file[table or "/"]
-            for name in group:
-                item = group.get(name)  # None for a broken link
-                is_plain = isinstance(item, h5py.Dataset)
-                units = text_attribute(item, "units") if is_plain else ""
-                if name == chosen or (is_plain and _is_same(name, units, own)):
-                    continue
-                if reason := _unreadable(item, source.n_pulses or 0):
-                    left_out[name] = reason
-                else:
-                    readers[name] = partial(_stored, source.path, item.name)
-    else:
-        readers = {
-            name: partial(_from_column, column)
+    if source.layout.format not in ("LH5", "HDF5"):
+        columns = {
+            name: column
             for name, column in source.columns.items()
             if not _is_same(name, column.units, own)
         }
-    names = _renamed(readers, own)
-    return {names[name]: read for name, read in readers.items()}, left_out
+        shown = _renamed(columns, own)
+        return lambda start, n: {
+            shown[name]: _from_column(column, start, n) for name, column in columns.items()
+        }, {}
+    table, _, chosen = source.layout.table.rpartition("/")
+    names, left_out = list[str](), dict[str, str]()
+    with opened(source.path) as file:
+        group = file[table or "/"]
+        for name in group:
+            item = group.get(name)  # None for a broken link
+            is_plain = isinstance(item, h5py.Dataset)
+            units = text_attribute(item, "units") if is_plain else ""
+            if name == chosen or (is_plain and _is_same(name, units, own)):
+                continue
+            if reason := _unreadable(item, source.n_pulses or 0):
+                left_out[name] = reason
+            else:
+                names.append(name)
+    shown = _renamed(names, own)
 
+    def read(start: int, n: int) -> dict[str, LGDO]:
+        with opened(source.path) as file:
+            group = file[table or "/"]
+            return {shown[name]: _rows(group[name], start, n) for name in names}
 
-def _stored(path: Path, name: str, start: int, n: int) -> LGDO:
-    with opened(path) as file:
-        return _rows(file[name], start, n)
+    return read, left_out
 
 
 def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:

@@ -160,15 +160,14 @@ class FileTranslation:
             return replace(finished(out, provenance), skipped=1)
         refuse_existing(out, force=force)
         pulses = self.opened(source)
-        others, left_out = other_columns(pulses, OWN_COLUMNS)
+        read_others, left_out = other_columns(pulses, OWN_COLUMNS)
         for column, reason in left_out.items():
             log.warning(f"{source.path.name}: column {column} is left out: {reason}")
         counts = Counts()
         give_back_large_arrays()
         with self.writer(out, force=force) as writer:
             for block in self._blocks(pulses, noise_key):
-                rows = counts.read, len(block.codes)
-                beside = {name: read(*rows) for name, read in others.items()}
+                beside = read_others(counts.read, len(block.codes))
                 writer.append(block.pulses, {**block.columns, **beside})
                 counts += Counts.of(block)
             self._require_some(source, counts)
