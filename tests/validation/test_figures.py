@@ -64,12 +64,12 @@ def test_further_parameters_are_drawn_each():
 
 
 def test_all_eight_losses_are_drawn_with_their_moving_average():
-    figure = run_figures.loss_curves(log(50))
+    figure = run_figures.loss_curves(log(500))
     require_drawn(figure)
     lines = [line for axes in figure.axes for line in axes.lines]
     assert len(lines) == 2 * len(LOSSES) == 16
     average = figure.axes[1].lines[1].get_xydata()
-    assert average.shape == (41, 2)
+    assert average.shape == (491, 2)
     assert average[0].tolist() == pytest.approx([90, np.mean(1 / np.arange(1, 11))])
 
 
@@ -80,7 +80,7 @@ def test_a_loss_of_every_third_iteration_is_drawn():
             del record["losses"]["discriminator_data"]
     raw, average = run_figures.loss_curves(records).axes[2].lines[:2]
     np.testing.assert_array_equal(raw.get_xdata(), np.arange(0, 600, 30))
-    assert np.isfinite(average.get_ydata()).sum() == 11
+    assert np.isfinite(average.get_ydata()).sum() == 20
 
 
 def test_cycle_figure_draws_all_pulses_in_each_panel():

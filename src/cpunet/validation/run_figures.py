@@ -39,7 +39,7 @@ from cpunet.validation.comparisons import Compared, histogram
 from cpunet.validation.slices import BEFORE, MeanPulse
 
 CHI_SQUARE = "chi_square"  # the only loss of a fitted chain
-AVERAGED = 10  # records in the moving average
+AVERAGES = 50  # a moving average is over this fraction of the records
 DRIFT_BINS = 12  # of drift time, with as many pulses each
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
@@ -92,15 +92,14 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
                 continue
             at, series = iteration[there], series[there]
             axes.plot(at, series, color=colour, alpha=0.25, linewidth=0.7)
-            width = min(AVERAGED, len(series))
+            width = max(1, len(series) // AVERAGES)
             average = np.convolve(series, np.full(width, 1 / width), mode="valid")
             axes.plot(at[len(at) - len(average) :], average, colour, label=text)
-        axes.set(title=title, xlabel="Iteration")
+        axes.set(title=title, xlabel="Iteration (lines: moving averages)")
         if axes.lines:
             axes.legend()
     grid[0, 0].set(ylabel="Loss", yscale="log")
     logarithmic(grid[0, 0].yaxis)
-    figure.supxlabel(f"Lines: mean of {AVERAGED} records", fontsize=8, x=0.99, ha="right")
     return figure
 
 
