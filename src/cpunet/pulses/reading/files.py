@@ -265,16 +265,14 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         from cpunet.pulses.reading.flashcam import channel_sizes
 
         return channel_sizes(path)
-    return dict.fromkeys(_hdf5_tables(path)) if found is HDF5 else {}
-
-
-def _hdf5_tables(path: Path) -> list[str]:
+    if found is not HDF5:
+        return {}
     from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import waveform_tables
     from cpunet.pulses.reading.published import detectors, is_majorana
 
     with opened(path) as file:
-        return detectors(file) if is_majorana(file) else waveform_tables(file)
+        return dict.fromkeys(detectors(file) if is_majorana(file) else waveform_tables(file))
 
 
 def recognise(path: Path) -> Format:
