@@ -493,7 +493,7 @@ def test_a_real_run_of_two_detectors(tmp_path):
         assert {"FEP", "SEP", "DEP"} == set(metrics["peaks"])
         assert sorted(p.stem for p in (folder / "translated").iterdir()) == parts
         assert not (folder / "data.lh5").exists()  # merged for the time being
-        assert "2 runs of fast, FEP" in (folder / "seeds.html").read_text()
+        assert "median ± std" in (folder / "seeds.html").read_text()
     assert "Nothing to be done" in here.run("-c1").stdout
 
 
