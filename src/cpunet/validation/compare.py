@@ -266,6 +266,9 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
+    if out is not None:
+        files = [report for report in reports if not isinstance(report, Report)]
+        refuse_existing(Path(out), *files, force=force)
     comparison = compared(reports, method=method)
     if out is None:
         return comparison
