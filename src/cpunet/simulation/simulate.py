@@ -28,7 +28,7 @@ from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow, with_resolution
 from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector, FloatArray
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
+from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import (
     GammaSource,
     HitFile,
@@ -36,6 +36,7 @@ from cpunet.simulation.hit_sources import (
     energy_windows,
     wanted_events,
 )
+from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings, split_overrides
@@ -90,9 +91,9 @@ class Simulation:
 
     def count(self, hits: Hits, events: EventPulses) -> None:
         """Count a block of events."""
-        r = np.hypot(hits.x_mm, hits.y_mm)
-        inside = self.detector.inside(r, hits.z_mm)
-        contacts = np.isin(self.detector.region(r, hits.z_mm), (POINT_CONTACT, LI_CONTACT))
+        place = hits.r_mm, hits.z_mm
+        inside = self.detector.inside(*place)
+        contacts = np.isin(self.detector.region(*place), (POINT_CONTACT, LI_CONTACT))
         collected = events.collected_kev
         self.n_events += len(hits)
         self.n_written += int((collected > 0).sum())
