@@ -19,7 +19,6 @@ from cpunet.simulation.gammas.sample import (
     simulate_gammas,
     with_resolution,
 )
-from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
@@ -154,26 +153,6 @@ SHAPES: dict[str, Detector] = {name: read_detector(name) for name in detector_na
 
 
 @pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
-def test_the_transport_has_the_outline_of_the_detector(detector: Detector) -> None:
-    shape, rng = CrystalShape.of(detector), np.random.default_rng(2)
-    # half of the places lie near the bottom, the top or the wall
-    u = rng.random((3, 4000))
-    z = (u[0] * 1.02 - 0.01) * detector.crystal_length
-    z[:1000] = u[0, :1000] * 12 - 0.5
-    r = detector.crystal_radius * 1.01 * np.sqrt(u[1])
-    r[1000:2000] = detector.crystal_radius - 9.5 + 10 * u[1, 1000:2000]
-    phi = 2 * np.pi * u[2]
-    mine = [
-        in_germanium(shape, *p) for p in zip(r * np.cos(phi), r * np.sin(phi), z, strict=True)
-    ]
-    # surfaces belong to the detector, and rounding may put a place on either side of them
-    nearly = detector.inside(r[:, None] + [-1e-5, 1e-5, 0, 0], z[:, None] + [0, 0, -1e-5, 1e-5])
-    clear = nearly.all(axis=1) | ~nearly.any(axis=1)
-    assert clear.mean() > 0.99
-    np.testing.assert_array_equal(np.array(mine)[clear], detector.inside(r, z)[clear])
-
-
-@pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
 def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
     for height in (1.0, 80.0):
         hits, _ = simulate_gammas(
@@ -206,7 +185,7 @@ def test_impossible_wishes_are_refused(settings: dict[str, object], message: str
 
 def test_electron_range_and_photon_attenuation() -> None:
     table = electron_table()
-    reach = np.interp(1.0, table.energy[::-1], table.range[::-1])
+    reach = np.interp(1.0, table.energy[::-1], np.cumsum(table.step[::-1]))
     # NIST ESTAR: 1.23 mm, which counts losses to hard photons too
     assert reach == pytest.approx(1.23, rel=0.06)
     photons = photon_table()

@@ -325,12 +325,11 @@ def test_siggens_own_rules(tmp_path, more, without, field, value) -> None:
 
 def test_widths_of_tapers_count_where_the_angle_is_0(tmp_path: Path) -> None:
     more = "taper_angle 0\nouter_taper_length 20\nouter_taper_width 4\ninner_taper_width 2"
-    outer, inner, _ = siggen(tmp_path, more).taper_angles_rad
-    assert (math.tan(outer), math.tan(inner)) == pytest.approx((4 / 20, 2 / 45))
-    outer, inner, _ = siggen(tmp_path, more.replace("angle 0", "angle 5")).taper_angles_rad
-    assert np.degrees([outer, inner]) == pytest.approx(5)
+    assert siggen(tmp_path, more).taper_slopes[:2] == pytest.approx((4 / 20, 2 / 45))
+    slopes = siggen(tmp_path, more.replace("angle 0", "angle 5")).taper_slopes[:2]
+    assert np.degrees(np.arctan(slopes)) == pytest.approx(5)
     # a width of one taper is not that of the other
-    assert siggen(tmp_path, more.rpartition("\n")[0]).taper_angles_rad[1] == 0
+    assert siggen(tmp_path, more.rpartition("\n")[0]).taper_slopes[1] == 0
 
 
 def test_radial_terms_need_a_power(tmp_path: Path) -> None:

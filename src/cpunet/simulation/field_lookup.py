@@ -18,7 +18,7 @@ from scipy.interpolate import RectBivariateSpline
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.fields import FieldMaps
-from cpunet.simulation.geometry import DITCH
+from cpunet.simulation.outline import DITCH
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import FloatArray, velocity_table
 
@@ -72,7 +72,7 @@ def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
         axis=-1,
     ).astype(np.float64)
     # nothing drifts in the ditch, and the field is discontinuous at its walls
-    ditch = np.asarray(fields.point_type) == DITCH
+    ditch = np.asarray(fields.region) == DITCH
     with_field = np.isfinite(stacked).all(-1) & ~ditch & (stacked[..., :2] != 0).any(-1)
     if not with_field.any():
         raise CpunetError("the field maps hold no field; compute them again")

@@ -28,26 +28,17 @@ from typing import Any
 
 import numpy as np
 import platformdirs
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import binary_erosion, minimum_filter
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.simulation.geometry import (
-    DITCH,
-    GERMANIUM,
-    LI_CONTACT,
-    Detector,
-    FloatArray,
-    RegionArray,
-)
+from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
+from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
 from cpunet.simulation.poisson import (
-    CONTACT_EDGE,
-    DITCH_EDGE,
     Grid,
     Potentials,
     make_grid,
-    point_types,
     solve_potentials,
 )
 
@@ -325,10 +316,8 @@ class FieldMaps:
     """Fields at the nodes ``r_mm`` (nr) times ``z_mm`` (nz), spaced by `grid_mm`.
 
     Maps have shape (nr, nz). The field is E = -grad V in V/cm. It is 0 in contacts and
-    outside; on the walls of the ditch it is that of the germanium. `point_type` is 0 in the
-    point contact, 1 in the lithium contact and outside, 2 in germanium, 3 in germanium on the
-    passivated face z = 0, 5 in the ditch, 6 and 7 in germanium next to the ditch and next to
-    a contact.
+    outside; on the walls of the ditch it is that of the germanium. `region` is
+    `Detector.region` at the nodes.
     """
 
     r_mm: FloatArray
@@ -338,7 +327,7 @@ class FieldMaps:
     e_r_V_per_cm: FloatArray
     e_z_V_per_cm: FloatArray
     weighting_potential: FloatArray
-    point_type: RegionArray
+    region: RegionArray
     temperature_K: float
     capacitance_pF: float
     depletion_V: float
@@ -396,7 +385,7 @@ def superposed_fields(
         e_r_V_per_cm=e_r,
         e_z_V_per_cm=e_z,
         weighting_potential=parts.point_contact,
-        point_type=point_types(grid),
+        region=grid.region,
         temperature_K=detector.temperature_K,
         capacitance_pF=parts.capacitance_pF,
         depletion_V=solution.depletion_V(*impurities) if depletion else np.nan,
@@ -489,10 +478,9 @@ def fields_in_words(detector: Detector, fields: FieldMaps) -> list[tuple[str, st
     """Names and texts: capacitance, depletion voltage, bias, extremes of the bulk's field."""
     strength = np.hypot(fields.e_r_V_per_cm, fields.e_z_V_per_cm)
     # next to contacts and the ditch the field is only a one-sided difference
-    bulk = fields.point_type > LI_CONTACT
-    bulk &= fields.point_type < DITCH_EDGE
-    bulk &= fields.point_type != CONTACT_EDGE
-    bulk &= detector.active(fields.r_mm[:, None], fields.z_mm[None, :])
+    germanium = fields.region == GERMANIUM
+    bulk = binary_erosion(germanium, border_value=1)
+    bulk[:, 0] = germanium[:, 0]
     measured, scale = detector.measured_depletion_V, detector.impurity_scale
     lines = [
         ("detector", detector.name),

@@ -26,7 +26,7 @@ from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
-from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import (
@@ -39,6 +39,7 @@ from cpunet.simulation.hit_sources import (
 from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
+from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings, split_overrides
 
 log = logging.getLogger(__name__)
