@@ -50,7 +50,7 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     how: dict[str, Any] = {"cmap": "viridis", "vmin": 0, "vmax": top}
     _map(panels[0], fields, fields.potential_V, lines[0], bar, how)
     weighting = np.maximum(fields.weighting_potential, low / 10)
-    bar = f"Weighting potential, lines at {', '.join(map(str, lines[1]))}"
+    bar = f"Weighting potential, lines at {low} to {lines[1][-1]}"
     how = {"cmap": "cividis", "norm": LogNorm(low / 10, 1)}
     _map(panels[1], fields, weighting, lines[1], bar, how)
     _paths(panels[0], detector, fields)
