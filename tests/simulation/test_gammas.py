@@ -17,7 +17,6 @@ from cpunet.simulation.gammas.sample import (
     EnergyWindow,
     GammaStatistics,
     simulate_gammas,
-    with_resolution,
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
@@ -203,11 +202,3 @@ def test_compton_mean_energy_is_that_of_klein_and_nishina() -> None:
     share = 1 / (1 + k * (1 - cosine))
     weight = share**2 * (share + 1 / share - 1 + cosine**2)
     assert drawn == pytest.approx(np.sum(weight * share) / weight.sum(), rel=0.01)
-
-
-def test_resolution_has_the_width_asked_for() -> None:
-    energy = with_resolution(np.full(40_000, 2614.5), noise_kev2=1.0, fano_kev=0.002, seed=1)
-    assert energy.std() * 2.3548 == pytest.approx(np.sqrt(1 + 0.002 * 2614.5), rel=0.02)
-    for noise, fano in ((-1, 0), (0, -1), (np.nan, 0), (0, np.inf)):
-        with pytest.raises(CpunetError, match="numbers from 0 up"):
-            with_resolution([1.0], noise_kev2=noise, fano_kev=fano, seed=1)

@@ -89,8 +89,9 @@ def _map(
     axes.contour(
         fields.r_mm, fields.z_mm, values, levels, colors="white", linewidths=0.65, alpha=0.9
     )
-    place = {"location": "bottom", "shrink": 0.95, "pad": 0.02, "aspect": 25}
-    axes.figure.colorbar(image, ax=axes, label=bar, **place)
+    axes.figure.colorbar(
+        image, ax=axes, label=bar, location="bottom", shrink=0.95, pad=0.02, aspect=25
+    )
 
 
 def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:

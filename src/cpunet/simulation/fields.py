@@ -16,7 +16,6 @@ is not depleted, and the potential is refused.
 
 from __future__ import annotations
 
-import heapq
 import logging
 import math
 import os
@@ -28,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import platformdirs
-from scipy.ndimage import binary_erosion, minimum_filter
+from scipy.ndimage import binary_erosion, label, minimum_filter
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
@@ -49,7 +48,6 @@ log = logging.getLogger(__name__)
 POCKET_DEPTH_V = 0.01
 HIGHEST_BIAS_V = 20_000.0
 _RESOLUTION_V = 0.5
-_NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j)
 
 
 def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
@@ -110,24 +108,12 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
 def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) -> bool:
     """Whether leaving a minimum requires a climb of more than `POCKET_DEPTH_V`.
 
-    Floods from the minimum, lowest node first, until a lower node or a contact is reached.
+    Otherwise a lower node or a contact can be reached from it below that level.
     """
     start = potential[row, column]
-    heap = [(float(start), row, column)]
-    seen = {(row, column)}
-    while heap:
-        level, i, j = heapq.heappop(heap)
-        if level > start + POCKET_DEPTH_V:
-            return True
-        if level < start or region[i, j] < GERMANIUM:
-            return False
-        for di, dj in _NEIGHBOURS:
-            node = (i + di, j + dj)
-            inside = 0 <= node[0] < region.shape[0] and 0 <= node[1] < region.shape[1]
-            if inside and node not in seen:
-                seen.add(node)
-                heapq.heappush(heap, (float(potential[node]), *node))
-    return True
+    basins, _ = label(potential <= start + POCKET_DEPTH_V, np.ones((3, 3)))
+    basin = basins == basins[row, column]
+    return bool((region[basin] >= GERMANIUM).all() and (potential[basin] >= start).all())
 
 
 # part of the file name, so that results of an older solver are not used

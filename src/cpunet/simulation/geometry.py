@@ -116,7 +116,8 @@ class Detector(Config):
         top_step, bottom_step = self.steps
         top_radius = radius - self.outer_taper_length * outer - top_step
         bore_mouth = self.bore_radius + self.inner_taper_length * inner
-        bore_mouth = max(bore_mouth, self.top_groove_radius)
+        if self.top_groove_depth:
+            bore_mouth = max(bore_mouth, self.top_groove_radius)
         bottom_radius = radius - self.bottom_taper_length * bottom - bottom_step
         ditch_inner = self.wrap_around_radius - self.ditch_thickness
         ends = ("top", "outer", top_step), ("bottom", "bottom", bottom_step)
@@ -131,10 +132,11 @@ class Detector(Config):
         for one, other in (
             ("bore_length", "bore_radius"),
             ("ditch_depth", "ditch_thickness"),
-            ("top_groove_depth", "top_groove_radius"),
         ):
             if (getattr(self, one) > 0) != (getattr(self, other) > 0):
                 yield f"{one} and {other} must both be given, or both be 0"
+        if self.top_groove_depth and not self.top_groove_radius:
+            yield "top_groove_depth and top_groove_radius must both be given"
         if 2 * li >= min(length, radius):
             yield "li_thickness leaves nothing of the crystal"
         if self.outer_taper_length + self.bottom_taper_length > length:
@@ -248,7 +250,7 @@ class Detector(Config):
         >>> read_detector("icpc").inside([0, 0, 12, 40], [10, 90, 1, 50])
         array([ True, False, False,  True])
         """
-        return self._at(insides, r, z)
+        return np.asarray(self._at(insides, r, z), np.bool_)
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
@@ -266,7 +268,7 @@ class Detector(Config):
 
         Surfaces belong to the contacts and to the ditch.
         """
-        return self._at(regions, r, z)
+        return np.asarray(self._at(regions, r, z), np.int8)
 
     def _at(self, loop: Callable[..., Any], r: npt.ArrayLike, z: npt.ArrayLike) -> Any:
         """What a loop of `cpunet.simulation.outline` finds at each place."""

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.pulses.reading.source import whole_numbers
 from cpunet.simulation.hits import FloatArray, HitOptions, IntArray
@@ -41,12 +41,10 @@ _NAMES = {
     "detector": ("det_uid", "detector", "detector_id", "detectorid", "volid", "volume"),
 }
 _NEEDED = ("event", "x", "y", "z", "edep")
+_VECTORS = ("cumulative_length", "flattened_data")
 _WITH_UNIT = re.compile(r"(.+?)\s*(?:\[(.*)\]|_in_(.+))$")
 # arrays of an NPZ beside the offsets, and the columns that they are
 _ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep_in_keV"}
-
-# values of a column for all steps, and the unit that belongs to them ("" for none)
-ReadColumn: TypeAlias = Callable[[], tuple[npt.NDArray[Any], str]]
 
 
 @dataclass(frozen=True)
@@ -69,18 +67,27 @@ class Steps:
 
 @dataclass(frozen=True)
 class StepTable:
-    """A table of steps: its columns by name, each of which is read when it is needed.
+    """A table of steps: its columns by name, arrays or items of an open HDF5 file.
 
-    The `name` is that of its detector, empty if it names none. Units that neither column nor
-    options tell are those of g4simple, MeV and mm, if the table is `g4simple`'s. A `file` of
-    remage tells where its detectors are.
+    Those of HDF5 are arrays with a value per row, or vectors with one per step of the row; the
+    vectors of deposits tell the steps of each row. The `name` is that of the detector, empty if
+    there is none. Units that neither column nor options tell are those of g4simple, MeV and
+    mm, if the table is `g4simple`'s. A `file` of remage tells where its detectors are.
     """
 
     path: Path
-    columns: Mapping[str, ReadColumn]
+    columns: Mapping[str, Any]
     name: str = ""
     g4simple: bool = False
     file: h5py.File | None = None
+
+    @classmethod
+    def of_group(cls, path: Path, group: h5py.Group, name: str) -> StepTable:
+        """A table in HDF5. g4simple writes one for all detectors."""
+        # the values of a column of Geant4's HDF5 are its pages
+        pages = {n: item["pages"] if _has(item, "pages") else item for n, item in group.items()}
+        g4simple = name == _G4SIMPLE
+        return cls(path, pages, "" if g4simple else name, g4simple, group.file)
 
     @cached_property
     def roles(self) -> dict[str, tuple[str, str]]:
@@ -107,7 +114,7 @@ class StepTable:
         for role, (name, in_name) in self.roles.items():
             if role == "detector":
                 continue
-            read, unit = self.columns[name]()
+            read, unit = self._read(name)
             where = f"{self.path}: column {name}"
             if read.ndim != 1 or read.dtype.kind not in "iuf":
                 raise CpunetError(
@@ -127,7 +134,7 @@ class StepTable:
         labels = self._labels()
         if not len(labels) or "edep" not in self.roles:
             return []
-        edep = self.columns[self.roles["edep"][0]]()[0]
+        edep = self._read(self.roles["edep"][0])[0]
         return sorted(
             map(str, np.unique(labels[edep > 0])),
             key=lambda label: (len(label), label) if label.isdigit() else (99, label),
@@ -149,12 +156,36 @@ class StepTable:
         """Detector of each step as text; empty if no column tells it."""
         if "detector" not in self.roles:
             return np.empty(0, np.str_)
-        labels = self.columns[self.roles["detector"][0]]()[0]
+        labels = self._read(self.roles["detector"][0])[0]
         if labels.dtype.kind == "f" and np.array_equal(labels, np.rint(labels)):
             labels = labels.astype(np.int64)
         if labels.dtype.kind in "SO":
             return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in labels])
         return labels.astype(np.str_)
+
+    @cached_property
+    def _per_row(self) -> IntArray:
+        """Number of steps of each row."""
+        edep = self.columns[self.roles["edep"][0]]
+        return _lengths(edep) if _has(edep, *_VECTORS) else np.ones(len(edep), np.int64)
+
+    def _read(self, name: str) -> tuple[npt.NDArray[Any], str]:
+        """Values of a column for all steps, and the unit that belongs to them."""
+        item = self.columns[name]
+        if isinstance(item, np.ndarray):
+            return item, ""
+        per_row, vectors = self._per_row, _has(item, *_VECTORS)
+        where = f"{self.path}: column"
+        if not vectors and not (isinstance(item, h5py.Dataset) and item.ndim == 1):
+            raise CpunetError(f"{where} {name} is no array with a value per step or hit")
+        same = np.array_equal(_lengths(item), per_row) if vectors else len(item) == len(per_row)
+        if not same:
+            raise CpunetError(f"{where}s {name} and edep differ in length; truncated?")
+        unit = text_attribute(item, "units")
+        if not vectors:
+            return np.repeat(item[()], per_row), unit
+        flat = item["flattened_data"]
+        return np.asarray(flat[: per_row.sum()]), text_attribute(flat, "units") or unit
 
 
 def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -232,14 +263,13 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
         yield [_csv_table(path)]
     elif kind == "npz":
         yield [_npz_table(path)]
-    elif kind == "stored":
-        with opened(path) as file:
-            yield [_hdf5_table(path, file[HIT_TABLE], "")]
-    elif kind == "tables":
+    elif kind:
         with opened(path) as file:
             groups = [g for folder in (STEPS, NTUPLES) for g in file.get(folder, {}).items()]
+            if kind == "stored":
+                groups = [("", file[HIT_TABLE])]
             tables = [
-                _hdf5_table(path, group, str(name))
+                StepTable.of_group(path, group, str(name))
                 for name, group in groups
                 if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys()
             ]
@@ -256,49 +286,12 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
         )
 
 
-def _hdf5_table(path: Path, group: h5py.Group, name: str) -> StepTable:
-    """Columns are arrays with a value per row, or vectors with one per step of the row.
-
-    g4simple writes one table for all detectors. The vectors of deposits tell the steps of each
-    row.
-    """
-    edep = _without_pages(group[roles(group)["edep"][0]])
-    per_row = _lengths(edep) if _is_vectors(edep) else np.ones(len(edep), np.int64)
-    read = {column: partial(_read, path, column, group[column], per_row) for column in group}
-    g4simple = name == _G4SIMPLE
-    return StepTable(path, read, "" if g4simple else name, g4simple, group.file)
-
-
-def _without_pages(item: Any) -> Any:
-    """The values of a column of Geant4's HDF5, which are its pages."""
-    return item["pages"] if isinstance(item, h5py.Group) and "pages" in item else item
-
-
-def _is_vectors(item: Any) -> bool:
-    parts = ("cumulative_length", "flattened_data")
-    return isinstance(item, h5py.Group) and all(is_column(item.get(part)) for part in parts)
+def _has(item: Any, *parts: str) -> bool:
+    return isinstance(item, h5py.Group) and all(part in item for part in parts)
 
 
 def _lengths(vectors: h5py.Group) -> IntArray:
-    return np.diff(vectors["cumulative_length"][()].astype(np.int64), prepend=0)
-
-
-def _read(path: Path, name: str, item: Any, per_row: IntArray) -> tuple[npt.NDArray[Any], str]:
-    """Values of a column for all steps, and its unit."""
-    item = _without_pages(item)
-    unit = text_attribute(item, "units")
-    if _is_vectors(item):
-        same = np.array_equal(_lengths(item), per_row)
-        values = item["flattened_data"][: per_row.sum()]
-        unit = text_attribute(item["flattened_data"], "units") or unit
-    elif isinstance(item, h5py.Dataset) and item.ndim == 1:
-        same = len(item) == len(per_row)
-        values = np.repeat(item[()], per_row) if same else item[:0]
-    else:
-        raise CpunetError(f"{path}: column {name} is no array with a value per step or hit")
-    if not same:
-        raise CpunetError(f"{path}: columns {name} and edep differ in length; truncated?")
-    return np.asarray(values), unit
+    return np.diff(np.asarray(vectors["cumulative_length"][()], np.int64), prepend=0)
 
 
 def _npz_table(path: Path) -> StepTable:
@@ -315,11 +308,7 @@ def _npz_table(path: Path) -> StepTable:
     columns |= {column: arrays[name] for name, column in _ARRAYS.items()}
     if len({len(values) for values in columns.values()}) > 1:
         raise CpunetError(f"{path}: {', '.join(needed)} differ in length; truncated?")
-    return StepTable(path, _in_memory(columns))
-
-
-def _in_memory(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, ReadColumn]:
-    return {name: partial(lambda values: (values, ""), v) for name, v in columns.items()}
+    return StepTable(path, columns)
 
 
 def _csv_table(path: Path) -> StepTable:
@@ -328,20 +317,21 @@ def _csv_table(path: Path) -> StepTable:
 
     with path.open(encoding="utf-8", errors="replace") as lines:
         head = list(takewhile(lambda line: line.startswith("#"), lines))
-    title, names = "", []
+    title, names, separator = "", [], ","
     for line in head:
         key, _, value = line[1:].strip().partition(" ")
         if key == "title":
             title = value
         elif key == "column":
             names.append(value.partition(" ")[2])
-        elif key == "separator" and value != "44":
-            raise CpunetError(f"{path}: columns are not separated by commas; export again")
+        elif key == "separator":
+            separator = chr(int(value))
     try:
         # the columns of one file can be numbers, text or both
         cells: DataFrame = read_csv(
-            path, header=None, skiprows=len(head), low_memory=False, encoding_errors="replace"
-        )
+            path, sep=separator, header=None, skiprows=len(head), low_memory=False,
+            encoding_errors="replace",
+        )  # fmt: skip
     except ValueError as error:
         raise CpunetError(f"{path}: holds no steps ({error}); export again") from error
     if (n := cells.shape[1]) != len(names):
@@ -349,4 +339,4 @@ def _csv_table(path: Path) -> StepTable:
     if cells[n - 1].isna().any():
         raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
     columns = {name: cells[at].to_numpy() for at, name in enumerate(names)}
-    return StepTable(path, _in_memory(columns), g4simple=title == _G4SIMPLE_TITLE)
+    return StepTable(path, columns, g4simple=title == _G4SIMPLE_TITLE)

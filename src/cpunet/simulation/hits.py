@@ -181,12 +181,7 @@ class Hits:
         """Events with the given numbers, in their order.
 
         A number without an event yields an event without hits, so the result has one event for
-        each number.
-
-        Raises
-        ------
-        CpunetError
-            If several events share one of the numbers.
+        each number. Of several events with one number it is the first.
 
         Examples
         --------
@@ -198,11 +193,6 @@ class Hits:
         order = np.argsort(self.event_number, kind="stable")
         known = self.event_number[order]
         first, last = (np.searchsorted(known, wanted, side) for side in ("left", "right"))
-        if np.any(last - first > 1):
-            number = wanted[np.argmax(last - first > 1)]
-            raise CpunetError(
-                f"hits: several events have the number {number}; number them anew"
-            )
         found = last > first
         kept = self[order[first[found]]]
         counts = np.zeros(len(wanted), np.int64)

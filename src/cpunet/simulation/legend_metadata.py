@@ -67,14 +67,6 @@ _MEASURED = {
         "characterization.manufacturer.dl_thickness_in_mm",
     ),
 }
-# Shapes that change nothing where their radius is another one, or they have no size.
-_EXTRA = {
-    "top_groove_radius": ("bore_radius", ["top_groove_depth"]),
-    "top_cylinder_radius": ("crystal_radius", ["top_cylinder_length"]),
-    "bottom_cylinder_radius": (
-        "crystal_radius", ["bottom_cylinder_length", "bottom_transition_length"],
-    ),
-}  # fmt: skip
 # of the argon around LEGEND's detectors
 LIQUID_ARGON_K = 87.0
 _SIMULATED = ("icpc", "bege", "ppc")
@@ -137,10 +129,6 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             )
         if field := _GEOMETRY[key]:
             values[field] = value
-    for radius, (same, sizes) in _EXTRA.items():
-        if not any(map(values.get, sizes)) or values.get(radius) == values.get(same, 0):
-            for field in (radius, *sizes):
-                values.pop(field, None)
     outer, inner = (
         _number_at(diode, f"geometry.groove.radius_in_mm.{side}", f"detector {name}", 0.0)
         for side in ("outer", "inner")
