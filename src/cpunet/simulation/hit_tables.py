@@ -291,7 +291,8 @@ def _has(item: Any, *parts: str) -> bool:
 
 
 def _lengths(vectors: h5py.Group) -> IntArray:
-    return np.diff(np.asarray(vectors["cumulative_length"][()], np.int64), prepend=0)
+    ends = vectors["cumulative_length"][()].astype(np.int64)
+    return np.asarray(np.diff(ends, prepend=0), np.int64)
 
 
 def _npz_table(path: Path) -> StepTable:
