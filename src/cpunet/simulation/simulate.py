@@ -236,7 +236,15 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
         for block in chain([first], blocks):
             events = simulate_events(fields, block, settings, library)
             simulation.count(block, events)
-            _append(simulation, writer, block, events)
+            kept = events.collected_kev > 0
+            columns: dict[str, tuple[Any, str]] = {
+                "lost_energy": (events.lost_kev[kept], "keV"),
+                "n_hits": (np.diff(block.offsets)[kept], ""),
+            }
+            if any(settings.trapping_per_ns):
+                columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
+            writer.append(events.pulses(), columns)
+            writer.append_rows(HIT_TABLE, hit_columns(block[kept]))
             bar.update(len(block))
         if not writer.n_pulses:
             raise CpunetError(
@@ -255,17 +263,3 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
             "depletion_V": fields.depletion_V,
         }
         writer.annotate(SIMULATION, json.dumps(made))
-
-
-def _append(
-    simulation: Simulation, writer: PulseWriter, hits: Hits, events: EventPulses
-) -> None:
-    kept = events.collected_kev > 0
-    columns: dict[str, tuple[Any, str]] = {
-        "lost_energy": (events.lost_kev[kept], "keV"),
-        "n_hits": (np.diff(hits.offsets)[kept], ""),
-    }
-    if any(simulation.settings.trapping_per_ns):
-        columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
-    writer.append(events.pulses(), columns)
-    writer.append_rows(HIT_TABLE, hit_columns(hits[kept]))
