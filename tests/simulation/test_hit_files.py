@@ -15,7 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.simulation import hit_sources
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_files import describe_hits, hit_detectors, read_hits
+from cpunet.simulation.hit_files import describe_hits, read_hits
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.hits import HitOptions, Hits
 
@@ -127,7 +127,7 @@ def test_a_description_has_the_same_events(tmp_path: Path) -> None:
 def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
     uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
     path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")
-    assert hit_detectors(path) == ["2", "11"]
+    assert list(describe_hits(path, HitOptions(), {})) == ["2", "11"]
     with pytest.raises(
         CpunetError, match="holds detectors 2, 11; choose one with `hits_detector`"
     ):
@@ -139,7 +139,7 @@ def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
 def test_detectors_by_the_names_of_their_volumes(tmp_path: Path) -> None:
     names = np.tile(["V01", "V01", "B02"], N)
     path = written(tmp_path, "csv", steps(volume=(names, "")))
-    assert hit_detectors(path) == ["B02", "V01"]
+    assert list(describe_hits(path, HitOptions(), {})) == ["B02", "V01"]
     np.testing.assert_allclose(read_hits(path, HitOptions("B02")).energy_kev, 238.6)
 
 

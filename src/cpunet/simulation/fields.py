@@ -78,10 +78,8 @@ def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionAr
         return 0.0
     while high - low > _RESOLUTION_V:
         middle = (low + high) / 2
-        if has_pocket(middle * bias + impurities, region):
-            low = middle
-        else:
-            high = middle
+        pocket = has_pocket(middle * bias + impurities, region)
+        low, high = (middle, high) if pocket else (low, middle)
     return high
 
 
@@ -196,7 +194,7 @@ class Superposition:
         CpunetError
             If the detector is not depleted, so that the superposition does not hold.
         """
-        potential = self._sum(bias_V, impurity_scale, impurity_tilt)
+        potential = self.total_V(bias_V, impurity_scale, impurity_tilt)
         if has_pocket(potential, self.grid.region):
             depletion = self.depletion_V(impurity_scale, impurity_tilt)
             name = self.detector.name
@@ -220,45 +218,15 @@ class Superposition:
             return depletion if depletion <= HIGHEST_BIAS_V else math.inf
         return depletion_voltage(
             self.potentials.bias,
-            self._sum(0.0, impurity_scale, impurity_tilt),
+            self.total_V(0.0, impurity_scale, impurity_tilt),
             self.grid.region,
         )
 
-    def scale_of_depletion(self, depletion_V: float, impurity_tilt: float = 0.0) -> float:
-        """Scale of the impurities at which the detector just depletes at `depletion_V`.
-
-        Raises
-        ------
-        CpunetError
-            If there is no such scale.
-        """
-        low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
-        what = f"detector {self.detector.name}: {depletion_V:g} V"
-        if self._pocket(depletion_V, low, impurity_tilt):
-            raise CpunetError(
-                f"{what} do not deplete it even with {low:g} of its impurities; correct "
-                "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
-            )
-        if not self._pocket(depletion_V, high, impurity_tilt):
-            raise CpunetError(
-                f"{what} deplete it even with {high:g} times its impurities; correct "
-                "measured_depletion_V or impurity_z0_1e10_per_cm3"
-            )
-        while high / low > 1 + _SCALE_RESOLUTION:
-            middle = math.sqrt(low * high)
-            if self._pocket(depletion_V, middle, impurity_tilt):
-                high = middle
-            else:
-                low = middle
-        return low
-
-    def _sum(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
+    def total_V(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
+        """Sum of the parts in V, also where the detector is not depleted."""
         parts = self.potentials
         total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
         return total + impurity_tilt * parts.tilt if impurity_tilt else total
-
-    def _pocket(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> bool:
-        return has_pocket(self._sum(bias_V, impurity_scale, impurity_tilt), self.grid.region)
 
 
 def solve(detector: Detector, *, cache: bool = True) -> Superposition:
@@ -395,13 +363,31 @@ def scaled_to_depletion(detector: Detector) -> Detector:
             f"detector {detector.name}: no measured_depletion_V to scale its impurities by; "
             "add it to the file, or give `settings` measured_depletion_V=VALUE"
         )
-    solution = solve(detector)
-    scale = solution.scale_of_depletion(measured, detector.impurity_tilt_1e10_per_cm4)
+    solution, tilt = solve(detector), detector.impurity_tilt_1e10_per_cm4
+
+    def pocket(scale: float) -> bool:
+        return has_pocket(solution.total_V(measured, scale, tilt), solution.grid.region)
+
+    low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
+    what = f"detector {detector.name}: {measured:g} V"
+    if pocket(low):
+        raise CpunetError(
+            f"{what} do not deplete it even with {low:g} of its impurities; correct "
+            "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
+        )
+    if not pocket(high):
+        raise CpunetError(
+            f"{what} deplete it even with {high:g} times its impurities; correct "
+            "measured_depletion_V or impurity_z0_1e10_per_cm3"
+        )
+    while high / low > 1 + _SCALE_RESOLUTION:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if pocket(middle) else (middle, high)
     log.info(
-        f"{detector.name}: impurities times {scale:.4g}, so that it depletes at the measured "
+        f"{detector.name}: impurities times {low:.4g}, so that it depletes at the measured "
         f"{measured:g} V"
     )
-    return detector.model_copy(update={"impurity_scale": scale})
+    return detector.model_copy(update={"impurity_scale": low})
 
 
 def electric_field(

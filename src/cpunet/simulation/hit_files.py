@@ -54,9 +54,9 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
     path
         Path of the file. A step takes some 200 bytes of memory.
     options
-        How it is read; `hits_detector` is one of `hit_detectors`: the name of the table, or
-        the number or name in the column that tells detectors apart (``det_uid``, ``volID``,
-        ``detector``…). An unknown or missing unit is an error.
+        How it is read; `hits_detector` is the name of the table, or the number or name in the
+        column that tells detectors apart (``det_uid``, ``volID``, ``detector``…). An unknown
+        or missing unit is an error.
 
     Raises
     ------
@@ -90,12 +90,6 @@ def holds_hits(path: Path | str) -> bool:
     with suppress(CpunetError):  # the reader of pulses reports the error
         return hit_format(Path(path)) in ("tables", "csv", "npz")
     return False
-
-
-def hit_detectors(path: Path | str) -> list[str]:
-    """Names of the detectors of a file; empty if it names none."""
-    with step_tables(Path(path)) as tables:
-        return [name for name in _by_detector(tables) if name]
 
 
 def _by_detector(tables: list[StepTable]) -> dict[str, tuple[StepTable, str | None]]:
@@ -312,7 +306,8 @@ def describe_hits(
     found: dict[str, HitsInfo | str] = {}
     names: list[str | None] = [options.hits_detector]
     if options.hits_detector is None:
-        names = [*hit_detectors(path)] or names
+        with step_tables(path) as tables:
+            names = [name or None for name in _by_detector(tables)]
     for name in names:
         try:
             hits = read_hits(path, replace(options, hits_detector=name))
