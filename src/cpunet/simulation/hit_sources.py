@@ -17,7 +17,7 @@ from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.gammas.sample import EnergyWindow, GammaStatistics, simulate_gammas
+from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import LATE_NS, HitOptions, Hits
@@ -233,7 +233,7 @@ class GammaSource:
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
         workers = min(usable_cores(), _MAX_WORKERS, rounds)
-        waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
+        waiting: deque[Future[tuple[Hits, int]]] = deque()
         pool = ThreadPoolExecutor(workers)
         primaries = 0
         try:
@@ -241,15 +241,13 @@ class GammaSource:
                 if i < rounds:
                     waiting.append(pool.submit(self._round, detector, i, rounds, int(seeds[i])))
                 if i >= workers:
-                    hits, statistics = waiting.popleft().result()
+                    hits, n_primaries = waiting.popleft().result()
                     yield replace(hits, event_number=hits.event_number + primaries)
-                    primaries += statistics.n_primaries
+                    primaries += n_primaries
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _round(
-        self, detector: Detector, i: int, rounds: int, seed: int
-    ) -> tuple[Hits, GammaStatistics]:
+    def _round(self, detector: Detector, i: int, rounds: int, seed: int) -> tuple[Hits, int]:
         wanted = {w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()}
         return simulate_gammas(
             detector,

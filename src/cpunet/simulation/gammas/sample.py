@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -185,7 +184,6 @@ def simulate_block(
     low: Array,
     high: Array,
     wanted: Integers,
-    spectrum: Integers,
     rng: np.random.Generator,
     hits: Array,
     offsets: Integers,
@@ -194,9 +192,8 @@ def simulate_block(
     """Simulate until the primaries, the space for hits or the requested events run out.
 
     Energies are in MeV. An event is kept if it lies in a window (low to high) that still
-    needs events, or always if there are no windows. `wanted` is counted down. `spectrum`
-    (1 keV bins) counts every event with a deposit. Returns the numbers of primaries done and
-    of events kept.
+    needs events, or always if there are no windows. `wanted` is counted down. Returns the
+    numbers of primaries done and of events kept.
     """
     stack = np.empty((STACK_HEIGHT, 7))
     n_kept = 0
@@ -216,7 +213,6 @@ def simulate_block(
             energy += mine[i, 3]
         if energy == 0.0:
             continue
-        spectrum[min(int(energy * 1e3), len(spectrum) - 1)] += 1
         keep = len(wanted) == 0
         for line in range(len(wanted)):
             if wanted[line] > 0 and low[line] <= energy <= high[line]:
@@ -245,17 +241,6 @@ class EnergyWindow(NamedTuple):
     high_kev: float
 
 
-@dataclass(frozen=True, eq=False)
-class GammaStatistics:
-    """Counts over all primaries, including events that were not kept.
-
-    ``spectrum`` is the histogram of events with a deposit, in bins of 1 keV from 0.
-    """
-
-    n_primaries: int
-    spectrum: npt.NDArray[np.int64]
-
-
 def simulate_gammas(
     detector: Detector,
     *,
@@ -265,7 +250,7 @@ def simulate_gammas(
     seed: int,
     wanted: Mapping[EnergyWindow, int] = MappingProxyType({}),
     energy_kev: float = TL208_KEV,
-) -> tuple[Hits, GammaStatistics]:
+) -> tuple[Hits, int]:
     r"""Simulate gammas from a disc above the crystal, in vacuum.
 
     Gammas are emitted isotropically into the cone around the axis that is as wide as crystal
@@ -299,8 +284,8 @@ def simulate_gammas(
     -------
     Hits
         Events with a deposit. ``event_number`` is the number of the primary.
-    GammaStatistics
-        Counts over all primaries, including events that were not kept.
+    int
+        Number of gammas in the cone, including those of events that were not kept.
 
     Raises
     ------
@@ -324,7 +309,6 @@ def simulate_gammas(
     low = np.array([line.low_kev / 1e3 - 1e-9 for line in wanted])
     high = np.array([line.high_kev / 1e3 + 1e-9 for line in wanted])
     missing = np.array(list(wanted.values()), np.int64)
-    spectrum = np.zeros(math.ceil(energy_kev) + 1, np.int64)
     rng = np.random.default_rng(seed)
     hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
     offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
@@ -334,7 +318,7 @@ def simulate_gammas(
     while done < n_primaries and not (wanted and missing.sum() == 0):
         tried, kept = simulate_block(
             outline, source, photon_table(), electron_table(), n_primaries - done,
-            low, high, missing, spectrum, rng, hits, offsets, primaries,
+            low, high, missing, rng, hits, offsets, primaries,
         )  # fmt: skip
         ends = offsets[: kept + 1].copy()
         deposits = hits[: ends[-1]]
@@ -345,4 +329,4 @@ def simulate_gammas(
     if missing.any():
         short = ", ".join(f"{n} of {w.name}" for w, n in zip(wanted, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
-    return Hits.concatenate(blocks), GammaStatistics(done, spectrum)
+    return Hits.concatenate(blocks), done
