@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened
+from cpunet.hdf5_files import opened
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import NOT_IN_PARTS, Superposition, solve, superposed_fields
 from cpunet.simulation.geometry import Detector
@@ -58,8 +58,7 @@ class StoredSimulation:
                     f"{file}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
                     "an output of cpunet simulate or of a test stand"
                 )
-            column = content.get(f"{_PULSES}/event_number")
-            numbers = np.asarray(column[()]) if is_column(column) else np.empty(0)
+            numbers = np.asarray(content[f"{_PULSES}/event_number"][()])
         try:
             made = json.loads(text)
             detector = Detector.model_validate(made["detector"])

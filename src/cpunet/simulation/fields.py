@@ -34,12 +34,7 @@ from cpunet.outputs import written_aside
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
 from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
-from cpunet.simulation.poisson import (
-    Grid,
-    Potentials,
-    make_grid,
-    solve_potentials,
-)
+from cpunet.simulation.poisson import Grid, Potentials, make_grid, solve_potentials
 
 log = logging.getLogger(__name__)
 

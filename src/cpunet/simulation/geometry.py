@@ -129,10 +129,7 @@ class Detector(Config):
                 yield f"{side}_cylinder_radius must be above 0 and at most crystal_radius"
             if bullet and getattr(self, f"{which}_taper_length"):
                 yield f"{side}_bullet_radius and {which}_taper_length cannot both be given"
-        for one, other in (
-            ("bore_length", "bore_radius"),
-            ("ditch_depth", "ditch_thickness"),
-        ):
+        for one, other in (("bore_length", "bore_radius"), ("ditch_depth", "ditch_thickness")):
             if (getattr(self, one) > 0) != (getattr(self, other) > 0):
                 yield f"{one} and {other} must both be given, or both be 0"
         if self.top_groove_depth and not self.top_groove_radius:

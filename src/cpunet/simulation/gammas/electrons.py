@@ -134,13 +134,7 @@ def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> 
 
 @kernel(error_model="numpy")
 def put_photon(
-    stack: Array,
-    n: int,
-    x: float,
-    y: float,
-    z: float,
-    direction: UnitVector,
-    energy: float,
+    stack: Array, n: int, x: float, y: float, z: float, direction: UnitVector, energy: float
 ) -> int:
     """Push a photon onto the stack of pending photons; return the new height."""
     row = stack[n]
