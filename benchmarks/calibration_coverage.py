@@ -63,6 +63,7 @@ def main() -> None:
     parser.add_argument("--stands", type=int, default=50, help="of each group")
     parser.add_argument("--groups", type=int, nargs="+", default=range(1, len(GROUPS) + 1))
     parser.add_argument("--events", type=int, default=500, help="full-energy ones of a stand")
+    parser.add_argument("--simulated", type=int, default=1, help="times as many as measured")
     parser.add_argument("--detector", default="ppc")
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
@@ -72,7 +73,9 @@ def main() -> None:
         for group in arguments.groups:
             if (group, seed) in done:
                 continue
-            result = experiment(group, seed, arguments.detector, arguments.events)
+            result = experiment(
+                group, seed, arguments.detector, arguments.events, arguments.simulated
+            )
             with arguments.results.open("a") as file:
                 file.write(json.dumps(result) + "\n")
             found.append(result)
@@ -82,8 +85,13 @@ def main() -> None:
     _tell(found, arguments.figure)
 
 
-def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, Any]:
-    """Make a stand with physics drawn from the priors, and calibrate it."""
+def experiment(
+    group: int, seed: int, detector: str, events: int, simulated: int
+) -> dict[str, Any]:
+    """Make a stand with physics drawn from the priors, and calibrate it.
+
+    Of its measured pulses one in `simulated` is taken.
+    """
     begun, names = time.perf_counter(), GROUPS[group - 1]
     nuisances = tuple(named(name) for name in names)
     rng = np.random.default_rng([group, seed])
@@ -97,12 +105,12 @@ def experiment(group: int, seed: int, detector: str, events: int) -> dict[str, A
         stand = cpunet.make_stand(
             Path(folder) / "stand",
             detector=detector,
-            events={"FEP": events},
+            events={"FEP": events * simulated},
             shift=_shift(before, drawn),
             settings=[f"{name}={value}" for name, value in made.items()],
             seed=100 * group + seed,
         )
-        search, truth = _search(stand, before, drawn, seed)
+        search, truth = _search(stand, before, drawn, seed, simulated)
         calibrated = search.run()
     at = calibrated.problem.parameters.coordinates
     covariance = calibrated.covariance[-len(names) :, -len(names) :]
@@ -139,13 +147,13 @@ def _shift(physics: Physics, coordinates: np.ndarray) -> dict[str, float]:
 
 
 def _search(
-    stand: cpunet.Stand, before: Physics, drawn: np.ndarray, seed: int
+    stand: cpunet.Stand, before: Physics, drawn: np.ndarray, seed: int, simulated: int
 ) -> tuple[Search, np.ndarray]:
     recipe = load_recipe("fast")
     selection = parse_selection("2000-2700", recipe.peaks)
     sim = load_pulses(stand.sim, "simulated", recipe, selection).prepared
     measured = load_pulses(stand.data, "measured", recipe, selection)
-    data = measured.prepared
+    data = measured.prepared[::simulated]
     for side in (sim, data):  # the line is calibrated to its energy, whatever is trapped
         side.pulses.energy_kev[:] = LINE_KEV
     noise, _ = measured_noise(measured, recipe.preparation)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable
 from functools import wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.container import Container
     from matplotlib.figure import Figure
 
@@ -32,11 +30,8 @@ COLOURS = {
 }
 SPARE_COLOURS = ("#8C6D1F", "#5B3A8C", "#9E2A2B", "#4F6D7A", "#B8A200")
 DATA_FILL = "0.80"
-RIGHT = 0.15  # margin of figures in inches
 
 GROUP = "method-"  # begins the group id of what a figure draws of a method
-# suffix of the name of a method without noise
-NO_NOISE = "_no_noise"
 
 LABELS = {
     "data": "Data",
@@ -49,6 +44,9 @@ LABELS = {
     "superpulse": "Superpulse ratio",
     "ceiling": "Ceiling",
 }
+
+# two panels above each other, the lower one smaller
+STACKED: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
 
 _STYLE = {
     "font.size": 10.0,
@@ -65,7 +63,6 @@ _STYLE = {
     "figure.constrained_layout.use": True,
     "axes.titley": 1.0,  # else the title is placed by the labels, which takes long
 }
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
@@ -74,36 +71,18 @@ def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
     @wraps(make_figure)
     def in_style(*args: P.args, **kwargs: P.kwargs) -> R:
         from matplotlib import style
-        from matplotlib.figure import Figure
 
         # based on matplotlib's defaults, so that user settings do not change a report
         with style.context(["default", _STYLE]):
-            made = make_figure(*args, **kwargs)
-            if isinstance(made, Figure):
-                _group_legends(made)
-            return made
+            return make_figure(*args, **kwargs)
 
     return in_style
 
 
-def colours(methods: Iterable[str]) -> Mapping[str, str]:
-    """Colour of each method: its own, or else the next spare one.
-
-    Examples
-    --------
-    >>> colours(["data", "other"])
-    {'data': 'black', 'other': '#8C6D1F'}
-    """
-    methods = list(methods)
-    others = [method for method in methods if method not in COLOURS]
-    spare = {m: SPARE_COLOURS[i % len(SPARE_COLOURS)] for i, m in enumerate(others)}
-    return {method: COLOURS.get(method) or spare[method] for method in methods}
-
-
-def line_look(method: str, colour: str) -> dict[str, Any]:
+def line_look(method: str) -> dict[str, Any]:
     """Look of a line; that of the data is broad and grey, so that it shows below others."""
-    look = {"color": "0.65", "linewidth": 4.0} if method == "data" else {"color": colour}
-    return look | {"gid": GROUP + method}
+    data = {"color": "0.65", "linewidth": 4.0}
+    return (data if method == "data" else {"color": COLOURS[method]}) | {"gid": GROUP + method}
 
 
 def group(drawn: Container, method: str) -> None:
@@ -113,63 +92,13 @@ def group(drawn: Container, method: str) -> None:
 
 
 def panels(
-    size: tuple[float, float],
-    rows: int = 1,
-    columns: int = 1,
-    *,
-    left: float = 0.85,
-    top: float = 0.35,
-    bottom: float = 0.5,
-    between: tuple[float, float] = (0.65, 0.4),
-    **how: Any,
+    size: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any
 ) -> tuple[Figure, npt.NDArray[Any]]:
-    """A figure with panels in fixed places; to fit them to labels takes as long as to draw.
-
-    Parameters
-    ----------
-    size
-        Width and height of the figure in inches.
-    rows, columns
-        Numbers of panels.
-    left, top, bottom
-        Margins in inches.
-    between
-        Gaps in inches between columns and between rows.
-    how
-        Further arguments of `Figure.subplots`.
-    """
+    """A figure of a size in inches with a grid of panels, made as `Figure.subplots` says."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size)
-    figure.set_layout_engine("none")
-    width, height = size[0] - left - RIGHT, size[1] - top - bottom
-    of_one = [
-        (whole - (n - 1) * gap) / n
-        for whole, n, gap in zip((width, height), (columns, rows), between, strict=True)
-    ]
-    places = {
-        "left": left / size[0],
-        "right": 1 - RIGHT / size[0],
-        "bottom": bottom / size[1],
-        "top": 1 - top / size[1],
-        "wspace": between[0] / of_one[0],
-        "hspace": between[1] / of_one[1],
-    }
-    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=places, **how)
-
-
-def stacked(
-    size: tuple[float, float], left: float = 1.05, top: float = 0.35
-) -> tuple[Figure, Any, Any]:
-    """A figure with two panels above each other, the lower one smaller, see `panels`."""
-    how: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
-    figure, ((above,), (below,)) = panels(size, 2, left=left, top=top, between=(0, 0.15), **how)
-    return figure, above, below
-
-
-def legend_height(entries: int, columns: int = 1, *, titled: bool = True) -> float:
-    """Room in inches for `legend_above`."""
-    return 0.16 + 0.178 * -(-entries // columns) + 0.2 * titled
+    return figure, figure.subplots(rows, columns, squeeze=False, **how)
 
 
 def legend_above(
@@ -185,80 +114,15 @@ def legend_above(
     )
 
 
-def steps(
-    axes: Axes,
-    heights: Any,
-    edges: Any,
-    method: str,
-    colour: str,
-    text: str,
-    baseline: float = 0,
-) -> None:
+def steps(axes: Axes, heights: Any, edges: Any, method: str, text: str) -> None:
     """Draw a histogram of a method: that of the data filled, others as a line."""
+    colour = COLOURS[method]
     look: dict[str, Any] = {"fill": False, "edgecolor": colour, "linewidth": 1.5, "zorder": 2}
     if method == "data":
         look = {"fill": True, "facecolor": DATA_FILL, "edgecolor": colour, "linewidth": 0.8}
-    gid = GROUP + method
-    axes.stairs(heights, edges, baseline=baseline, label=text, gid=gid, **look)
-
-
-def logarithmic(axis: Axis) -> None:
-    """Label a logarithmic axis in plain text, which is drawn faster than formulas."""
-    from matplotlib.ticker import LogFormatter
-
-    class Powers(LogFormatter):
-        def __call__(self, x: float, pos: int | None = None) -> str:
-            return _power(x) if super().__call__(x, pos) else ""
-
-    axis.set_major_formatter(Powers())
-    axis.set_minor_formatter(Powers(minor_thresholds=(2, 0.5)))
-
-
-def _power(value: float) -> str:
-    """A value as ``0.2`` or ``3×10⁻⁸``."""
-    digit, _, exponent = f"{value:.0e}".partition("e")
-    if abs(int(exponent)) <= 2:
-        return f"{value:g}"
-    return f"{digit}×10".removeprefix("1×") + str(int(exponent)).translate(_SUPERSCRIPT)
-
-
-def linear_within(axes: Axes, limit: float) -> None:
-    """Make a y axis logarithmic, but linear up to ± `limit`.
-
-    Small differences then show beside those of an untranslated simulation.
-    """
-    axes.set_yscale("symlog", linthresh=limit)
-    axes.yaxis.set_major_formatter("{x:g}")
+    axes.stairs(heights, edges, label=text, gid=GROUP + method, **look)
 
 
 def label(method: str) -> str:
     """Label of a method in legends."""
-    name = method.removesuffix(NO_NOISE)
-    return LABELS.get(name, name) + (", no noise" if name != method else "")
-
-
-def _group_legends(figure: Figure) -> None:
-    """Mark the entries of legends, which begin with the label of a method, as its own."""
-    from matplotlib.legend import Legend
-    from matplotlib.offsetbox import HPacker, TextArea
-
-    artists = list(_without_ticks(figure))
-    ids = {artist.get_gid() or "" for artist in artists}
-    by_label = {label(i.removeprefix(GROUP)): i for i in sorted(ids) if i.startswith(GROUP)}
-    for legend in (artist for artist in artists if isinstance(artist, Legend)):
-        for entry in legend.findobj(HPacker):
-            for text in entry.get_children():
-                if isinstance(text, TextArea):
-                    begins = [name for name in by_label if text.get_text().startswith(name)]
-                    for artist in entry.findobj() if begins else ():
-                        artist.set_gid(by_label[max(begins, key=len)])
-
-
-def _without_ticks(artist: Artist) -> Iterator[Artist]:
-    """An artist and its children, but no scales: asked for their ticks, they make them."""
-    from matplotlib.axis import Axis
-
-    yield artist
-    for child in artist.get_children():
-        if not isinstance(child, Axis):
-            yield from _without_ticks(child)
+    return LABELS.get(method, method)

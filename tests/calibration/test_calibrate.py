@@ -164,7 +164,6 @@ def test_a_plan_is_told_before_any_fit(stand, free, tmp_path, capsys):
         ({"prior": ["temperature=90"]}, "expected NAME=VALUE±ERROR"),
         ({"prior": {"temperature": (90, 0)}}, "an error above 0"),
         ({"prior": {"mood": (1, 2)}}, "'mood': no such parameter of the physics"),
-        ({"free": ["bias"], "fix": ["bias"]}, "all of it .* is fixed"),
         ({"recipe": "paper"}, "fits no readout chain"),
         ({"read": cpunet.ReadOptions(data_table="all")}, "a detector with physics of its own"),
     ],

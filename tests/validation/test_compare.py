@@ -13,9 +13,8 @@ import pytest
 
 from cpunet.cli import run
 from cpunet.errors import CpunetError
-from cpunet.validation.compare import compare
+from cpunet.validation.compare import Comparison, compare
 from cpunet.validation.report import Report
-from cpunet.validation.side_by_side import comparison_page, score_figure, side_by_side
 
 
 def scores(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, Any]:
@@ -43,8 +42,12 @@ def scores(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, 
     }
 
 
+def of(**runs: dict[str, Any]) -> Comparison:
+    return Comparison("ren", runs)
+
+
 def test_rows_and_what_they_show():
-    table = side_by_side({"a": scores(), "b": scores(85.0, 0.45, -0.5)})
+    table = of(a=scores(), b=scores(85.0, 0.45, -0.5))
     assert [(row.peak, row.score.split(":")[0].split(" [")[0]) for row in table.rows] == [
         ("SEP", "drift time"),
         ("SEP", "tail slope"),
@@ -59,7 +62,8 @@ def test_rows_and_what_they_show():
     assert shown[4] == ["+1.00 ± 2.00", "-0.50 ± 2.00"]
     # an AUC of 0.52 is closer to chance than one of 0.45
     assert [set(row.best) for row in table.rows] == [{1}, {1}, {0}, {0, 1}, {1}]
-    assert table.notes == ()
+    assert table.note == ""
+    assert table.scores.loc["SEP", "edge RMSE [10⁻³]"].tolist() == [0.6, 0.6]
 
 
 def test_what_a_run_lacks_is_a_dash():
@@ -69,7 +73,7 @@ def test_what_a_run_lacks_is_a_dash():
     del sep["parameters"]["tail_slope"]
     sep["parameters"]["drift_time"]["iou"].pop("ceiling")
     sep["parameters"]["drift_time"].pop("iou_std")
-    table = side_by_side({"old": old, "new": scores()})
+    table = of(old=old, new=scores())
     assert [row.cells[0].text for row in table.rows] == ["80.0", "–", "–", "–", "–"]
     assert [set(row.best) for row in table.rows] == [{0, 1}, set(), set(), set(), set()]
 
@@ -77,79 +81,57 @@ def test_what_a_run_lacks_is_a_dash():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda m: m["peaks"]["SEP"].update(n_data=901), "number of measured pulses"),
-        (lambda m: m["peaks"]["SEP"].update(n_sim=1), "number of simulated pulses"),
+        (lambda m: m["peaks"]["SEP"].update(n_data=901), "numbers of measured pulses"),
+        (lambda m: m["peaks"]["SEP"].update(n_sim=1), "numbers of simulated pulses"),
         (lambda m: m["rejections"]["data"].update(saturated=4), "rejections of measured"),
         (lambda m: m["rejections"].pop("sim"), "rejections of simulated"),
         (lambda m: m["peaks"].update(DEP={}), "peaks"),
+        (lambda m: m.update(compared={"detector": "V01"}), "detectors"),
     ],
 )
 def test_other_data_are_noted(change, words):
     other = copy.deepcopy(scores())
     change(other)
-    notes = side_by_side({"a": scores(), "b": other, "c": scores()}).notes
-    assert len(notes) == 1
-    assert notes[0].startswith("a and b were scored on different pulses (")
-    assert words in notes[0]
+    note = of(a=scores(), b=other, c=scores()).note
+    assert note.startswith("b: other pulses than those of a (")
+    assert words in note
 
 
 def test_a_method_that_nobody_scored_names_those_there_are():
-    with pytest.raises(
-        CpunetError, match=r"^a, b: no score of the method xx; there are ren, rc$"
-    ):
-        side_by_side({"a": scores(), "b": scores()}, method="xx")
+    one = Report({"compared": {"run": "a"}} | scores(), {})
+    with pytest.raises(CpunetError, match=r"^a: no score of the method xx; there are ren, rc$"):
+        compare(one, method="xx")
     with pytest.raises(CpunetError, match="nothing is scored there"):
-        side_by_side({"a": {"peaks": {}}})
+        compare(Report({"compared": {"run": "a"}, "peaks": {}}, {}))
 
 
-def table_page(runs: dict[str, Any]) -> str:
-    return comparison_page(side_by_side(runs), runs, {})
+def table_page(folder: Path, runs: dict[str, Any]) -> str:
+    Comparison("ren", runs).save(folder / "page.html")
+    return (folder / "page.html").read_text("utf-8")
 
 
 def seed(iou: float, **training: Any) -> dict[str, Any]:
     return scores(iou) | {"training": {"recipe": "fast", "peak": "FEP"} | training}
 
 
-def test_scores_scatter_over_runs_of_one_recipe():
-    runs = {"0": seed(80.0), "1": seed(84.0), "2": seed(81.0), "other": seed(9, recipe="paper")}
+def test_scores_scatter_over_runs_of_one_recipe(tmp_path):
+    runs = {"0": seed(80.0), "1": seed(84.0), "2": seed(81.0)}
     del runs["2"]["peaks"]["SEP"]["two_sample"]
-    over = side_by_side(runs).over_runs
-    assert over.names == ("3 runs of fast, FEP",)
-    assert [row.cells[0].text for row in over.rows] == [
-        "81.0 ± 2.1 (80.0 – 84.0)",
-        "81.0 ± 2.1 (80.0 – 84.0)",
-        "0.520 ± 0.000 (0.520 – 0.520), 1 missing",
-        "0.600 ± 0.00 (0.600 – 0.600)",
-        "+1.00 ± 0.00 (+1.00 – +1.00)",
-    ]
-    assert "<td>81.0\u00a0±\u00a02.1 (80.0 – 84.0)</td>" in table_page(runs)
-    apart = {"0": seed(80.0), "1": seed(80.0, peak="SEP")}
-    assert side_by_side(apart).over_runs is None
+    over = ["81.0 ± 2.1", "81.0 ± 2.1", "0.520 ± 0.000", "0.600 ± 0.00", "+1.00 ± 0.00"]
+    assert [row.over for row in Comparison("ren", runs).rows] == over
+    assert "<td>median ± std</td><td>81.0 ± 2.1</td>" in table_page(tmp_path, runs)
+    assert "median ± std" in str(Comparison("ren", runs))
+    for other in ({"recipe": "paper"}, {"peak": "SEP"}):
+        assert not Comparison("ren", runs | {"other": seed(9, **other)}).of_seeds
 
 
-def test_the_page_is_whole_and_alone():
+def test_the_page_is_whole_and_alone(tmp_path):
     name = 'a<b>&"$\\c$"'
-    page = table_page({name: scores(), "other": scores(85.0)})
+    page = table_page(tmp_path, {name: scores(), "other": scores(85.0)})
     assert "<b>&" not in page
     assert re.search(r"https?:|src=|href=\"[^#]|url\([^#]|<script", page) is None
-    assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in page
-    assert "<td>80.0\u00a0±\u00a02.5 (88.0)</td>" in page
-    assert page.count("<svg") == 1  # of the peak
-
-
-def test_dots_and_bars_stand_where_their_scores_are():
-    old = scores()
-    del old["peaks"]["SEP"]["two_sample"]
-    table = side_by_side({"old": old, "new": scores(84.0)})
-    panels = score_figure(table.rows, table.names).axes[: len(table.rows)]
-    first, classifier = panels[0], panels[2]
-    assert first.get_xlabel() == "drift time: IoU [%] (ceiling)"
-    drawn = [line.get_xydata().tolist() for line in first.lines]
-    assert [line[1] for line in drawn[2::3]] == [[80.0, 0], [84.0, 1]]
-    assert [x for x, _ in drawn[0]] == [86.5, 89.5]  # 88 ± 1.5
-    assert [x for x, _ in drawn[2]] == [77.5, 80.0, 82.5]
-    assert [text.get_text() for text in classifier.texts] == ["no score"]
-    assert [text.get_text() for text in first.get_yticklabels()] == ["old", "new"]
+    assert "<td><b>85.0 ± 2.5 (88.0)</b></td>" in page
+    assert "<td>80.0 ± 2.5 (88.0)</td>" in page
 
 
 def metrics(*ious: float) -> dict[str, Any]:
@@ -164,7 +146,7 @@ def metrics(*ious: float) -> dict[str, Any]:
     tested = {"ren": {"auc": 0.51, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}}
     return {
         "peaks": {"SEP": {"parameters": parameters, "two_sample": tested}},
-        "training": {"recipe": "fast", "peak": "FEP", "device": "cpu"},
+        "compared": {"trained": "recipe fast on FEP"},
     }
 
 
@@ -192,7 +174,7 @@ def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
     assert '<td class="off">3 of 5 off</td>' in page
     assert "<td>0 of 3 off</td>" in page
     assert "off by 19.0 sigma (IoU 50.0 of 88.0)" in page
-    assert "recipe fast, trained on FEP, on cpu" in page
+    assert "trained: recipe fast on FEP" in page
     links = re.findall(r'href="([^#].*?)"', page)
     targets = {(tmp_path / "pages" / unquote(link)).resolve() for link in links}
     assert targets == {tmp_path / name / "report" / "report.html" for name in runs}
@@ -226,20 +208,20 @@ def header(compared: object) -> list[str]:
 
 
 def test_a_report_in_memory_is_compared(two):
-    run = {"compared": {"run": "kept"}} | metrics(70.0)
+    run = metrics(70.0) | {"compared": {"run": "kept"}}
     assert header(compare(Report(run, {}), two[0])) == ["peak", "score", "kept", "first"]
 
 
 def test_demo_folders_and_files(two, tmp_path):
     report(tmp_path / "demo" / "report", 70.0)
     made = compare(tmp_path / "demo", two[0] / "metrics.json")
-    assert made.table.names == ("demo", "first")
+    assert [*made.metrics] == ["demo", "first"]
 
 
 def test_names_are_made_unique(tmp_path):
     folders = [report(tmp_path / run / "report", 80.0) for run in ("a", "b")]
-    assert compare(*folders).table.names == ("a", "b")
-    assert compare(folders[0], folders[0]).table.names == ("report (1)", "report (2)")
+    assert [*compare(*folders).metrics] == ["a", "b"]
+    assert [*compare(folders[0], folders[0]).metrics] == ["report (1)", "report (2)"]
 
 
 def test_the_command(two, tmp_path, capsys):
@@ -249,7 +231,7 @@ def test_the_command(two, tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == str(page)
     assert [path.name for path in page.parent.iterdir()] == [page.name]
     first = page.read_text()
-    assert "<b>85.0\u00a0±\u00a02.5 (88.0)</b>" in first
+    assert "<b>85.0 ± 2.5 (88.0)</b>" in first
     with pytest.raises(CpunetError, match="exists already"):
         run(words)
     assert run([*words, "--method", "ren", "--force"]) == 0

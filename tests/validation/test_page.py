@@ -197,10 +197,9 @@ def test_verdicts_in_words(tmp_path):
 def test_survival_by_ranges_and_the_noise_are_tables(tmp_path):
     survived = {"survival": 33.333, "survival_std": 3.47, "peak": 400}
     ranges = {"Qbb": {"data": survived, "ren": {"missing": "there is no cut", "peak": 2}}}
-    noise = {
-        "SEP": {"ren": {"n": 90, "samples": 200, "rms": 1.0, "rms_std": 0.1, "sigma": -1.5}}
-    }
-    found = {"ae_details": {"survival by energy range": ranges}, "noise": noise}
+    noise = {"ren": {"n": 90, "samples": 200, "rms": 1.0, "rms_std": 0.1, "sigma": -1.5}}
+    peaks = {"SEP": {"missing": "no pulses", "noise": noise}}
+    found = {"ae_details": {"survival by energy range": ranges}, "peaks": peaks}
     write_report(tmp_path, found, {}, [])
     rows = re.findall(r"<tr>(<td.*?)</tr>", (tmp_path / "report.html").read_text())
     told = [re.findall(r">([^<>]+)</td>", row) for row in rows]
@@ -282,7 +281,7 @@ def two_methods() -> Figure:
     figure = Figure()
     axes = figure.subplots()
     for method, text in (("data", "Data, n = 3"), ("ren", "REN translation, n = 3")):
-        axes.plot([1, 2, len(text)], label=text, **line_look(method, "blue"))
+        axes.plot([1, 2, len(text)], label=text, **line_look(method))
     axes.legend()
     return figure
 
@@ -296,9 +295,9 @@ def test_a_click_hides_a_method_in_all_figures(tmp_path):
     page.write_text(page.read_text().replace("</body>", SELFTEST))
     seen, log = run_page(page, width=500)
     assert "CONSOLE" not in log
-    # a line, and in the legend a line and a text, in each of two figures
-    assert seen["before"] == [[True] * 6, [True] * 6, "true"]
-    assert seen["hidden"] == [[False] * 6, [True] * 6, "false"]
+    # a line in each of two figures
+    assert seen["before"] == [[True] * 2, [True] * 2, "true"]
+    assert seen["hidden"] == [[False] * 2, [True] * 2, "false"]
     assert seen["again"] == seen["before"]
     assert seen["widths"][0] <= seen["widths"][1]
     assert seen["requests"] == 0

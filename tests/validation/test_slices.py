@@ -13,13 +13,12 @@ from scipy.special import ndtr
 from cpunet.errors import CpunetError
 from cpunet.pulses.parameters import align_half_maximum
 from cpunet.validation.methods import true_responses
+from cpunet.validation.run_figures import shape_figure
 from cpunet.validation.slices import (
     AFTER,
     BEFORE,
     Slices,
     slice_edges,
-    slice_figure,
-    slice_residuals,
     slice_table,
     sliced,
 )
@@ -118,7 +117,6 @@ def test_few_pulses_are_missing_with_the_reason():
     rows = slice_table({"data": data, "raw": method}, DT).slices["raw"]
     assert rows[0].missing == "9 pulses beside 30 measured ones (at least 10 are needed)"
     assert rows[1].missing is None
-    assert slice_residuals(data, method)[0] is None
 
 
 def test_nothing_in_a_slice_is_no_failure():
@@ -129,19 +127,9 @@ def test_nothing_in_a_slice_is_no_failure():
     table = slice_table({"data": data, "raw": none}, DT)
     assert table.left_out["raw"]["outside"] == 40
     assert all(row.n == 0 and row.missing for row in table.slices["raw"])
-    require_drawn(slice_figure({"data": data, "raw": none}, DT, "SEP"))
-
-
-def test_the_figure_has_a_column_for_each_slice():
-    rng = np.random.default_rng(7)
-    edges = np.linspace(20, 120, 5) * DT
-    sets = {"data": drawn(rng, 100, edges), "ren": drawn(rng, 120, edges, width=6.0)}
-    figure = slice_figure(sets, DT, "SEP")
-    require_drawn(figure)
-    assert len(figure.axes) == 8
-    shown = figure.axes[4].lines[0].get_ydata()
-    expected = 100 * slice_residuals(sets["data"], sets["ren"])[0].difference
-    np.testing.assert_allclose(shown, expected)
+    slices = zip(data.pulses, none.pulses, strict=True)
+    columns = {str(i): {"data": one, "raw": other} for i, (one, other) in enumerate(slices)}
+    require_drawn(shape_figure(columns, DT, "SEP"))
 
 
 TIME = np.arange(800.0)

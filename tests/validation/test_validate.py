@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ import pytest
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.published import UNKNOWN
@@ -85,9 +85,8 @@ def whole(run, files) -> Evaluation:
 def test_a_sample_of_both_sides_is_compared(run, files) -> None:
     how = {"baselines": False, "device": "cpu", "max_pulses": 250}
     few = evaluate(run, files["sim"], files["data"], **how)
-    assert len(few.sim.prepared) == 250
+    assert len(few.sets[0].translations.windows["raw"]) == 250
     assert few.metrics["rejections"]["sim"]["not_drawn"] == 130
-    assert len(few.data.energies_kev) == 380
 
 
 def test_what_is_compared(whole) -> None:
@@ -99,28 +98,29 @@ def test_what_is_compared(whole) -> None:
     assert ranges["SEP"]["data"]["sideband"] == 5
     assert ranges["FEP"]["data"]["sideband"] == 0
     assert {"noise", "noise_spectrum"} <= set(whole.metrics["verdicts"]["table"]["SEP"]["ren"])
-    assert whole.metrics["noise"]["SEP"]["ren"]["rms_ratio"] == pytest.approx(1, abs=0.1)
+    noise = whole.metrics["peaks"]["SEP"]["noise"]["ren"]
+    assert noise["rms_ratio"] == pytest.approx(1, abs=0.1)
     assert set(whole.metrics["drift_slices"]) == {"FEP", "SEP", "DEP"}
     assert [line.split(":")[0] for line in whole.metrics["verdicts"]["summary"]] == [
         "REN, FEP",
         "REN, SEP",
         "REN, DEP",
     ]
-    # energies of all pulses of the file are there, for its spectrum
-    assert len(whole.data.energies_kev) == 380
 
 
 @pytest.mark.thorough
 def test_every_figure_can_be_drawn(whole) -> None:
     made = drawings(whole)
-    assert {"spectrum", "FEP forward cycle", "SEP single pulse", "losses"} <= set(made)
+    assert {"FEP mean pulse", "SEP superpulses", "SEP single pulse", "losses"} <= set(made)
+    assert {"FEP cycle of simulation", "FEP cycle of data"} <= set(made)
     for drawing in made.values():
         assert drawing().axes
 
 
-def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(whole, run) -> None:
+def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) -> None:
+    sides = [SimpleNamespace(path=Path(f), detector=None, read_as={}) for f in ("sim", "data")]
     unknown = {"seed": None, "sim": UNKNOWN, "data": UNKNOWN, "started": ""}
-    told = _compared(run.model_copy(update=unknown), whole.sim, whole.data)
+    told = _compared(run.model_copy(update=unknown), *sides)
     assert told["trained"] == (
         "recipe fast on FEP, an unknown number of simulated and an unknown number of measured "
         "pulses"
@@ -157,22 +157,15 @@ def found(run, files, tmp_path_factory):
 
 
 @pytest.mark.thorough
-def test_numbers_without_noise_are_those_of_the_windows(found):
-    peak = max(found.sets, key=lambda peak: len(peak.sim_rows))
-    every = np.arange(len(peak.sim_rows))
-    windows = peak.without_noise(every)
-    recipe = found.ren.recipe
+def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
+    peak = max(found.sets, key=lambda peak: len(peak.rows["raw"]))
+    rows, translations = peak.known_to_all(), peak.translations
+    assert rows.tolist() == peak.rows["raw"].tolist()
+    each = [translations.without_noise(row) for row in rows]
+    windows = {method: np.concatenate([one[method] for one in each]) for method in each[0]}
     assert set(windows) == {"raw", "rc", "gauss_exp", "superpulse", "ren", "truth"}
-    assert peak.known_to_all().tolist() == every.tolist()
-    kept = peak.noise_free_parameters()
-    assert set(kept) == {f"{m}_no_noise" for m in windows if m not in ("raw", "ren")}
-    for method, values in kept.items():
-        pulses = Pulses.of(windows[method.removesuffix("_no_noise")], dt_ns=peak.dt_ns)
-        wanted = pulse_parameters(pulses, recipe.preparation, recipe.scores)
-        for name, expected in wanted.items():
-            np.testing.assert_allclose(values[name], expected, rtol=1e-4)
     scores = peak.paired_scores()
-    squares = pair_squares(windows, windows["truth"], recipe.scores.edge_samples)
+    squares = pair_squares(windows, windows["truth"], found.run.recipe.scores.edge_samples)
     for method, score in scores.items():
         assert score == pytest.approx(scores_of_squares(squares[method]), rel=1e-4)
     assert scores["ren"]["edge_rmse"] < scores["raw"]["edge_rmse"]
@@ -180,17 +173,18 @@ def test_numbers_without_noise_are_those_of_the_windows(found):
 
 def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     peak = found.sets[0]
-    pulses = {method: peak.pulses(method) for method in peak.methods}
+    pulses = {method: peak.windows(method) for method in peak.rows}
     # the others have no noise: these baselines are too short for its spectrum
     assert list(pulses) == ["data", "raw", "ren"]
     assert set(found.metrics["baseline_methods"]["missing"]) == {"noise"}
-    assert all(len(p) == len(peak.sim_rows) for m, p in pulses.items() if m != "data")
-    again = found.ren.apply(
-        found.sim.prepared.pulses.waveforms,
-        energy_kev=found.sim.prepared.pulses.energy_kev,
-        generator=found.ren.seeded(0),
+    raw = peak.rows["raw"]
+    assert all(len(p) == len(raw) for m, p in pulses.items() if m != "data")
+    again = peak.translations.ren.apply(
+        peak.translations.windows["raw"],
+        energy_kev=peak.translations.energy_kev["raw"],
+        generator=peak.translations.ren.seeded(0),
     )
-    np.testing.assert_array_equal(pulses["ren"].waveforms, again[peak.sim_rows])
+    np.testing.assert_array_equal(pulses["ren"], again[raw])
 
 
 @pytest.fixture(scope="module")

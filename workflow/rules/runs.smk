@@ -18,7 +18,6 @@ def calibration_options(wildcards):
         of_data = {}  # merged
     return options(
         free=words["free"] or None,
-        fix=words["fix"] or None,
         prior=words["prior"],
         events=words["events"],
         peak=training["peak"],

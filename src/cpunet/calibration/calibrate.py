@@ -77,7 +77,6 @@ def calibrate(
     out: str | Path | None = None,
     *,
     free: Sequence[str] = (),
-    fix: Sequence[str] = (),
     prior: Sequence[str] | Mapping[str, tuple[float, float]] = (),
     plan: bool = False,
     peak: str = "FEP",
@@ -105,8 +104,6 @@ def calibrate(
         Run folder to make; may be left out with a plan.
     free
         Parameters, as temperature,impurity; by default those that the data tell.
-    fix
-        Parameters that stay as simulated.
     prior
         NAME=VALUE±ERROR (or +-) of a parameter or of depletion_voltage (repeatable).
     plan
@@ -153,7 +150,7 @@ def calibrate(
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
     _ = settings.chain  # without one there is nothing to calibrate with a detector
-    given = settings, Freedom.of(free, fix, prior), peak, events, require_seed(seed)
+    given = settings, Freedom.of(free, prior), peak, events, require_seed(seed)
     act = partial(_calibrated, given, plan, force)
     if sides[1].table != ALL:
         return act("", sides, target)

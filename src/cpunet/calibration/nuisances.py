@@ -272,7 +272,7 @@ class Physics:
         told = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
         source = (
             f"detector {self.detector.name}: with {told} there can be none; narrow a `prior`, "
-            "or `fix` one of them"
+            "or leave one of them out of `free`"
         )
         return (
             checked(Detector, of_detector, source),
@@ -332,7 +332,6 @@ class Freedom:
     def of(
         cls,
         free: str | Sequence[str] = (),
-        fix: str | Sequence[str] = (),
         prior: Sequence[str] | Mapping[str, tuple[float, float]] = (),
     ) -> Freedom:
         """What is free, from names and priors as users give them.
@@ -345,16 +344,12 @@ class Freedom:
 
         Examples
         --------
-        >>> Freedom.of(fix="tilt", prior=["temperature=90±0.5"]).priors
+        >>> Freedom.of(prior=["temperature=90±0.5"]).priors
         {'temperature_K': (90.0, 0.5)}
         """
-        chosen, stay = _parameters(free), _parameters(fix)
+        chosen = _parameters(free)
         # another lithium layer requires new field solutions: only on request
-        usual = (n for n in NUISANCES if n.name != "li_thickness_mm")
-        kept = tuple(n for n in chosen or usual if n not in stay)
-        if chosen and not kept:
-            names = ", ".join(n.name for n in chosen)
-            raise CpunetError(f"`free`: all of it ({names}) is fixed", "leave something free")
+        kept = chosen or tuple(n for n in NUISANCES if n.name != "li_thickness_mm")
         given = prior.items() if isinstance(prior, Mapping) else map(_split, prior)
         priors = dict(_prior(name, *of_name) for name, of_name in given)
         without_use = priors.keys() - {DEPLETION, *(n.name for n in kept)}
@@ -389,7 +384,7 @@ def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]
             f"detector {physics.detector.name}: within the priors it depletes at "
             f"{max(needed):.0f} V, its bias is {bias:.0f} V",
             "correct bias_V or the impurities and simulate again, give a `prior` with which it "
-            "depletes, or `fix` impurity",
+            "depletes, or leave impurity out of `free`",
         )
 
 

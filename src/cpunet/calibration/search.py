@@ -197,7 +197,7 @@ class Search:
         else:
             raise CpunetError(
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
-                "that cannot be simulated; narrow a `prior`, or `fix` a parameter"
+                "that cannot be simulated; narrow a `prior`, or leave a parameter out of `free`"
             )
         outdated = there.outdated(free, farthest / FARTHEST)
         return there.again(outdated) if outdated else there

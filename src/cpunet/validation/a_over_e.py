@@ -13,33 +13,17 @@ Only the low side is cut; events near the contacts have a high A/E and need anot
 Under a gamma line there is background, mostly Compton events of other lines, which the cut
 removes more or less than the events of the line.  For the survival by ranges of energy it is
 estimated from sidebands and subtracted.
-
-The distribution of A/E can agree although its dependence on the position in the detector does
-not, since deviations can cancel; so A/E is compared in bins of the drift time as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
-from cpunet.plotting import (
-    GROUP,
-    colours,
-    group,
-    label,
-    legend_above,
-    legend_height,
-    linear_within,
-    stacked,
-    styled,
-)
-from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.parameters import Values
 from cpunet.validation.comparisons import Missing, resampled_quantiles
 
 Range = tuple[float, float]
@@ -51,11 +35,6 @@ ACCEPTANCE = 0.9  # fraction of the DEP that survives
 MIN_EVENTS = 20  # events of the DEP: two below the cut
 DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
-QUANTILES = {"q16": 0.16, "median": 0.5, "q84": 0.84}
-MIN_IN_BIN = 10  # minimum events of a bin of drift time for errors of its quantiles
-TIME_BINS = 8
-LINEAR = 1.0  # percent, up to which the scale of the ratios is linear if some are large
-FAR = 5  # times LINEAR: larger ratios count as large
 
 
 @dataclass(frozen=True)
@@ -112,50 +91,6 @@ class RangeSurvival:
     survival: float | None = None
     survival_std: float | None = None
     missing: str | None = None
-
-
-@dataclass(frozen=True)
-class TimeBin:
-    """A/E of the events of a bin of drift time.
-
-    Attributes
-    ----------
-    n, time_ns
-        Number of events, and their median drift time.
-    q16, median, q84
-        Quantiles of A/E, with their errors.
-    missing
-        Reason why there are none.
-    """
-
-    n: int
-    time_ns: float | None = None
-    q16: float | None = None
-    q16_error: float | None = None
-    median: float | None = None
-    median_error: float | None = None
-    q84: float | None = None
-    q84_error: float | None = None
-    missing: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class AgainstTime:
-    """A/E in bins of drift time.
-
-    Attributes
-    ----------
-    edges_ns
-        Edges of the bins.
-    left_out
-        Number of events by method outside the edges, or without finite amplitude or time.
-    methods
-        Bins of each method and of the data.
-    """
-
-    edges_ns: Values
-    left_out: dict[str, int]
-    methods: Mapping[str, list[TimeBin]]
 
 
 def ae_survival(
@@ -390,104 +325,3 @@ def _within(energy_kev: Values, ranges: Sequence[Range]) -> npt.NDArray[np.bool_
     for low, high in ranges:
         inside |= (energy_kev >= low) & (energy_kev < high)
     return inside
-
-
-def ae_against_drift_time(
-    amplitude: Mapping[str, Values], drift_time: Mapping[str, Values], bins: int = TIME_BINS
-) -> AgainstTime:
-    """Median and 16 and 84 % quantiles of A/E in bins of the drift time, by method.
-
-    Parameters
-    ----------
-    amplitude, drift_time
-        A/E in pulse heights per sample and drift times in ns, by method, of equal length; those
-        of the measured pulses are under ``"data"``.
-    bins
-        Number of bins, with equal numbers of measured pulses.
-    """
-    known = {m: np.isfinite(ae) & np.isfinite(drift_time[m]) for m, ae in amplitude.items()}
-    edges = np.quantile(drift_time["data"][known["data"]], np.linspace(0, 1, bins + 1))
-    methods, left_out = {}, {}
-    for method, finite in known.items():
-        ae, time = amplitude[method][finite], drift_time[method][finite]
-        inside = (time >= edges[0]) & (time <= edges[-1])
-        place = np.searchsorted(edges[1:-1], time, side="right")
-        chosen = [inside & (place == i) for i in range(bins)]
-        methods[method] = [_bin(ae[rows], time[rows]) for rows in chosen]
-        left_out[method] = len(amplitude[method]) - int(inside.sum())
-    return AgainstTime(edges, left_out, methods)
-
-
-@styled
-def ae_figure(table: AgainstTime, peak: str) -> Figure:
-    """Median A/E against drift time with its error, and the range from 16 to 84 %.
-
-    Parameters
-    ----------
-    table
-        Result of `ae_against_drift_time`.
-    peak
-        Name of the gamma line, for the title.
-    """
-    methods = table.methods
-    palette = colours(methods)
-    figure, above, below = stacked((6.4, 5.4), left=1.1, top=legend_height(len(methods), 3))
-    ratios: list[float] = []
-    for method, rows in methods.items():
-        known = [row for row in rows if row.missing is None]
-        if not known:
-            continue
-        time, median, low, high, error = columns_of(
-            known, "time_ns", "median", "q16", "q84", "median_error"
-        )
-        look = {"color": palette[method], "marker": "o", "markersize": 3.5}
-        group(above.errorbar(time, median, error, label=label(method), **look), method)
-        # with one point these lines would be invisible, but widen the range of the axis
-        for edge in (low, high) if len(known) > 1 else ():
-            above.plot(time, edge, ":", color=palette[method], lw=1.1, gid=GROUP + method)
-        if method != "data":
-            points = _ratio(rows, methods["data"])
-            group(below.errorbar(*points, **look), method)
-            ratios += points[1].tolist()
-    below.axhline(0, color="black", linewidth=0.8)
-    above.set(ylabel=PARAMETERS["current_amplitude"].axis_label)
-    below.set(
-        xlabel=PARAMETERS["drift_time"].axis_label, ylabel="Median,\nmethod / data − 1 [%]"
-    )
-    if max(map(abs, ratios), default=0.0) > FAR * LINEAR:
-        linear_within(below, LINEAR)
-        below.set_ylabel(f"{below.get_ylabel()[:-1]},\nlinear within ± {LINEAR:g}]")
-    title = f"{peak}: median of A/E in bins of the drift time; dotted: 16 and 84 %"
-    legend_above(figure, above, 3, title)
-    return figure
-
-
-def _bin(ae: Values, time: Values) -> TimeBin:
-    n = len(ae)
-    if n < MIN_IN_BIN:
-        return TimeBin(n, missing=f"{n} events (at least {MIN_IN_BIN} are needed)")
-    found: dict[str, Any] = {}
-    for name, p in QUANTILES.items():
-        # scatter of the rank of a quantile, which is independent of the distribution
-        stray = np.sqrt(p * (1 - p) / n)
-        low, high = np.quantile(ae, np.clip([p - stray, p + stray], 0, 1))
-        found |= {name: float(np.quantile(ae, p)), f"{name}_error": float((high - low) / 2)}
-    return TimeBin(n, float(np.median(time)), **found)
-
-
-def _ratio(rows: Sequence[TimeBin], data: Sequence[TimeBin]) -> Values:
-    """Time, deviation of the median from that of the data in percent, and its error."""
-    time, median, error = columns_of(rows, "time_ns", "median", "median_error")
-    measured, other = columns_of(data, "median", "median_error")
-    known = np.isfinite(median) & np.isfinite(measured) & (measured != 0)
-    time, median, error, measured, other = (
-        values[known] for values in (time, median, error, measured, other)
-    )
-    ratio = median / measured
-    spread = np.hypot(error / measured, ratio * other / measured)
-    return np.stack([time, 100 * (ratio - 1), 100 * spread])
-
-
-def columns_of(rows: Sequence[Any], *names: str) -> Values:
-    """Fields of objects as rows of an array; NaN for None."""
-    return np.array([[getattr(row, name) for row in rows] for name in names], float)

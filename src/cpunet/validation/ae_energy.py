@@ -15,9 +15,9 @@ import scipy.optimize
 from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.plotting import GROUP, colours, group, label, stacked, styled
+from cpunet.plotting import COLOURS, GROUP, STACKED, group, label, panels, styled
 from cpunet.pulses.parameters import Values
-from cpunet.validation.a_over_e import DEP, Range, columns_of
+from cpunet.validation.a_over_e import DEP, Range
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
@@ -224,11 +224,10 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
     methods
         ``methods`` of `against_energy`.
     """
-    figure, above, below = stacked((6.4, 5.6), top=0.15)
-    palette = colours(methods)
+    figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
     for method, found in methods.items():
-        colour, line = palette[method], found.mean
-        energy, mean, error, sigma, sigma_error = columns_of(found.points, *FITTED)
+        colour, line = COLOURS[method], found.mean
+        energy, mean, error, sigma, sigma_error = _columns(found.points)
         look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
         for axes, value, spread in (
             (above, mean / found.scale - 1, error / found.scale),
@@ -269,7 +268,7 @@ def _points(
 
 def _course(points: list[SiteFit]) -> Course:
     """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
-    energy, mean, error, sigma, sigma_error = columns_of(points, *FITTED)
+    energy, mean, error, sigma, sigma_error = _columns(points)
     design = np.stack([energy - REFERENCE_KEV, np.ones(len(energy))], axis=1) / error[:, None]
     slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
     covariance = np.linalg.inv(design.T @ design) / scale**2
@@ -301,6 +300,11 @@ def _resolution(energy: Values, relative: Values, error: Values) -> WidthLaw:
         squares = terms @ np.array([a, b2])
     at_reference = 100 * np.sqrt(a + b2 * 1e6 / REFERENCE_KEV**2)
     return WidthLaw(float(a), float(1e3 * np.sqrt(b2)), 2.0, float(at_reference))
+
+
+def _columns(points: Sequence[SiteFit]) -> Values:
+    """Fitted values of the points, as rows of an array."""
+    return np.array([[getattr(point, name) for point in points] for name in FITTED])
 
 
 def _seen(values: Values) -> tuple[float, float] | None:

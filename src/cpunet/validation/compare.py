@@ -1,46 +1,180 @@
-"""Compare the scores of several validations."""
+"""Compare the scores of several validations: one table, and one page."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
+
+import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
-from cpunet.tables import text_table
+from cpunet.plotting import label
+from cpunet.tables import NO_VALUE, text_table
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
-from cpunet.validation.side_by_side import FEW, SideBySide, comparison_page, side_by_side
-from cpunet.validation.verdicts import Metrics
+from cpunet.validation.verdicts import (
+    Metrics,
+    judged_scores,
+    methods_of,
+    number,
+    part,
+    summary,
+)
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+FEW = 8  # runs whose scores are printed beside each other; of more, the page has them
+OVER = "median ± std"  # name of the column over runs that differ in their seed only
+
+# what runs have in common that differ in their seed only
+ORIGIN = (
+    ("training", "recipe"),
+    ("training", "peak"),
+    ("compared", "simulation"),
+    ("compared", "data"),
+)
+
+
+class Cell(NamedTuple):
+    """A score, its format and text, and its distance from the best possible one."""
+
+    value: float | None = None
+    digits: str = ""
+    text: str = NO_VALUE
+    off: float = math.inf
+
+    @classmethod
+    def of(
+        cls, value: float | None, error: float | None, digits: str, best: float, more: str = ""
+    ) -> Cell:
+        """A score with its error, if there are any, and the text that follows them."""
+        if value is None:
+            return cls()
+        spread = "" if error is None else f" ± {error:{digits.lstrip('+')}}"
+        return cls(value, digits, f"{value:{digits}}{spread}{more}", abs(value - best))
+
+
+class Row(NamedTuple):
+    """One score of every run.
+
+    Attributes
+    ----------
+    peak, score
+        Name of the peak and of the score.
+    cells
+        Scores in the order of the runs.
+    """
+
+    peak: str
+    score: str
+    cells: list[Cell]
+
+    @property
+    def best(self) -> set[int]:
+        """Indices of the runs with the best score; empty if fewer than two have one."""
+        known = [cell.off for cell in self.cells if cell.value is not None]
+        return {i for i, c in enumerate(self.cells) if len(known) > 1 and c.off == min(known)}
+
+    @property
+    def texts(self) -> list[str]:
+        """Scores as displayed; the best are marked."""
+        best = self.best
+        return [f"{cell.text}{'*' * (i in best)}" for i, cell in enumerate(self.cells)]
+
+    @property
+    def over(self) -> str:
+        """Median and standard deviation over the runs."""
+        known = [cell for cell in self.cells if cell.value is not None]
+        if len(known) < 2:
+            return NO_VALUE
+        values, digits = np.array([cell.value for cell in known], float), known[0].digits
+        spread = f"{np.std(values, ddof=1):{digits.lstrip('+')}}"
+        return f"{np.median(values):{digits}} ± {spread}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Scores of several runs, as returned by `cpunet.compare`.
 
+    The best is the highest IoU, the AUC closest to that of shuffled labels, the lowest RMSE of
+    the edge, and the smallest difference of A/E survival.
+
     Parameters
     ----------
-    table
-        Scores of the runs, which have the names of their folders, made unique, such as
-        ``DETECTOR/PERIOD``.
+    method
+        Method that is scored.
     metrics
-        Content of ``metrics.json`` by run.
+        Content of ``metrics.json`` by run.  Runs have the names of their folders, made unique,
+        such as ``DETECTOR/PERIOD``.
     folders
         Folder of each report; None for those in memory.
     missing
         Names of the reports that are not there.
     path
         The page; None if none was written.
+
+    Examples
+    --------
+    >>> iou = lambda value: {"iou": {"ren": value, "ceiling": 90.0}}
+    >>> metrics = lambda v: {"peaks": {"SEP": {"parameters": {"drift_time": iou(v)}}}}
+    >>> made = Comparison("ren", {"old": metrics(80.0), "new": metrics(85.0)})
+    >>> made.rows[0].texts
+    ['80.0 (90.0)', '85.0 (90.0)*']
     """
 
-    table: SideBySide
+    method: str
     metrics: Mapping[str, Metrics]
-    folders: Mapping[str, Path | None]
+    folders: Mapping[str, Path | None] | None = None
     missing: tuple[str, ...] = ()
     path: Path | None = None
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """Scores that any run has, ordered by peak."""
+        rows = []
+        for peak in _union(part(metrics, "peaks") for metrics in self.metrics.values()):
+            found = [_scores(metrics, peak, self.method) for metrics in self.metrics.values()]
+            for score in _union(found):
+                cells = [of_run.get(score, Cell()) for of_run in found]
+                if any(cell.value is not None for cell in cells):
+                    rows.append(Row(peak, score, cells))
+        return rows
+
+    @property
+    def scores(self) -> DataFrame:
+        """Numbers of the scores: a row per peak and score, a column per run."""
+        from pandas import DataFrame, MultiIndex
+
+        index = MultiIndex.from_tuples([row[:2] for row in self.rows], names=["peak", "score"])
+        values = [[cell.value for cell in row.cells] for row in self.rows]
+        return DataFrame(values, index, list(self.metrics), dtype=float)
+
+    @property
+    def note(self) -> str:
+        """Signs that runs were not scored on the same pulses; empty if there are none."""
+        (first, known), *others = ((n, _pulses(metrics)) for n, metrics in self.metrics.items())
+        apart = {name: [k for k in known if of[k] != known[k]] for name, of in others}
+        names = ", ".join(name for name, differences in apart.items() if differences)
+        words = ", ".join(_union(apart.values()))
+        text = f"other pulses than those of {first} ({words}), so scores differ for that, too"
+        return f"{names}: {text}" if names else ""
+
+    @property
+    def of_seeds(self) -> bool:
+        """Whether the runs differ in their seed only: of one recipe, on the same files."""
+        origins = {
+            tuple(part(metrics, section).get(key) for section, key in ORIGIN)
+            for metrics in self.metrics.values()
+            if part(metrics, "training")
+        }
+        return len(self.metrics) > 1 and len(origins) == 1
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write the comparison as an HTML page, with links to the reports.
@@ -50,30 +184,46 @@ class Comparison:
         CpunetError
             If the page exists and `force` is off, or cannot be written.
         """
-        path = Path(path)
-        _refuse(path, [*self.folders.values()], force=force)
+        from cpunet.html_pages import rendered
+
+        path, folders = Path(path), self.folders or {}
+        if path.is_dir():
+            raise CpunetError(
+                f"{path}: is a folder", "give the name of a page, as compare.html"
+            )
+        refuse_existing(path, *folders.values(), force=force)
         links = {
             name: quote(os.path.relpath(folder / PAGE, path.parent))
-            for name, folder in self.folders.items()
+            for name, folder in folders.items()
             if folder is not None and (folder / PAGE).is_file()
         }
-        page = comparison_page(self.table, self.metrics, links, self.missing)
+        peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
+        title = f"{label(self.method)}: {len(self.metrics)} runs compared"
+        runs = [_overview(name, one, self.method) for name, one in self.metrics.items()]
+        values = {"title": title, "comparison": self, "runs": runs, "links": links}
+        page = rendered("compare.html", **values, peaks=peaks, over=OVER)
         with written_aside(path) as aside:
             aside.write_text(page, encoding="utf-8")
 
     def __str__(self) -> str:
-        table, lines = self.table, []
-        if self.path is None or len(table.names) <= FEW:
-            lines.append(_text(table, f"Scores of {table.method}, the best with *"))
-            lines += [f"note: {note}" for note in table.notes]
-        if table.over_runs is not None:
-            title = "Over runs: median ± standard deviation (lowest – highest)"
-            lines.append(_text(table.over_runs, title))
+        lines = []
+        if self.path is None or len(self.metrics) <= FEW:
+            seeds = self.of_seeds
+            rows = [
+                ["" if i and self.rows[i - 1].peak == row.peak else row.peak, row.score]
+                + row.texts
+                + [row.over] * seeds
+                for i, row in enumerate(self.rows)
+            ]
+            head = ["peak", "score", *self.metrics, *[OVER] * seeds]
+            title = f"Scores of {self.method}, the best with *"
+            lines = [text_table(head, rows, words=2, title=title)]
+            lines += [f"note: {self.note}"] if self.note else []
         lines += [f"no report: {name}" for name in self.missing]
         return "\n".join(lines if self.path is None else [*lines, str(self.path)])
 
     def __repr__(self) -> str:
-        return f"<Comparison of {', '.join(self.table.names)}: {self.table.method}>"
+        return f"<Comparison of {', '.join(self.metrics)}: {self.method}>"
 
 
 def compare(
@@ -84,9 +234,9 @@ def compare(
 ) -> Comparison:
     """Put the scores of several validations beside each other, of one detector or of many.
 
-    The page also has links to the reports, and room for many detectors and periods. A second
-    table tells how the scores of runs scatter that differ in their seed only. Reports that are
-    missing are listed.
+    The page also has links to the reports, and room for many detectors and periods. Of runs
+    that differ in their seed only, the median and the standard deviation are told as well.
+    Reports that are missing are listed.
 
     Parameters
     ----------
@@ -116,11 +266,9 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
-    if out is None:
-        return compared(reports, method=method)
-    files = [r.folder if isinstance(r, Report) else Path(r) for r in reports]
-    _refuse(Path(out), files, force=force)
     comparison = compared(reports, method=method)
+    if out is None:
+        return comparison
     comparison.save(out, force=force)
     return replace(comparison, path=Path(out))
 
@@ -164,25 +312,72 @@ def compared(
             "give folders of cpunet validate or cpunet demo",
         )
     missing = tuple(name for name in names if name not in runs)
-    table = side_by_side(runs, method)
-    return Comparison(table, runs, dict(zip(names, folders, strict=True)), missing)
+    made = Comparison(method, runs, dict(zip(names, folders, strict=True)), missing)
+    if not made.rows:
+        known = _union(methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks"))
+        raise CpunetError(
+            f"{', '.join(runs)}: no score of the method {method}; "
+            + (f"there are {', '.join(known)}" if known else "nothing is scored there")
+        )
+    return made
 
 
-def _refuse(out: Path, reports: Sequence[Path | None], *, force: bool) -> None:
-    if out.is_dir():
-        raise CpunetError(f"{out}: is a folder", "give the name of a page, as compare.html")
-    refuse_existing(out, *reports, force=force)
+def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
+    """Scores of a method at a peak, by name."""
+    scores, survival = part(metrics, "peaks", peak), part(metrics, "ae_survival", peak)
+    found = {}
+    for name, one in part(scores, "parameters").items():
+        ceiling = number(one, "iou", "ceiling")
+        more = "" if ceiling is None else f" ({ceiling:.1f})"
+        iou, error = (number(one, key, method) for key in ("iou", "iou_std"))
+        title = f"{name.replace('_', ' ')}: IoU [%] (ceiling)"
+        found[title] = Cell.of(iou, error, ".1f", 100.0, more)
+    auc, error, chance = (
+        number(scores, "two_sample", method, key) for key in ("auc", "auc_std", "null_mean")
+    )
+    edge = number(scores, "paired", method, "edge_rmse")
+    apart, std = (number(survival, key, method) for key in ("difference", "difference_std"))
+    return found | {
+        "classifier: AUC": Cell.of(auc, error, ".3f", chance or 0.0),
+        "edge RMSE [10⁻³]": Cell.of(None if edge is None else 1e3 * edge, None, "#.3g", 0.0),
+        "A/E survival minus data [points]": Cell.of(apart, std, "+.2f", 0.0),
+    }
 
 
-def _text(table: SideBySide, title: str) -> str:
-    """A row per peak and score, a column per run."""
-    rows = []
-    for peak, of_peak in groupby(table.rows, key=lambda row: row.peak):
-        names = [peak]
-        for row in of_peak:
-            cells = [f"{c.text}{'*' * (i in row.best)}" for i, c in enumerate(row.cells)]
-            rows.append([names.pop() if names else "", row.score, *cells])
-    return text_table(["peak", "score", *table.names], rows, words=2, title=title)
+class Overview(NamedTuple):
+    """Line of one run: how many scores are off, verdicts in words, and what was compared."""
+
+    name: str
+    text: str
+    marked: bool
+    lines: list[str]
+    about: str
+
+
+def _overview(name: str, metrics: Metrics, method: str) -> Overview:
+    off, judged = judged_scores(metrics, method)
+    text = f"{off} of {judged} off" if judged else "not judged"
+    marked = off > 2 and off > 0.2 * judged  # one or two can be off by chance
+    lines = [summary(metrics, peak, method) for peak in part(metrics, "peaks")]
+    about = "; ".join(f"{key}: {text}" for key, text in part(metrics, "compared").items())
+    return Overview(name, text, marked, lines, about)
+
+
+def _pulses(metrics: Metrics) -> dict[str, Any]:
+    """What distinguishes the pulses of a validation from those of another."""
+    peaks, rejections = part(metrics, "peaks"), part(metrics, "rejections")
+    found: dict[str, Any] = {"detectors": part(metrics, "compared").get("detector")}
+    found["peaks"] = peaks.keys()
+    for side, called in (("data", "measured"), ("sim", "simulated")):
+        numbers = {peak: part(peaks, peak).get(f"n_{side}") for peak in peaks}
+        found[f"numbers of {called} pulses"] = numbers
+        found[f"rejections of {called} pulses"] = rejections.get(side)
+    return found
+
+
+def _union(names: Iterable[Iterable[str]]) -> list[str]:
+    """All names in the order of their first occurrence."""
+    return list(dict.fromkeys(name for some in names for name in some))
 
 
 def _names(reports: Sequence[Path]) -> list[str]:

@@ -8,71 +8,38 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.plotting import NO_NOISE
 from cpunet.processes import one_thread_for_matrices
 from cpunet.progress import stage
-from cpunet.pulses.loading import (
-    InputSet,
-    load_pulses,
-    require_same_sampling,
-)
-from cpunet.pulses.parameters import Values, current_amplitude
+from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
-from cpunet.translation.translator import IREN, REN
+from cpunet.translation.translator import REN
 from cpunet.validation.a_over_e import (
     DEP,
-    AgainstTime,
     Range,
     RangeSurvival,
     SurvivalRow,
-    ae_against_drift_time,
     peak_survival,
     survival_table,
 )
 from cpunet.validation.ae_energy import AgainstEnergy, against_energy
 from cpunet.validation.comparisons import Missing
-from cpunet.validation.methods import fit_baseline_methods, translate_all, true_responses
+from cpunet.validation.methods import (
+    Translations,
+    fit_baseline_methods,
+    translate_all,
+    true_responses,
+)
 from cpunet.validation.peaks import ByMethod, PeakScores, PeakSets, score_peak
 from cpunet.validation.report import as_stored
-from cpunet.validation.slices import MeanPulse, Slices, aligned_means, slice_table
+from cpunet.validation.slices import Slices, aligned_means, slice_table
 from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
-
-
-@dataclass(frozen=True, eq=False)
-class PeakDetails:
-    """Comparisons of one peak beyond distributions, each with a figure.
-
-    Parameters
-    ----------
-    means, slices
-        Mean pulses by method, of all pulses and in slices of rise time.
-    ae_against_time
-        Result of `ae_against_drift_time`.
-    """
-
-    means: Mapping[str, MeanPulse]
-    slices: Mapping[str, Slices]
-    ae_against_time: AgainstTime
-
-    @classmethod
-    def of(cls, peak: PeakSets, values: ByMethod) -> PeakDetails:
-        """Compare the pulses with noise, of which these are the parameters."""
-        noisy = {m: v for m, v in values.items() if not m.endswith(NO_NOISE)}
-        rise, amplitude, time = (
-            {m: v[name] for m, v in noisy.items()}
-            for name in ("rise_01_90", "current_amplitude", "drift_time")
-        )
-        means, slices = aligned_means(peak.pulses, rise)
-        return cls(means, slices, ae_against_drift_time(amplitude, time))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,29 +48,21 @@ class Evaluation:
 
     Parameters
     ----------
-    ren, iren
-        Translators of the run.
     run
         The run.
-    sim, data
-        Prepared pulses of both sides.
-    sets, values, details
-        Pulses, parameters by method, and further comparisons, each by peak.  The latter two
-        exist only for scored peaks.
+    sets, values, slices
+        Pulses, and parameters and mean pulses by method, each by peak.  The latter two exist
+        only for scored peaks.
     ae_energy
         A/E against energy.
     metrics
         Content of ``metrics.json``.
     """
 
-    ren: REN
-    iren: IREN
     run: Run
-    sim: InputSet
-    data: InputSet
     sets: list[PeakSets]
     values: Mapping[str, ByMethod]
-    details: Mapping[str, PeakDetails]
+    slices: Mapping[str, Mapping[str, Slices]]
     ae_energy: AgainstEnergy
     metrics: dict[str, Any]
 
@@ -128,7 +87,7 @@ def evaluate(
         If the input cannot be used, or no peak can be scored.
     """
     device, recipe, trained_on = resolve_device(device), run.recipe, run.peak
-    ren, iren = REN.of(run, device), IREN.of(run, device)
+    ren = REN.of(run, device)
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
     selection = _selected(recipe, names)
     sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
@@ -144,45 +103,36 @@ def evaluate(
         tails=ren.tails,
         fitted=baselines,
     )
-    translations = translate_all(ren, baseline_methods, sim_set, responses, seed)
-    simulated, measured = sim_set.prepared.pulses, data_set.prepared.pulses
-    # of each whole side at once, so that peaks that overlap share them
-    windows = {"raw": simulated.waveforms, **translations.noisy, "data": measured.waveforms}
-    amplitudes = {method: current_amplitude(of_method) for method, of_method in windows.items()}
-    sets = []
-    for name in names:
-        chosen = parse_selection(name, recipe.peaks)
-        in_sim = np.flatnonzero(chosen.select(simulated.energy_kev))
-        in_data = np.flatnonzero(chosen.select(measured.energy_kev))
-        one = PeakSets(name, measured, in_sim, in_data, translations, amplitudes)
-        sets.append(one)
+    translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
+    selections = {name: parse_selection(name, recipe.peaks) for name in names}
+    sets = [PeakSets.of(name, one, translations) for name, one in selections.items()]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
-    details: dict[str, PeakDetails] = {}
+    slices: dict[str, dict[str, Slices]] = {}
     with stage("Scoring", len(sets)) as bar:
         for peak in sets:
-            values[peak.name], peaks[peak.name] = score_peak(peak, recipe, seed)
-            if values[peak.name]:
-                details[peak.name] = PeakDetails.of(peak, values[peak.name])
+            found, peaks[peak.name] = score_peak(peak, recipe, seed)
+            if found:
+                values[peak.name] = found
+                rise = {method: v["rise_01_90"] for method, v in found.items()}
+                slices[peak.name] = aligned_means(peak.windows, rise)
             bar.update(1)
-    if not details:
+    if not values:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
     kept = survival_table(
         {
-            name: {method: v["current_amplitude"] for method, v in values[name].items()}
-            for name in details
+            name: {method: v["current_amplitude"] for method, v in of_peak.items()}
+            for name, of_peak in values.items()
         },
         seed=seed,
     )
-    sides = {m: measured if m == "data" else simulated for m in amplitudes}
-    energies = {method: side.energy_kev for method, side in sides.items()}
     known = None if run.fit is None else run.fit.tails
     ae_energy = against_energy(
-        {method: amplitudes[method] for method in ("data", "ren")},
-        energies,
+        {method: translations.amplitudes[method] for method in ("data", "ren")},
+        translations.energy_kev,
         {name: span for name, (span, _) in _lines(recipe).items()},
     )
     metrics = {
@@ -190,24 +140,11 @@ def evaluate(
         "peaks": peaks,
         "ae_survival": kept,
         "ae_details": {
-            "survival by energy range": _range_survivals(amplitudes, energies, kept, recipe),
-            "A/E against drift time": {
-                name: of_peak.ae_against_time for name, of_peak in details.items()
-            },
+            "survival by energy range": _range_survivals(translations, kept, recipe)
         },
         "ae_energy": ae_energy,
         "drift_slices": {
-            name: slice_table(of_peak.slices, data_set.dt_ns)
-            for name, of_peak in details.items()
-        },
-        # numbers of the noise beside each other; its spectrum is with the scores
-        "noise": {
-            name: {
-                method: {k: v for k, v in found.items() if not k.startswith("power")}
-                for method, found in (peaks[name].noise or {}).items()
-                if method != "frequency_mhz"
-            }
-            for name in details
+            name: slice_table(of_peak, data_set.dt_ns) for name, of_peak in slices.items()
         },
         "baseline_methods": {
             "fits": {
@@ -225,12 +162,10 @@ def evaluate(
     }
     stored = as_stored(metrics)
     stored["verdicts"] = {
-        "summary": [summary(stored, name, "ren") for name in details],
+        "summary": [summary(stored, name, "ren") for name in values],
         "table": verdict_table(stored),
     }
-    return Evaluation(
-        ren, iren, run, sim_set, data_set, sets, values, details, ae_energy, stored
-    )
+    return Evaluation(run, sets, values, slices, ae_energy, stored)
 
 
 def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
@@ -242,8 +177,7 @@ def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
 
 
 def _range_survivals(
-    amplitudes: Mapping[str, Values],
-    energies: Mapping[str, Values],
+    translations: Translations,
     ae_survival: dict[str, SurvivalRow] | Missing,
     recipe: Recipe,
 ) -> dict[str, dict[str, RangeSurvival]] | Missing:
@@ -255,8 +189,10 @@ def _range_survivals(
     ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
     return {
         name: {
-            method: peak_survival(values, energies[method], cuts[method], span, sidebands)
-            for method, values in amplitudes.items()
+            method: peak_survival(
+                values, translations.energy_kev[method], cuts[method], span, sidebands
+            )
+            for method, values in translations.amplitudes.items()
             if method in cuts
         }
         for name, (span, sidebands) in ranges.items()

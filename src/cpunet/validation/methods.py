@@ -1,8 +1,8 @@
 """All methods of a validation: baseline methods, fitted to the peak of the training, and REN.
 
-Each translates all simulated pulses once, with and without noise.  Only a few numbers are kept
-of a noise-free pulse, and about twenty events are translated again for display: to keep all
-samples would double the memory.
+Each translates all simulated pulses once, with and without noise.  Of a noise-free pulse only
+its difference from the truth is kept, and a few events are translated again for display: to
+keep all samples would double the memory.
 
 Of a virtual test stand the truth is known.  Two pulses are compared with it after both are
 shifted to cross half of their maximum at the same time: a time shift left by the electronics or
@@ -12,11 +12,10 @@ the alignment is not a difference of shape.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +31,7 @@ from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block, pulse_parameters
+from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
@@ -42,7 +41,6 @@ from cpunet.translation.translator import REN
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
 Flags = npt.NDArray[np.bool_]
 
 
@@ -219,92 +217,74 @@ def fit_baseline_methods(
     kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
     there = tails is not None and tails.law.rate_khz > 0
     found = tails_of(data)[0] if there else None
-    noise = _or_reason(result.missing, "noise", lambda: noise_of(data, found))
-    if noise is not None:
+    try:
+        noise = noise_of(data, found)
         result.noise = TraceNoise(noise, tails) if there else noise
+    except CpunetError as error:
+        result.missing["noise"] = str(error)
     fit_sim, fit_data = (
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
     )
     with stage("Fitting baseline methods", len(kinds)) as bar:
         for name, kind in kinds.items():
-            fit = partial(kind.fit, fit_sim, fit_data, sim.dt_ns, config.samples_before)
-            method = _or_reason(result.missing, name, fit)
-            if method is not None:
+            try:
+                method = kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
                 result.methods[name] = method
+            except CpunetError as error:
+                result.missing[name] = str(error)
             bar.update(1)
     for name, reason in result.missing.items():
         log.info(f"{name} is left out: {reason}")
     return result
 
 
-def _or_reason(missing: dict[str, str], name: str, make: Callable[[], T]) -> T | None:
-    """The result of `make`, or None, with the reason recorded in `missing`."""
-    try:
-        return make()
-    except CpunetError as error:
-        missing[name] = str(error)
-        return None
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseFree:
-    """Numbers of the noise-free pulses of one method.
-
-    Parameters
-    ----------
-    parameters
-        Result of `pulse_parameters`, row by row; NaN where a pulse cannot be prepared.
-    whole
-        Mask of the pulses that could be prepared.
-    squares
-        Squared differences from the truth, see `pair_squares`; None if it is unknown.
-    """
-
-    parameters: Mapping[str, Values]
-    whole: Flags
-    squares: Values | None
-
-
 @dataclass(frozen=True, eq=False)
 class Translations:
-    """Translations of the simulated pulses by all methods, row by row.
+    """Pulses of all methods: measured, simulated, and translated row by row.
 
     Parameters
     ----------
-    noisy
-        Windows with noise by method: baseline methods, ``ren`` and ``truth``, or only ``ren``
-        if the noise of the data is unknown.  Rows that cannot be prepared are NaN.
-    whole
-        Mask of the prepared rows, by method.
-    clean
-        Numbers of the same pulses without noise, and of ``raw``.
+    windows
+        Windows with noise by method: ``data``, ``raw``, baseline methods, ``ren`` and
+        ``truth``; of translations only ``ren`` if the noise of the data is unknown.  Rows that
+        cannot be prepared are NaN.
+    whole, energy_kev, amplitudes
+        Mask of the prepared rows, energies and current amplitudes, by method.
+    known
+        Mask of the simulated pulses that every method can prepare without noise.
+    squares
+        Squared differences of the noise-free pulses from the truth by method, see
+        `pair_squares`; empty if the truth is unknown.
     truth
         Windows of the noise-free truth, if known.
     """
 
     ren: REN
     baselines: FittedBaselineMethods
-    simulated: Pulses
-    noisy: dict[str, FloatArray] = field(default_factory=dict)
-    whole: dict[str, Flags] = field(default_factory=dict)
-    clean: dict[str, NoiseFree] = field(default_factory=dict)
-    truth: FloatArray | None = None
+    windows: dict[str, FloatArray]
+    whole: dict[str, Flags]
+    energy_kev: dict[str, Values]
+    amplitudes: dict[str, Values]
+    known: Flags
+    squares: dict[str, Values]
+    truth: FloatArray | None
 
-    def without_noise(self, rows: npt.NDArray[np.int64]) -> dict[str, FloatArray]:
-        """Noise-free windows of some pulses by method, with the truth if it is known."""
-        pulses, config = self.simulated[rows], self.ren.recipe.preparation
-        found = {"raw": pulses.waveforms}
+    def without_noise(self, row: int) -> dict[str, FloatArray]:
+        """Noise-free window of a pulse by method, with the truth if it is known."""
+        raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
+        found = {"raw": raw}
         for name, method in self.baselines.methods.items():
-            found[name] = method.translate_like_data(pulses.waveforms, config)
-        found["ren"] = self.ren.apply(pulses.waveforms, noise=False)
-        return found if self.truth is None else found | {"truth": self.truth[rows]}
+            found[name] = method.translate_like_data(raw, config)
+        found["ren"] = self.ren.apply(raw, noise=False)
+        return found if self.truth is None else found | {"truth": self.truth[[row]]}
 
 
 def translate_all(
     ren: REN,
     baselines: FittedBaselineMethods,
     sim: InputSet,
+    data: InputSet,
     responses: FloatArray | None,
     seed: int,
 ) -> Translations:
@@ -314,39 +294,38 @@ def translate_all(
     ----------
     ren, baselines
         REN and baseline methods.
-    sim
-        Prepared simulated pulses.
+    sim, data
+        Prepared pulses of both sides.
     responses
-        True noise-free records of these pulses, if known.
+        True noise-free records of the simulated pulses, if known.
     seed
         Seed of the noise, common to all methods.
     """
-    pulses, recipe = sim.prepared.pulses, ren.recipe
-    known: dict[str, FloatArray] = {} if responses is None else {"truth": responses}
-    others = [*baselines.methods, *known]
+    pulses, recipe, noise = sim.prepared.pulses, ren.recipe, baselines.noise
+    given: dict[str, FloatArray] = {} if responses is None else {"truth": responses}
+    others = [*baselines.methods, *given]
     shape = (len(pulses), recipe.preparation.length)
     noisy = {
         name: np.empty(shape, np.float32)
         for name in (*baselines.methods, "ren", "truth")  # from the simplest to the truth
-        if name == "ren" or (name in others and baselines.noise is not None)
+        if name == "ren" or (name in others and noise is not None)
     }
-    truth = None if responses is None else np.empty(shape, np.float32)
+    truth, known = None, np.ones(len(pulses), bool)
+    squares: dict[str, Values] = {}
+    if responses is not None:
+        truth = np.empty(shape, np.float32)
+        squares = {m: np.zeros((len(pulses), 4)) for m in ("raw", *baselines.methods, "ren")}
     generator = ren.seeded(seed)
-    noise = baselines.noise
     # all methods get the same noise
     rngs = {name: np.random.default_rng(seed) for name in others}
-    parts: dict[str, list[NoiseFree]] = {}
     with stage("Translating", len(pulses)) as bar:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
             clean = {"raw": block.waveforms}
             for name in others:
                 method = baselines.methods.get(name)
-                records = (
-                    known[name][rows] if method is None else method.translate(block.waveforms)
-                )
                 finished = finish(
-                    records,
+                    given[name][rows] if method is None else method.translate(block.waveforms),
                     recipe.preparation,
                     dt_ns=block.dt_ns,
                     noise=noise,
@@ -358,14 +337,27 @@ def translate_all(
                     noisy[name][rows] = finished.windows
             clean["ren"] = ren.apply(block.waveforms, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
+            for windows in clean.values():
+                known[rows] &= _whole(windows)
             if truth is not None:
-                truth[rows] = clean["truth"]
-            for name, numbers in _numbers(clean, recipe, sim.dt_ns).items():
-                parts.setdefault(name, []).append(numbers)
+                truth[rows] = clean.pop("truth")
+                found = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
+                for name, of_block in found.items():
+                    squares[name][rows] = of_block
             bar.update(len(block))
-    whole = {name: _whole(windows) for name, windows in noisy.items()}
-    joined = {name: _joined(found) for name, found in parts.items()}
-    return Translations(ren, baselines, pulses, noisy, whole, joined, truth)
+    measured = data.prepared.pulses
+    every = {"data": measured.waveforms, "raw": pulses.waveforms} | noisy
+    return Translations(
+        ren,
+        baselines,
+        every,
+        {method: _whole(windows) for method, windows in every.items()},
+        {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
+        {method: current_amplitude(windows) for method, windows in every.items()},
+        known,
+        squares,
+        truth,
+    )
 
 
 def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArray:
@@ -376,38 +368,6 @@ def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArra
         energy_kev=pulses.energy_kev,
         generator=generator,
         tails_kev=drawn_kev(tails, len(pulses), generator),
-    )
-
-
-def _numbers(
-    clean: Mapping[str, FloatArray], recipe: Recipe, dt_ns: float
-) -> dict[str, NoiseFree]:
-    """Numbers of the noise-free pulses of one block."""
-    squares: Mapping[str, Values] = {}
-    if "truth" in clean:
-        methods = {name: windows for name, windows in clean.items() if name != "truth"}
-        squares = pair_squares(methods, clean["truth"], recipe.scores.edge_samples)
-    return {
-        name: NoiseFree(
-            pulse_parameters(
-                Pulses.of(windows, dt_ns=dt_ns), recipe.preparation, recipe.scores
-            ),
-            _whole(windows),
-            squares.get(name),
-        )
-        for name, windows in clean.items()
-    }
-
-
-def _joined(parts: list[NoiseFree]) -> NoiseFree:
-    squares = [part.squares for part in parts if part.squares is not None]
-    return NoiseFree(
-        {
-            name: np.concatenate([part.parameters[name] for part in parts])
-            for name in parts[0].parameters
-        },
-        np.concatenate([part.whole for part in parts]),
-        np.concatenate(squares) if squares else None,
     )
 
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from scipy.special import erfc
 from scipy.stats import norm
 
-from cpunet.plotting import colours, group, label, logarithmic, stacked, styled
+from cpunet.plotting import COLOURS, STACKED, group, label, panels, styled
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 
@@ -115,13 +115,12 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
         Name of the gamma line, for the title.
     """
     methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
-    palette = colours(methods)
     frequency = np.asarray(found["frequency_mhz"])
-    figure, above, below = stacked((5.6, 4.4))
+    figure, ((above,), (below,)) = panels((5.6, 4.4), 2, **STACKED)
     data = np.asarray(found["data"]["power"])
     for method in methods:
         power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))
-        look = {"color": palette[method], "marker": "o", "markersize": 3}
+        look = {"color": COLOURS[method], "marker": "o", "markersize": 3}
         group(above.errorbar(frequency, power, error, label=label(method), **look), method)
         if method != "data":
             # bands without noise in the data have no ratio
@@ -139,8 +138,6 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
         yscale="linear" if silent else "log",
     )
     above.legend()
-    for axis in (below.xaxis, *([] if silent else [above.yaxis])):
-        logarithmic(axis)
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
 

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cpunet.html_pages import asset, figure_html, joined, part, rendered
-from cpunet.plotting import NO_NOISE, colours, label
+from cpunet.plotting import COLOURS, label
 from cpunet.progress import stage
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
@@ -24,15 +24,13 @@ from cpunet.settings import flat
 from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
-from cpunet.validation.side_by_side import peak_figure
 from cpunet.validation.verdicts import Metrics
 
 FIRST = 2  # figures of mean pulses at the top of the page, and of noise
-AE_ENERGY = "A over E and energy"  # figure with a section of its own
 # section of a figure by the end of its name; all others are under Details
 PLACES = {
     "A over E survival": "ae",
-    "A over E": "ae_drift",
+    "A over E and energy": "ae_energy",
     "mean pulse": "first",
     "superpulses": "slices",
     "noise": "noise",
@@ -67,14 +65,11 @@ def write_page(
             stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
             drawn[name] = figure_html(name.replace("_", " "), draw(), folder / f"{stem}.svg")
             bar.update(1)
-    ae_energy = ae_energy_html(metrics.get("ae_energy", {}), drawn.pop(AE_ENERGY, Markup()))
     ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))
-    scores = joined(
-        peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()
-    )
+    scores = [peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()]
     # of each method that is drawn, for the page's legend
-    palette = colours(re.findall('data-method="([^"]*)"', joined([*drawn.values(), scores])))
+    methods = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn.values())))
     html = rendered(
         "report.html",
         title="CPU-Net validation",
@@ -82,13 +77,13 @@ def write_page(
         placed=placed,
         notes=notes,
         verdicts=verdicts_html(metrics.get("verdicts", {})),
-        methods=[{"name": m, "label": label(m), "colour": c} for m, c in palette.items()],
-        scores=scores,
+        methods=[{"name": m, "label": label(m), "colour": COLOURS[m]} for m in methods],
+        scores=joined(scores),
         survival=survival_html(metrics.get("ae_survival", {})),
         ranges=ranges_table(ranges),
-        ae_energy=ae_energy,
+        ae_energy=ae_energy_html(metrics.get("ae_energy", {})),
         multi_site=metrics.get("ae_energy", {}).get("multi_site"),
-        noise=noise_table(metrics.get("noise", {})),
+        noise=noise_table(metrics.get("peaks", {})),
         rejections=pairs_table(metrics.get("rejections", {}), ("Reason", "Pulses")),
         training=pairs_table(metrics.get("training", {}), ("Setting", "Value")),
         script=Markup(asset("report.js")),
@@ -142,16 +137,11 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
     """Return the section of one peak: numbers of events and tables."""
     chief, others = scores.get("parameters", {}), scores.get("further", {})
     n_sim, n_data = (number(scores.get(name)) for name in ("n_sim", "n_data"))
-    parts = [
-        part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses"),
-        part("p", f"Not scored: {scores['missing']}.")
-        if "missing" in scores
-        else part(
-            "grid", "figures", [figure_html(f"{peak} scores", peak_figure(peak, scores))]
-        ),
-    ]
+    parts = [part("heading", 3, f"{peak}: {n_sim} simulated, {n_data} measured pulses")]
+    if "missing" in scores:
+        parts.append(part("p", f"Not scored: {scores['missing']}."))
     if chief:
-        parts.append(part("folded", "Scores as a table", _parameter_table(chief)))
+        parts.append(_parameter_table(chief))
     if others:
         title = f"Further parameters: {len(others)}"
         parts.append(part("folded", title, _parameter_table(others), screen=True))
@@ -169,7 +159,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
             else [label(method), *(with_std(found[one], found[std]) for one, std in pairs)]
             for method, found in tested.items()
         ]
-        tables.append(part("folded", "The classifier as a table", part("table", head, rows)))
+        tables.append(part("table", head, rows))
     if paired := scores.get("paired", {}):
         head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
         rows = [
@@ -196,8 +186,6 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
     for peak, found in survival.items():
         title = peak
         for method in found.get("survival", {}):
-            if method.endswith(NO_NOISE):
-                continue  # in metrics.json
             kept, apart = (
                 _percent(found[key].get(method), found[f"{key}_std"].get(method))
                 for key in ("survival", "difference")
@@ -225,21 +213,22 @@ def ranges_table(ranges: Mapping[str, Any]) -> Markup:
     return part("table", head, rows, {0, 1, 4}) if rows else Markup()
 
 
-def noise_table(noise: Mapping[str, Any]) -> Markup:
+def noise_table(peaks: Mapping[str, Any]) -> Markup:
     """Return the RMS of the noise before the pulse by peak and method."""
     rows = [
         [peak, label(method), *(number(found.get(key)) for key in ("n", "samples")),
          with_std(found.get("rms"), found.get("rms_std")),
          *(number(found.get(key)) for key in ("rms_ratio", "sigma", "spectrum_sigma"))]
-        for peak, methods in noise.items()
-        for method, found in methods.items()
+        for peak, scores in peaks.items()
+        for method, found in scores.get("noise", {}).items()
+        if method != "frequency_mhz"
     ]  # fmt: skip
     head = ["Peak", "Method", "Pulses", "Samples", "RMS [height]", "Over the data's", "In σ"]
     return part("table", [*head, "Spectrum in σ"], rows, {0, 1}) if rows else Markup()
 
 
-def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
-    """Return a table of the lines, and the figure."""
+def ae_energy_html(found: Mapping[str, Any]) -> Markup:
+    """Return a table of the lines."""
     if "methods" not in found:
         return part("gap", found["missing"]) if found else Markup()
     rows = []
@@ -257,7 +246,7 @@ def ae_energy_html(found: Mapping[str, Any], figure: Markup) -> Markup:
         )
     head = ["Method", "Slope [% per MeV]", "χ² / degrees", "Width at all energies [%]"]
     head += ["Noise [keV]", f"Width at {REFERENCE_KEV:g} keV [%]"]
-    return joined([part("table", head, rows, {0}), part("grid", "figures", [figure])])
+    return part("table", head, rows, {0})
 
 
 def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
@@ -267,14 +256,12 @@ def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
 
 
 def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
-    """One row per parameter and method with noise, and one with the ceiling."""
+    """One row per parameter and method, and one with the ceiling."""
     rows = []
     for name, values in parameters.items():
         unit, iou, error = SHAPE_PARAMETERS[name].unit, values["iou"], values["iou_std"]
         title = name.replace("_", " ").capitalize() + (f" [{unit}]" if unit else "")
         for method, distance in values["wasserstein"].items():
-            if method.endswith(NO_NOISE):
-                continue  # in metrics.json
             moved = with_std(distance, values["wasserstein_std"][method])
             apart = with_std(values["ks"][method], values["ks_std"][method])
             score = _percent(iou[method], error[method])

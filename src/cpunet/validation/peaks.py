@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.plotting import NO_NOISE
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.shape_parameters import all_parameters
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.comparisons import Compared, Missing, compare
@@ -28,108 +28,59 @@ ByMethod = dict[str, dict[str, Values]]
 
 @dataclass(frozen=True, eq=False)
 class PeakSets:
-    """The simulated and measured pulses of one peak, as rows of the whole datasets.
+    """The pulses of one peak, as rows of the whole datasets.
 
     Parameters
     ----------
     name
         Name of a peak of the recipe, or a range in keV.
-    measured
-        All prepared measured pulses.
-    sim_rows, data_rows
-        Rows of the pulses of the peak.
     translations
-        Translations of the simulated pulses by all methods.
-    amplitudes
-        Current amplitudes of all pulses of each side and method, with noise.
+        Pulses of all methods.
+    rows
+        Rows of the pulses with noise, by method: the data, then from the simplest method to the
+        truth; of translations those that can be prepared.
     """
 
     name: str
-    measured: Pulses
-    sim_rows: Rows
-    data_rows: Rows
     translations: Translations
-    amplitudes: Mapping[str, Values]
+    rows: dict[str, Rows]
 
-    @property
-    def raw(self) -> Pulses:
-        """The simulated pulses of the peak."""
-        return self.translations.simulated[self.sim_rows]
+    @classmethod
+    def of(cls, name: str, chosen: EnergySelection, translations: Translations) -> Self:
+        """Select the pulses of a peak, of both sides and of the translations."""
+        rows = {
+            method: np.flatnonzero(chosen.select(translations.energy_kev[method]) & whole)
+            for method, whole in translations.whole.items()
+        }
+        always = ("data", "raw", "ren")
+        rows = {m: r for m, r in rows.items() if m in always or len(r) >= MIN_PULSES}
+        return cls(name, translations, rows)
 
-    @property
-    def data(self) -> Pulses:
-        """The measured pulses of the peak."""
-        return self.measured[self.data_rows]
-
-    @property
-    def dt_ns(self) -> float:
-        """Sampling period in ns."""
-        return self.translations.simulated.dt_ns
-
-    def rows(self, method: str) -> Rows:
-        """Rows of the pulses with noise of one method in its whole dataset."""
-        if method in ("data", "raw"):
-            return self.data_rows if method == "data" else self.sim_rows
-        return self._prepared(self.translations.whole[method])
-
-    @property
-    def methods(self) -> list[str]:
-        """The data, then the methods with noise from the simplest to the truth."""
-        translated = self.translations.whole
-        enough = [m for m in translated if len(self.rows(m)) >= MIN_PULSES or m == "ren"]
-        return ["data", "raw", *enough]
-
-    def pulses(self, method: str) -> Pulses:
+    def windows(self, method: str) -> FloatArray:
         """Pulses with noise of a method, copied from its whole dataset."""
-        if method in ("data", "raw"):
-            return self.data if method == "data" else self.raw
-        return Pulses.of(self.translations.noisy[method][self.rows(method)], dt_ns=self.dt_ns)
-
-    def noise_free_parameters(self) -> dict[str, dict[str, Values]]:
-        """Parameters of the noise-free pulses of the baseline methods and of the truth."""
-        found = {}
-        for name, kept in self.translations.clean.items():
-            rows = self._prepared(kept.whole)
-            if name not in ("raw", "ren") and len(rows) >= MIN_PULSES:
-                found[f"{name}{NO_NOISE}"] = {k: v[rows] for k, v in kept.parameters.items()}
-        return found
+        return self.translations.windows[method][self.rows[method]]
 
     def known_to_all(self) -> Rows:
-        """Indices within the peak of the events that all methods have without noise."""
-        whole = [kept.whole[self.sim_rows] for kept in self.translations.clean.values()]
-        return np.flatnonzero(np.logical_and.reduce(whole))
-
-    def without_noise(self, places: Rows) -> dict[str, FloatArray]:
-        """Noise-free windows of some events by method, with the truth if it is known."""
-        return self.translations.without_noise(self.sim_rows[places])
+        """Rows of the simulated events that all methods have without noise."""
+        rows = self.rows["raw"]
+        return rows[self.translations.known[rows]]
 
     def paired_scores(self) -> dict[str, PairedScores] | None:
         """Paired scores by method; None if the truth is unknown."""
-        rows = self.sim_rows[self.known_to_all()]
-        scores = {
-            name: scores_of_squares(kept.squares[rows])
-            for name, kept in self.translations.clean.items()
-            if kept.squares is not None
-        }
-        return scores or None
+        rows, squares = self.known_to_all(), self.translations.squares
+        return {name: scores_of_squares(one[rows]) for name, one in squares.items()} or None
 
     def not_prepared(self) -> dict[str, int]:
         """Number of translated pulses that cannot be prepared like data, by method."""
-        whole = dict(self.translations.whole)
-        for name, kept in self.translations.clean.items():
-            if name not in ("raw", "ren"):
-                whole[f"{name}{NO_NOISE}"] = kept.whole
-        counts = {name: int((~kept[self.sim_rows]).sum()) for name, kept in whole.items()}
+        raw, whole = self.rows["raw"], self.translations.whole
+        counts = {m: int((~kept[raw]).sum()) for m, kept in whole.items() if m != "data"}
         return {name: count for name, count in counts.items() if count}
 
     def missing(self) -> str | None:
         """Reason why the peak cannot be scored; None if it can."""
-        sides = (("simulated", self.sim_rows), ("measured", self.data_rows))
+        sides = (("simulated", self.rows["raw"]), ("measured", self.rows["data"]))
         few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
         return f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)" if few else None
-
-    def _prepared(self, flags: npt.NDArray[np.bool_]) -> Rows:
-        return self.sim_rows[flags[self.sim_rows]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,34 +131,33 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, Pea
     Returns
     -------
     values
-        Pulse-shape parameters by method and name: all of `SHAPE_PARAMETERS`, or only those
-        of `PARAMETERS` for methods without noise.  Empty if the peak is not scored.
+        Pulse-shape parameters by method and name.  Empty if the peak is not scored.
     scores
         Scores of the peak.
     """
-    counted = PeakScores(len(peak.sim_rows), len(peak.data_rows), peak.not_prepared())
+    counted = PeakScores(len(peak.rows["raw"]), len(peak.rows["data"]), peak.not_prepared())
     if (missing := peak.missing()) is not None:
         return {}, replace(counted, missing=missing)
+    dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
     values = {
         method: all_parameters(
-            peak.pulses(method),
+            Pulses.of(peak.windows(method), dt_ns=dt_ns),
             recipe.preparation,
             recipe.scores,
-            amplitudes=peak.amplitudes[method][peak.rows(method)],
+            amplitudes=peak.translations.amplitudes[method][rows],
         )
-        for method in peak.methods
-    } | peak.noise_free_parameters()
-    chief = {method: {name: v[name] for name in PARAMETERS} for method, v in values.items()}
-    further = {
-        method: {name: v for name, v in of_method.items() if name not in PARAMETERS}
-        for method, of_method in values.items()
-        if not method.endswith(NO_NOISE)
+        for method, rows in peak.rows.items()
     }
-    align, dt_ns = recipe.preparation.samples_before, peak.dt_ns
-    samples = recipe.preparation.baseline_samples
+    chief, further = (
+        {
+            m: {name: v for name, v in of.items() if (name in PARAMETERS) is chosen}
+            for m, of in values.items()
+        }
+        for chosen in (True, False)
+    )
     noise = baseline_spectra(
-        {method: peak.pulses(method).waveforms[:, :samples].copy() for method in peak.methods},
-        {method: align + values[method]["t01"] / dt_ns for method in peak.methods},
+        {method: peak.windows(method)[:, :samples].copy() for method in values},
+        {m: recipe.preparation.samples_before + of["t01"] / dt_ns for m, of in values.items()},
         samples,
         dt_ns,
     )
@@ -241,9 +191,9 @@ def classifier_tests(
         Seed of the folds.
     """
     tested: dict[str, TwoSample | Missing] = {}
-    data = peak.data.waveforms
-    for method in peak.methods[1:]:
-        others, features = peak.pulses(method).waveforms, (values["data"], values[method])
+    data = peak.windows("data")
+    for method in list(values)[1:]:
+        others, features = peak.windows(method), (values["data"], values[method])
         try:
             tested[method] = classifier_auc(data, others, seed=seed, features=features)
         except CpunetError as error:

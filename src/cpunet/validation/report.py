@@ -153,21 +153,18 @@ class Report:
         """
         import hist
 
-        from cpunet.pulses.shape_parameters import MAX_BINS, data_axis, labelled
+        from cpunet.pulses.shape_parameters import labelled
 
         of_peak = named(self.values, peak, "scored peak")
-        data = named(of_peak["data"], parameter, "parameter")
-        there = {m: v[parameter] for m, v in of_peak.items() if parameter in v}
-        scored = self._compared(peak).get(parameter, {}).get("axis", {})
-        axis = (
-            hist.axis.Regular(int(scored["bins"]), scored["low"], scored["high"])
-            if scored.get("bins")
-            else data_axis(data, MAX_BINS)
-        )
-        methods = hist.axis.StrCategory(list(there), name="method")
-        made: hist.Hist[Any] = hist.Hist(methods, labelled(axis, parameter))
-        for method, values in there.items():
-            made.fill(method, values[np.isfinite(values)])
+        named(of_peak["data"], parameter, "parameter")
+        scores = self.metrics["peaks"][peak]
+        compared = (scores["parameters"] | scores["further"])[parameter]
+        low, high, bins = (compared["axis"][key] for key in ("low", "high", "bins"))
+        axis = labelled(hist.axis.Regular(bins, low, high), parameter)
+        methods = hist.axis.StrCategory(list(of_peak), name="method")
+        made: hist.Hist[Any] = hist.Hist(methods, axis)
+        for method, values in of_peak.items():
+            made.fill(method, values[parameter][np.isfinite(values[parameter])])
         return made
 
     def plot(self, peak: str | None = None, parameter: str = "current_amplitude") -> Figure:
@@ -223,7 +220,6 @@ class Report:
             for peak, of_peak in self.values.items()
             for method, of_method in of_peak.items()
             for name in PARAMETERS
-            if name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         before = gc.get_threshold()

@@ -17,30 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Self
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from cpunet.plotting import (
-    GROUP,
-    colours,
-    label,
-    legend_above,
-    legend_height,
-    line_look,
-    linear_within,
-    panels,
-    styled,
-)
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values, align_half_maximum
 
 BEFORE, AFTER = 100, 150  # samples of a mean pulse before and after half maximum
 SLICES = 4
 MIN_PULSES = 10  # minimum pulses of a slice for an error of its mean
 EDGE_SAMPLES = 100  # about half maximum, in which differences are evaluated
-LINEAR = 0.1  # percent of full charge, up to which the scale of the residuals is linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +67,8 @@ class Slices:
 
     Attributes
     ----------
+    whole
+        Mean of all pulses.
     pulses, edges
         Mean pulse of each slice, and the edges of the slices in ns.
     left_out
@@ -87,6 +76,7 @@ class Slices:
         (no crossing).
     """
 
+    whole: MeanPulse
     pulses: tuple[MeanPulse, ...]
     edges: Values
     left_out: dict[str, int]
@@ -140,19 +130,6 @@ class SliceTable:
     slices: dict[str, list[SliceScore]]
 
 
-class Residual(NamedTuple):
-    """Mean pulse of a method minus that of the data, with its error, in pulse heights."""
-
-    difference: Values
-    error: Values
-
-    @property
-    def z(self) -> Values:
-        r"""Pull :math:`z = (\bar{x} - \bar{x}_{\mathrm{data}}) / \sigma`; NaN without error."""
-        known = self.error > 0
-        return np.where(known, self.difference / np.where(known, self.error, 1), np.nan)
-
-
 def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
     """Edges of slices with equal numbers of measured pulses.
 
@@ -173,25 +150,22 @@ def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
 
 
 def aligned_means(
-    pulses: Callable[[str], Pulses], rise_time: Mapping[str, Values]
-) -> tuple[dict[str, MeanPulse], dict[str, Slices]]:
-    """Mean pulse of all pulses and of each slice, by method.
-
-    Pulses are aligned once for both, one method at a time.
+    windows: Callable[[str], FloatArray], rise_time: Mapping[str, Values]
+) -> dict[str, Slices]:
+    """Mean pulses of each method, in the same slices for all.
 
     Parameters
     ----------
-    pulses
-        Prepared pulses of a method.
+    windows
+        Prepared pulses of a method, shape ``(n, length)``.
     rise_time
         Their rise times in ns by method, those of the measured pulses under ``"data"``.
     """
-    edges, means, slices = slice_edges(rise_time["data"]), {}, {}
-    for method, times in rise_time.items():
-        aligned = align_half_maximum(pulses(method).waveforms, BEFORE, AFTER)
-        means[method] = MeanPulse.of(aligned)
-        slices[method] = sliced(aligned, times, edges)
-    return means, slices
+    edges = slice_edges(rise_time["data"])
+    return {
+        method: sliced(align_half_maximum(windows(method), BEFORE, AFTER), times, edges)
+        for method, times in rise_time.items()
+    }
 
 
 def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
@@ -215,23 +189,7 @@ def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
         "outside": int((timed & ~inside).sum()),
         "unaligned": int(inside.sum()) - sum(pulse.n for pulse in found),
     }
-    return Slices(found, edges, left_out)
-
-
-def slice_residuals(data: Slices, method: Slices) -> tuple[Residual | None, ...]:
-    """Differences between the mean pulses of a method and those of the data.
-
-    Returns
-    -------
-    tuple
-        Residual of each slice; None where a side has fewer than 10 pulses.
-    """
-    return tuple(
-        None
-        if min(measured.n, other.n) < MIN_PULSES
-        else Residual(other.mean - measured.mean, np.hypot(other.error, measured.error))
-        for measured, other in zip(data.pulses, method.pulses, strict=True)
-    )
+    return Slices(MeanPulse.of(aligned), found, edges, left_out)
 
 
 def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> SliceTable:
@@ -253,69 +211,20 @@ def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> SliceTable:
     )
 
 
-@styled
-def slice_figure(sets: Mapping[str, Slices], dt_ns: float, peak: str) -> Figure:
-    """Superpulses (top) and residuals with error bands (bottom), one column per slice.
-
-    Parameters
-    ----------
-    sets
-        Superpulses by method, the measured ones under ``"data"``; drawn in this order, later
-        ones on top.
-    dt_ns
-        Sampling period in ns.
-    peak
-        Name of the gamma line, for the title.
-    """
-    data = sets["data"]
-    n = len(data.pulses)
-    size, top = (2.0 + 2.7 * n, 4.9), legend_height(1) + 0.25
-    shared: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
-    figure, grid = panels(size, 2, n, left=1.1, top=top, between=(0.2, 0.2), **shared)
-    time_ns = dt_ns * np.arange(-BEFORE, len(data.pulses[0].mean) - BEFORE, dtype=float)
-    palette = colours(sets)
-    for i, axes in enumerate(grid[0]):
-        low, high = data.edges[i : i + 2]
-        axes.set_title(f"{low:.0f} … {high:.0f} ns")
-        for method, slices in sets.items():
-            if slices.pulses[i].n:
-                look = line_look(method, palette[method])
-                axes.plot(time_ns, slices.pulses[i].mean, label=label(method), **look)
-        counts = ", ".join(str(slices.pulses[i].n) for slices in sets.values())
-        axes.text(0.97, 0.03, f"n = {counts}", ha="right", transform=axes.transAxes, size=8)
-    for method, slices in sets.items():
-        for axes, residual in zip(grid[1], slice_residuals(data, slices), strict=True):
-            if method == "data" or residual is None:
-                continue
-            middle, error = 100 * residual.difference, 100 * residual.error
-            look = {"color": palette[method], "gid": GROUP + method}
-            axes.plot(time_ns, middle, linewidth=1.0, **look)
-            axes.fill_between(time_ns, middle - error, middle + error, alpha=0.3, lw=0, **look)
-    for axes in grid[1]:
-        axes.axhline(0, color="black", linewidth=0.8)
-        axes.set_xlabel("Time from half maximum [ns]")
-    linear_within(grid[1, 0], LINEAR)
-    grid[1, 0].set_ylabel(f"Method − data\n[% of full charge,\nlinear within ± {LINEAR:g}]")
-    grid[0, 0].set_ylabel("Pulse height")
-    title = f"{peak}: superpulses in slices of rise time 1–90 %; bands: ±1 standard error"
-    legend_above(figure, grid[0, 0], len(sets), title)
-    grid[0, 0].set_xlim(time_ns[0], time_ns[-1])
-    return figure
-
-
 def _scores(data: Slices, method: Slices, dt_ns: float) -> list[SliceScore]:
     scores = []
-    residuals = slice_residuals(data, method)
-    for residual, own, measured in zip(residuals, method.pulses, data.pulses, strict=True):
+    near = slice(BEFORE - EDGE_SAMPLES, BEFORE + EDGE_SAMPLES + 1)
+    for own, measured in zip(method.pulses, data.pulses, strict=True):
         score = SliceScore(own.n, measured.n)
-        if residual is None:
+        if min(own.n, measured.n) < MIN_PULSES:
             few = f"{own.n} pulses beside {measured.n} measured ones"
             missing = f"{few} (at least {MIN_PULSES} are needed)"
             scores.append(replace(score, missing=missing))
             continue
-        near = slice(BEFORE - EDGE_SAMPLES, BEFORE + EDGE_SAMPLES + 1)
-        difference, error, z = (v[near] for v in (*residual, residual.z))
-        known, pulls = np.isfinite(difference), z[np.isfinite(z)]
+        difference = (own.mean - measured.mean)[near]
+        error = np.hypot(own.error, measured.error)[near]
+        known = np.isfinite(difference)
+        pulls = difference[known & (error > 0)] / error[known & (error > 0)]
         worst = int(np.nanargmax(np.abs(difference)))
         found = replace(
             score,

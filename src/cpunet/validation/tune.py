@@ -10,8 +10,6 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import reduce
-from operator import getitem
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
@@ -34,7 +32,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
-from cpunet.settings import Set, checked
+from cpunet.settings import Set, flat, read_settings
 from cpunet.training.job import TrainingJob
 from cpunet.training.networks import differences
 from cpunet.training.run import resolve_device
@@ -131,7 +129,7 @@ def tune(
             "choose another name"
         )
     study.set_user_attr(BEGUN, begun)
-    own = {key: value_of(recipe, key) for key in space}
+    own = {key: own_values(recipe)[key] for key in space}
     given = {key: _in_journal(space[key], value) for key, value in own.items()}
     if not study.trials and None not in given.values():
         study.enqueue_trial(given, {UNCHANGED: True})
@@ -197,26 +195,19 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
                 f"recipe {recipe.name}: search.{key}: only settings of {', '.join(TUNED)} "
                 "can be tuned"
             )
-        value_of(recipe, key)
+        if key not in own_values(recipe):
+            raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
         for value in config.choices or (config.low, config.high):
-            with_values(recipe, {key: value})
+            try:
+                with_values(recipe, {key: value})
+            except CpunetError as error:
+                raise CpunetError(f"recipe {recipe.name}: search.{key}: {error}") from error
     return dict(recipe.search)
 
 
-def value_of(recipe: Recipe, key: str) -> Any:
-    """The value of a setting.
-
-    Raises
-    ------
-    CpunetError
-        If the recipe has none of that name.
-    """
-    try:
-        return reduce(getitem, key.split("."), recipe.model_dump(mode="json"))
-    except (LookupError, TypeError):
-        raise CpunetError(
-            f"recipe {recipe.name}: search.{key}: there is no such setting"
-        ) from None
+def own_values(recipe: Recipe) -> dict[str, Any]:
+    """All settings of a recipe, as ``training.ridge``, and their values."""
+    return dict(flat(recipe.model_dump(mode="json")))
 
 
 def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
@@ -227,12 +218,7 @@ def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
     CpunetError
         If a value is not allowed.
     """
-    settings = recipe.model_dump(mode="json") | {"search": None}
-    for key, value in values.items():
-        *parents, last = key.split(".")
-        reduce(getitem, parents, settings)[last] = value
-    source = ", ".join(f"{key} = {value}" for key, value in values.items())
-    return checked(Recipe, settings, f"recipe {recipe.name}, search, {source}")
+    return read_settings(Recipe, recipe, {**values, "search": None})
 
 
 def _in_journal(config: SearchConfig, value: Any) -> Any:

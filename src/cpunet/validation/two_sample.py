@@ -28,7 +28,7 @@ Values = npt.NDArray[np.float64]
 Parameters = Mapping[str, Values]
 
 MIN_PULSES = 40  # pulses per side: 8 in each test fold
-LARGEST = 1000  # pulses per side: resolves an AUC to 0.013
+LARGEST = 1000  # pulses per side, drawn at random: resolves an AUC to 0.013
 BLOCK = 256  # pulses per block: bounds memory
 FOLDS = 5
 SHUFFLES = 40  # determine the spread of the null to a ninth
@@ -78,7 +78,6 @@ def classifier_auc(
     *,
     seed: int | np.random.Generator,
     features: tuple[Parameters, Parameters] | None = None,
-    largest: int = LARGEST,
 ) -> TwoSample:
     """Test whether two sets of pulses can be distinguished.
 
@@ -96,8 +95,6 @@ def classifier_auc(
         Seed of the choice of pulses, the folds and the shuffles.
     features
         Further values per pulse by name, the same ones of the data and of the others.
-    largest
-        Maximum number of pulses per side; they are drawn at random.
 
     Returns
     -------
@@ -119,7 +116,7 @@ def classifier_auc(
         np.flatnonzero(np.isfinite(windows).all(axis=1) & np.isfinite(extra).all(axis=1))
         for windows, extra in zip(sides, extras, strict=True)
     ]
-    size = min(largest, *map(len, usable))
+    size = min(LARGEST, *map(len, usable))
     if size < MIN_PULSES:
         raise CpunetError(
             f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable, "

@@ -119,9 +119,8 @@ def _report(run: Run, pair: Pair, how: Mapping[str, Any]) -> Report:
     # nor is matplotlib while the pulses take most memory
     from cpunet.validation.drawings import drawings
 
-    values = {peak: of_peak for peak, of_peak in found.values.items() if of_peak}
     notes = _notes(run, found.metrics, how["truth"])
-    return Report(found.metrics, values, None, drawings(found), notes)
+    return Report(found.metrics, found.values, None, drawings(found), notes)
 
 
 def _of_channels(

@@ -21,13 +21,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from cpunet.plotting import NO_NOISE, label
+from cpunet.plotting import label
 from cpunet.pulses.parameters import PARAMETERS
 
 AGREES = 2.0  # sigma
 TOO_CLOSE = 4.0  # sigma on the good side: not by chance, but the same events on both sides
-LISTED = 6  # agreeing quantities listed by name; more are only counted
-BY_CHANCE = 0.08  # fraction of a perfect translation's parameters off in IoU or distance
 WITHIN = "agrees within errors"
 
 Worse = Literal["lower", "higher", "both"]
@@ -194,8 +192,6 @@ def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdi
 def verdict_table(metrics: Metrics) -> dict[str, dict[str, dict[str, Words]]]:
     """Verdicts on all methods, ready for JSON.
 
-    Methods without noise are left out, since the missing noise alone makes them differ.
-
     Parameters
     ----------
     metrics
@@ -247,20 +243,24 @@ def summary(metrics: Metrics, peak: str, method: str) -> str:
             worst = max(known.values(), key=lambda v: v.severity)
             quoted = f" ({worst.numbers})" if worst.numbers else ""
             off.append((worst.severity, f"{_called(name)} {worst.words}{quoted}"))
-    parts = [_agreement(agreeing, len(off))] if agreeing else []
+    parts = []
+    if agreeing:
+        *first, last = agreeing
+        names = f"{', '.join(first)} and {last}" if first else last
+        parts = [f"{names} {'agree' if first else 'agrees'} with the data within errors"]
     parts += [text for _, text in sorted(off, key=lambda pair: -pair[0])]
     head = f"{_SHORT.get(method, label(method))}, {peak}"
     return f"{head}: {'; '.join(parts + silent) or 'not scored'}"
 
 
 def methods_of(metrics: Metrics, peak: str) -> list[str]:
-    """Methods with noise in the scores of a peak, in their order there."""
+    """Methods in the scores of a peak, in their order there."""
     scores = part(metrics, "peaks", peak)
     names = [
         *(m for p in part(scores, "parameters") for m in part(scores, "parameters", p, "iou")),
         *part(scores, "two_sample"),
     ]
-    return [m for m in dict.fromkeys(names) if m != "ceiling" and not m.endswith(NO_NOISE)]
+    return [m for m in dict.fromkeys(names) if m != "ceiling"]
 
 
 def part(metrics: Any, *keys: str) -> Mapping[str, Any]:
@@ -281,18 +281,6 @@ def number(metrics: Any, *keys: str) -> float | None:
 def _called(quantity: str) -> str:
     named = {_AUC: "classifier", _SURVIVAL: "A/E survival"}
     return named.get(quantity, quantity.replace("_", " "))
-
-
-def _agreement(agreeing: list[str], n_off: int) -> str:
-    """List the agreeing quantities, or only their number if they are too many for a line."""
-    if len(agreeing) > LISTED:
-        total = len(agreeing) + n_off
-        count = f"{len(agreeing)} of {total}" if n_off else f"all {total}"
-        chance = f" (by chance about {BY_CHANCE * total:.0f} would not)" if n_off else ""
-        return f"{count} scores agree with the data within errors{chance}"
-    *first, last = agreeing
-    names = f"{', '.join(first)} and {last}" if first else last
-    return f"{names} {'agree' if first else 'agrees'} with the data within errors"
 
 
 def judged_scores(metrics: Metrics, method: str) -> tuple[int, int]:
