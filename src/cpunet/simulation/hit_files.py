@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from cpunet.simulation.hits import (
     Hits,
     IntArray,
 )
-from cpunet.tables import counted, span
+from cpunet.tables import Lines, counted, span
 
 # More hits outside the crystal are those of another frame, or of another detector.
 _MISPLACED_PERCENT = 1.0
@@ -229,61 +229,12 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
     return {"event_number": (number, ""), **places, "edep": (hits.edep_kev, "keV")}
 
 
-@dataclass(frozen=True)
-class HitsInfo:
-    """What is known of the hits of one detector.
-
-    Parameters
-    ----------
-    events, hits
-        Their numbers.
-    energy_kev
-        Lowest and highest energy of an event in keV.
-    extents_mm
-        Lowest and highest x, y, z and r in the frame of the crystal.
-    peaks
-        Number of events in each gamma line, by the energy deposited.
-    crystal
-        Crystal in which the hits should lie, if one was given.
-    outside_percent
-        Share of the hits outside it.
-    """
-
-    events: int
-    hits: int
-    energy_kev: list[float]
-    extents_mm: dict[str, list[float]]
-    peaks: dict[str, int]
-    crystal: Detector | None
-    outside_percent: float
-
-    @property
-    def lines(self) -> list[tuple[str, str]]:
-        """Names and texts."""
-        extents = ", ".join(f"{axis} {span(ends, 2)}" for axis, ends in self.extents_mm.items())
-        lines = [
-            ("hits", f"{self.hits} of {self.events} events"),
-            ("energy", f"{span(self.energy_kev)} keV an event"),
-            ("lines", counted(self.peaks)),
-            ("extents", f"{extents} mm"),
-        ]
-        if (crystal := self.crystal) is not None:
-            size = f"radius {crystal.crystal_radius:g} mm, z 0 to {crystal.crystal_length:g} mm"
-            misplaced = self.outside_percent > _MISPLACED_PERCENT
-            remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
-            lines += [
-                ("crystal", f"{crystal.name}, {size}"),
-                ("outside", f"{self.outside_percent:.2f} % of the hits{remedy}"),
-            ]
-        return lines
-
-
 def describe_hits(
     path: Path,
     options: HitOptions,
     peaks: Mapping[str, PeakConfig],
     crystal: Detector | None = None,
-) -> dict[str, HitsInfo | str]:
+) -> dict[str, Lines]:
     """Describe the hits of a file, detector by detector.
 
     Parameters
@@ -300,10 +251,11 @@ def describe_hits(
     Returns
     -------
     dict
-        By name of the detector (``""`` if the file names none); or the reason why its hits
+        Topics and texts by name of the detector (``""`` if the file names none): hits, their
+        energies, gamma lines and extents in the frame of the crystal; or the reason why they
         cannot be read.
     """
-    found: dict[str, HitsInfo | str] = {}
+    found: dict[str, Lines] = {}
     names: list[str | None] = [options.hits_detector]
     if options.hits_detector is None:
         with step_tables(path) as tables:
@@ -312,21 +264,35 @@ def describe_hits(
         try:
             hits = read_hits(path, replace(options, hits_detector=name))
         except CpunetError as error:
-            found[name or ""] = str(error).removeprefix(f"{path}: ")
-            continue
-        places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
-        lines = label_peaks(hits.energy_kev, peaks)
-        outside = 0.0 if crystal is None else np.mean(~crystal.inside(hits.r_mm, hits.z_mm))
-        found[name or ""] = HitsInfo(
-            events=len(hits),
-            hits=len(hits.edep_kev),
-            energy_kev=_ends(hits.energy_kev),
-            extents_mm={axis: _ends(values) for axis, values in places.items()},
-            peaks={peak: int((lines == peak).sum()) for peak in peaks},
-            crystal=crystal,
-            outside_percent=100 * float(outside),
-        )
+            found[name or ""] = [("hits", str(error).removeprefix(f"{path}: "))]
+        else:
+            found[name or ""] = _in_words(hits, peaks, crystal)
     return found
+
+
+def _in_words(
+    hits: Hits, peaks: Mapping[str, PeakConfig], crystal: Detector | None
+) -> list[tuple[str, str]]:
+    energy_kev = hits.energy_kev
+    lines = label_peaks(energy_kev, peaks)
+    places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
+    extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
+    words = [
+        ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
+        ("energy", f"{span(_ends(energy_kev))} keV an event"),
+        ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
+        ("extents", f"{', '.join(extents)} mm"),
+    ]
+    if crystal is not None:
+        percent = 100 * float(np.mean(~crystal.inside(hits.r_mm, hits.z_mm)))
+        size = f"radius {crystal.crystal_radius:g} mm, z 0 to {crystal.crystal_length:g} mm"
+        misplaced = percent > _MISPLACED_PERCENT
+        remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
+        words += [
+            ("crystal", f"{crystal.name}, {size}"),
+            ("outside", f"{percent:.2f} % of the hits{remedy}"),
+        ]
+    return words
 
 
 def _ends(values: FloatArray) -> list[float]:
