@@ -201,8 +201,7 @@ def _look(
         hits = describe_hits(Path(path), frame, recipe.peaks, inside)
         lines = [("file", str(path))]
         for name, one in hits.items():
-            lines.append(("detector", name))
-            lines += [("hits", one)] if isinstance(one, str) else one.lines
+            lines += [("detector", name), *one]
         return InfoResult(str(path), lines)
     return _file(pulse_file(path, read), recipe)
 

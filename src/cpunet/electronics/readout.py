@@ -6,6 +6,7 @@ wandering baselines disturb the traces.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -24,7 +25,6 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray as PulseArray
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import open_pulses
-from cpunet.simulation.gammas.sample import with_resolution
 
 # Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
 # the record moves its level and the trace's end is independent of its beginning.
@@ -368,15 +368,13 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         | np.where(n_piled > 0, PILE_UP, 0)
         | np.where(beyond.any(axis=1), SATURATED, 0)
     ).astype(np.uint8)
+    # the resolution grows with the root of the energy
+    fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
+    smeared = np.random.default_rng(int(resolution.integers(2**63)))
     return RawTraces(
         waveforms=cast(PulseArray, np.clip(adc, 0, electronics.adc_top).astype(np.uint16)),
         dt_ns=electronics.dt_ns,
-        energy_kev=with_resolution(
-            energy,
-            noise_kev2=0.0,
-            fano_kev=electronics.resolution_fwhm_kev**2 / REFERENCE_KEV,
-            seed=int(resolution.integers(2**63)),
-        ),
+        energy_kev=smeared.normal(energy, fwhm_kev / math.sqrt(8 * math.log(2))),
         event_number=pulses.event_number,
         peak=pulses.peak,
         flag=flag,
