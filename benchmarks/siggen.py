@@ -34,7 +34,7 @@ class StoredMaps:
     e_r_V_per_cm: Array
     e_z_V_per_cm: Array
     weighting_potential: Array
-    point_type: npt.NDArray[np.int8]
+    region: npt.NDArray[np.int8]
     temperature_K: float = 90.0
 
 

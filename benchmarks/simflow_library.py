@@ -1,6 +1,6 @@
 """Translate ideal pulse-shape libraries: time, memory, and A/E of events from the library.
 
-    python benchmarks/simflow_library.py RUN [--detector icpc] [--grid-mm 0.5] [--ranks 16,64]
+    python benchmarks/simflow_library.py RUN [--detector icpc] [--grid-mm 0.5]
     python benchmarks/simflow_library.py RUN --detector geometry_A.yaml --hits g4_h20mm.npz
 
 RUN contains a readout chain.  Each step runs in its own process, to measure its peak memory.
@@ -12,6 +12,7 @@ own azimuth, and at that of the hits.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -21,11 +22,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import awkward as ak
+import h5py
 import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.legend.current_library import read_library
 from cpunet.legend.currents import PEAK, currents_about_peak
 from cpunet.legend.translate_library import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
@@ -100,13 +101,14 @@ def read_out(path: Path, name: str, hits: Hits) -> np.ndarray:
 
 def compare(folder: Path, detector: str, hits: Hits, path: Path) -> None:
     """Print how far A/E from the library is from the full translation."""
-    library = read_library(path)
-    mode = library.told["mode_per_ns"]
+    with h5py.File(path) as file:
+        ((name, library),) = file.items()
+        mode = json.loads(library.attrs["cpunet"])["mode_per_ns"]
     turned = replace(hits, x_mm=np.hypot(hits.x_mm, hits.y_mm), y_mm=np.zeros(len(hits.x_mm)))
     for title, these in (("azimuth 0", turned), ("own azimuth", hits)):
         full = drifted(folder, detector, these, mode)
         begun = time.monotonic()
-        apart = 100 * (read_out(path, library.detector, these) / full - 1)
+        apart = 100 * (read_out(path, name, these) / full - 1)
         taken = time.monotonic() - begun
         quantiles = np.percentile(np.abs(apart), [50, 90, 99, 100])
         print(
@@ -124,7 +126,6 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--detector", default="icpc")
     parser.add_argument("--grid-mm", type=float, default=0.5)
-    parser.add_argument("--ranks", default="16,64")
     parser.add_argument("--hits", type=Path)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -135,11 +136,7 @@ def main() -> None:
         name = read_detector(given.detector).name
         words += ["--detector", name] if name else []
         run(*words, "--out", whole)
-        files = [ideal, whole]
-        for rank in given.ranks.split(","):
-            files.append(Path(folder) / f"rank{rank}.lh5")
-            run(*words, "--low-rank", rank, "--out", files[-1])
-        for file in files:
+        for file in (ideal, whole):
             print(f"  {file.name}: {file.stat().st_size / 1e6:.1f} MB")
         if given.hits:
             compare(given.run, given.detector, events_of(given.hits, given.detector), whole)

@@ -19,7 +19,7 @@ import scipy.fft
 
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.legend.currents import PEAK, currents_about_peak
-from cpunet.legend.lithium import LithiumLayer, arrived, delayed
+from cpunet.legend.lithium import LithiumLayer, arrived
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
@@ -49,6 +49,28 @@ def told(undecayed: Exponentials, fine: np.ndarray) -> tuple[np.ndarray, np.ndar
     currents, _ = currents_about_peak(signal)
     late = np.arange(PLATEAU) > (signal < 0.8).argmin(axis=1)[:, None]
     return currents[..., PEAK], ((1 - signal[:, :PLATEAU]) * late).sum(axis=1)
+
+
+def delayed(charge: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Pulses of charge that reaches the boundary gradually.
+
+    Parameters
+    ----------
+    charge
+        Pulses of charge released at the boundary, shape (n, samples).
+    share
+        Fraction that has arrived at each sample, shape (n, samples) or (samples,).
+
+    Returns
+    -------
+    numpy.ndarray
+        Float32 (n, samples), in units of the charge released in the layer.
+    """
+    n_samples = charge.shape[1]
+    coming = np.diff(np.broadcast_to(share, charge.shape), axis=1, prepend=0)
+    length = scipy.fft.next_fast_len(2 * n_samples, real=True)
+    spectra = scipy.fft.rfft(charge.astype(float), length) * scipy.fft.rfft(coming, length)
+    return np.asarray(scipy.fft.irfft(spectra, length)[:, :n_samples], np.float32)
 
 
 def of_the_layer(chain: Exponentials, detector: Detector, fields: FieldMaps) -> None:

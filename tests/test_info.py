@@ -12,10 +12,13 @@ import pytest
 from torch import nn
 
 from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load
+from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.description import trace_properties
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_files import describe_hits
 from cpunet.training import chain_description
 from synthetic import status_of, write_pulses, write_run
 
@@ -33,21 +36,16 @@ def test_a_file_of_pulses(tmp_path):
     energies = [2614.0, 2615.0, 2103.0, 500.0, np.nan, 100.0]
     path = tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=energies))
-    assert info(path).values == {
-        "path": str(path),
-        "format": "LH5",
-        "table": "geds/sim/waveform",
-        "columns": ["energy", "event_number"],
-        "n_pulses": 6,
-        "length": 20,
-        "dt_ns": 16.0,
-        "energy": "column energy [keV]",
-        "energy_kev": [100.0, 2615.0],
-        "n_without_energy": 1,
-        "peaks": {"FEP": 2, "SEP": 1, "DEP": 0},
-        "samples": [-3.0, 19.0],
-        "n_not_finite": 2,
-        "n_constant": 1,
+    assert dict(info(path).lines) == {
+        "file": str(path),
+        "format": "LH5, table geds/sim/waveform",
+        "traces": "6 of 20 samples, every 16 ns",
+        "columns": "energy, event_number",
+        "energy": "column energy [keV], 100 … 2615 keV; 1 pulses have none",
+        "lines": "2 FEP, 1 SEP",
+        "source": "",
+        "amplitudes": "",
+        "samples": "values -3 … 19; 2 traces not finite; 1 traces constant",
     }
 
 
@@ -63,17 +61,20 @@ def test_a_file_is_opened(tmp_path):
 @pytest.mark.thorough
 def test_tails_of_a_bench_detector(reference_data: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
-    told = info(path, read=FileOptions(kev_per_adc=calibrated)).values
-    assert told["tails"]["rate_khz"] == pytest.approx(1.4, abs=0.3)
-    json.dumps(told)
-    assert told["tails"]["percent_above"]["10_kev"]["measured"] == pytest.approx(30, abs=3)
+    file = PulseFile(path, kev_per_adc=calibrated)
+    tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
+    lines = info(path, read=FileOptions(kev_per_adc=calibrated)).lines
+    assert lines[-2:] == tails_in_words(tails.describe())
+    assert tails.describe()["rate_khz"] == pytest.approx(1.4, abs=0.3)
+    assert len(tails.kev) == 1000
+    assert np.nanmean(tails.kev > 10) == pytest.approx(0.3, abs=0.03)
 
 
 def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
-    told = info(path).values
-    assert told["tails"].startswith("not known: only 0 of 40 traces can be prepared")
+    told = dict(info(path).lines)["pile-up tails"]
+    assert told.startswith("not known: only 0 of 40 traces can be prepared")
 
 
 def test_a_run_folder(tmp_path):
@@ -95,15 +96,17 @@ def test_every_table_of_a_file(tmp_path):
             group = made.create_group(f"ch{channel}/raw")
             group["waveform"] = np.zeros((channel, 50), np.float32)
             group["waveform"].attrs["dt"] = 16.0
-    told = info(file, read=DT)
-    found = {name: (one["n_pulses"], one["length"]) for name, one in told.values.items()}
-    assert found == {"ch3/raw": (3, 50), "ch7/raw": (7, 50)}
-    one = FileOptions(table="ch7/raw", dt_ns=16)
-    assert info(file, read=one).values["n_pulses"] == 7
-    assert "ch3/raw" in str(told)
+    rows = [line.split()[:4] for line in str(info(file, read=DT)).splitlines()]
+    assert rows[:3] == [
+        ["table", "traces", "samples", "ns"],
+        ["ch3/raw", "3", "50", "16"],
+        ["ch7/raw", "7", "50", "16"],
+    ]
+    one = info(file, read=FileOptions(table="ch7/raw", dt_ns=16))
+    assert dict(one.lines)["traces"] == "7 of 50 samples, every 16 ns"
     every = info(file, read=FileOptions(table="all", dt_ns=16))
     assert every.ok
-    assert str(every.tables["ch7"]) == str(info(file, read=one))
+    assert str(every).endswith(f"ch7:\n{one}")
 
 
 def test_amplitudes_suggest_a_calibration(tmp_path):
@@ -114,24 +117,24 @@ def test_amplitudes_suggest_a_calibration(tmp_path):
     traces[:, 20:] = 15 * kev[:, np.newaxis]
     file = tmp_path / "raw.npy"
     np.save(file, traces)
-    told = info(file, read=DT).values
-    assert "Th-228" in told["amplitudes"]
-    assert float(told["amplitudes"].split()[-1]) == pytest.approx(1 / 15, rel=1e-3)
+    told = dict(info(file, read=DT).lines)["amplitudes"]
+    assert "Th-228" in told
+    assert float(told.split()[-1]) == pytest.approx(1 / 15, rel=1e-3)
     noise = rng.uniform(100, 2600, (3000, 1)).astype(np.float32) * np.ones((1, 40), np.float32)
     noise[:, :20] = 0
     np.save(file, noise)
-    assert info(file, read=DT).values["amplitudes"] == "no lines that stand out"
+    told = dict(info(file, read=DT).lines)
+    assert told["amplitudes"] == "no lines that stand out"
 
 
 def test_files_of_hits_are_described(tmp_path):
     path = tmp_path / "hits.npz"
     place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
     np.savez(path, **place, edep_keV=[2000.0, 614.5, 50.0], offsets=np.array([0, 2, 3]))
-    told = info(path).values[""]
-    assert (told["events"], told["hits"]) == (2, 3)
-    assert told["energy_kev"] == [50.0, 2614.5]
-    assert told["extents_mm"]["r"] == [0.0, 5.0]
-    assert told["peaks"] == {"FEP": 1, "SEP": 0, "DEP": 0}
+    told = dict(describe_hits(path, HitOptions(), RECIPE.peaks)[""])
+    assert told["hits"] == "3 of 2 events"
+    assert told["energy"] == "50 … 2614.5 keV an event"
+    assert told["lines"] == "1 FEP"
     csv = tmp_path / "hits.csv"
     names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
     csv.write_text(
@@ -140,11 +143,11 @@ def test_files_of_hits_are_described(tmp_path):
     assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
     assert "names no unit" in str(info(csv))
     units = HitOptions(length_unit="cm", energy_unit="keV")
-    assert info(csv, frame=units).values[""]["extents_mm"]["x"] == [30, 30]
+    assert "x 30 … 30" in str(info(csv, frame=units))
 
 
 def test_the_properties_are_those_that_were_made():
-    """Noise, decay, trigger and saturation of traces made here."""
+    """Noise and decay of traces made here."""
     rng, n, length, at = np.random.default_rng(4), 60, 1600, 700
     time = np.arange(length)
     shape = np.where(time < at, 0, np.exp(-(time - at) * 16e-3 / 50))
@@ -152,23 +155,22 @@ def test_the_properties_are_those_that_were_made():
     traces = np.round(traces + rng.normal(0, 6, traces.shape))
     traces[:3] = np.minimum(traces[:3], 2000)
     pulses = Pulses.of(traces, dt_ns=16, energy_kev=np.linspace(1000, 2000, n))
-    told = trace_properties([pulses], RECIPE)
-    assert told.trigger_sample == [at, at, at]
-    assert told.baseline_samples == at
-    assert told.noise_adc == pytest.approx(6, rel=0.1)
+    told = dict(trace_properties([pulses], RECIPE))
+    adc, kev = (float(part.split()[0]) for part in told["noise"].split(", ")[:2])
+    assert adc == pytest.approx(6, rel=0.1)
     # 1000 keV are 2000 ADC, of which an eighth has decayed at the end of a window
-    assert told.noise_kev == pytest.approx(3, rel=0.04)
-    assert told.decay_us == pytest.approx(50, rel=0.02)
-    assert told.saturated_percent == pytest.approx(5)
+    assert kev == pytest.approx(3, rel=0.04)
+    assert float(told["decay"].split()[0]) == pytest.approx(50, rel=0.02)
+    assert told["left out"].startswith("3 saturated")
     with pytest.raises(CpunetError, match="only 0 of 60 traces hold a pulse"):
         trace_properties([Pulses.of(np.ones((n, 200)), dt_ns=16)], RECIPE)
 
 
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
-    told = info(stand_of_one_detector).values
-    assert told["provenance"]["made by"].startswith("cpunet simulate")
-    assert told["provenance"]["detector"].startswith("ppc, 2500 V, 90 K, charge clouds of 0.1")
-    assert told["provenance"]["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
+    told = dict(info(stand_of_one_detector).lines)
+    assert told["made by"].startswith("cpunet simulate")
+    assert told["detector"].startswith("ppc, 2500 V, 90 K, charge clouds of 0.1")
+    assert told["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
 
 
 @pytest.fixture
@@ -192,8 +194,8 @@ def test_hits_are_compared_with_a_crystal(reference_data: Path, tmp_path):
     """Hits of a crystal without the taper, and the same where it stands turned over."""
     path = reference_data / "geant4" / "g4_h20mm.npz"
     crystal = read_detector("icpc")
-    right = info(path, detector=crystal).values[""]
-    assert right["outside_percent"] == pytest.approx(10.5, abs=0.3)
+    right = dict(describe_hits(path, HitOptions(), RECIPE.peaks, crystal)[""])["outside"]
+    assert float(right.split()[0]) == pytest.approx(10.5, abs=0.3)
     with np.load(path) as file:
         arrays = {name: file[name] for name in ("x_mm", "edep_keV", "offsets")}
         arrays |= {"y_mm": -file["y_mm"] - 10, "z_mm": 200 - file["z_mm"]}
@@ -201,14 +203,15 @@ def test_hits_are_compared_with_a_crystal(reference_data: Path, tmp_path):
     moved = info(tmp_path / "moved.npz", detector=crystal)
     assert "100.00 % of the hits; check `origin`, `flip_z`" in str(moved)
     given = HitOptions(origin=(0, -10, 200), flip_z=True)
-    told = info(tmp_path / "moved.npz", detector=crystal, frame=given).values[""]
-    assert told["outside_percent"] == pytest.approx(right["outside_percent"])
+    told = describe_hits(tmp_path / "moved.npz", given, RECIPE.peaks, crystal)[""]
+    assert dict(told)["outside"] == right
 
 
 def test_traces_that_are_no_numbers(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
-    assert info(tmp_path / "pulses.npy", read=DT).values["n_not_finite"] == 30
-    with pytest.raises(CpunetError, match="no spectrum to draw"):
+    told = dict(info(tmp_path / "pulses.npy", read=DT).lines)
+    assert told["samples"] == "values –; 30 traces not finite"
+    with pytest.raises(CpunetError, match="is no detector to draw; leave out `out`"):
         info(tmp_path / "pulses.npy", read=DT, out=tmp_path / "e.png")
 
 
@@ -243,9 +246,14 @@ def test_numbers_of_a_detector():
 def test_impurities_from_the_measured_depletion():
     values = COARSE | {"measured_depletion_V": 2200}
     found = info("ppc", settings=values | {"impurity_scale": "depletion"})
-    assert found.values["depletion_V"] == pytest.approx(2200, abs=1)
+    depletion = dict(found.lines)["depletion voltage"]
+    assert float(depletion.split()[0]) == pytest.approx(2200, abs=1)
     # given by hand, the scale leads to the same fields
-    scale = {"impurity_scale": found.values["impurity_scale"]}
+    scale = {
+        "impurity_scale": read_detector(
+            "ppc", values | {"impurity_scale": "depletion"}
+        ).impurity_scale
+    }
     assert info("ppc", settings=values | scale).lines == found.lines
 
 
@@ -274,14 +282,11 @@ def test_the_command_line(tmp_path, capsys):
 
 
 def test_measured_traces_are_described(reference_data: Path):
-    """A bench detector: what its digitiser was set to, and what is seen by eye."""
-    told = info(reference_data / "real" / "th228.fcio").values["traces"]
-    assert told["looked_at"] == 1000
-    low, middle, high = told["trigger_sample"]
-    assert low <= middle <= high
-    assert middle == pytest.approx(911, abs=3)
-    assert 700 < told["baseline_samples"] < middle
-    assert told["decay_us"] == pytest.approx(78.9, rel=0.03)
-    assert told["saturated_percent"] == pytest.approx(0.2)
-    assert told["noise_adc"] == pytest.approx(15, abs=2)
-    assert told["noise_kev"] is None
+    """A bench detector, whose properties are seen by eye."""
+    told = dict(info(reference_data / "real" / "th228.fcio").lines)
+    assert float(told["decay"].removesuffix(" µs")) == pytest.approx(78.9, rel=0.03)
+    adc, _, words = told["noise"].partition(" ADC ")
+    assert float(adc) == pytest.approx(15, abs=2)
+    assert words == "(RMS of a baseline, median)"  # without energies not in keV
+    assert told["left out"].startswith("2 saturated")
+    assert told["left out"].endswith(" of 1000 traces")

@@ -74,10 +74,6 @@ order in which data flow.
 
 ::: cpunet.merge_libraries
 
-::: cpunet.expand_library
-
-::: cpunet.read_library
-
 ::: cpunet.lithium_table
 
 ::: cpunet.LegendParameters

@@ -9,11 +9,9 @@ from cpunet.electronics.stand import make_stand as make_stand
 from cpunet.errors import CpunetError as CpunetError
 from cpunet.inspection import info as info
 from cpunet.inspection import load as load
-from cpunet.legend.current_library import expand_library as expand_library
-from cpunet.legend.current_library import merge_libraries as merge_libraries
-from cpunet.legend.current_library import read_library as read_library
 from cpunet.legend.export import LegendParameters as LegendParameters
 from cpunet.legend.export import export_legend as export_legend
+from cpunet.legend.library_files import merge_libraries as merge_libraries
 from cpunet.legend.lithium import LithiumLayer as LithiumLayer
 from cpunet.legend.lithium import lithium_table as lithium_table
 from cpunet.legend.make_library import make_library as make_library

@@ -1,10 +1,10 @@
-"""Open HDF5 files for reading, and their columns; errors of the library become one line."""
+"""Open HDF5 files for reading; errors of the library become one line."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.tables import shortened
 
 
 @contextmanager
@@ -72,69 +71,18 @@ def is_column(item: object) -> bool:
     return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
 
 
-@dataclass(frozen=True)
-class Hdf5Column:
-    """Dataset of an HDF5 file with one value per event; the file is open only while reading.
-
-    Parameters
-    ----------
-    path, dataset
-        File, and path of the dataset in it.
-    units
-        The attribute ``units``, empty if there is none.
-    size
-        Number of values.
-    constant
-        Whether it is a scalar, which applies to all events.
-    first
-        Row of the first event.
-    """
+@dataclass(frozen=True, eq=False)
+class StoredRows:
+    """Rows of a dataset, all or some of them; the file is open only while they are read."""
 
     path: Path
     dataset: str
-    units: str
-    size: int
-    constant: bool
-    first: int = 0
+    shape: tuple[int, ...]
+    rows: npt.NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
-        return self.size
+        return self.shape[0]
 
-    def part(self, first: int, size: int) -> Hdf5Column:
-        """The rows of some events."""
-        return self if self.constant else replace(self, first=first, size=size)
-
-    def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events `start` to `stop` - 1, shape ``(stop - start,)``."""
+    def __getitem__(self, part: slice) -> Any:
         with opened(self.path) as file:
-            if self.constant:
-                return np.full(stop - start, file[self.dataset][()])
-            return np.asarray(file[self.dataset][self.first + start : self.first + stop])
-
-
-def columns_of(path: Path, group: h5py.Group) -> dict[str, Hdf5Column]:
-    """Columns of a group: its numeric datasets of one dimension, and its scalars."""
-    members = {name: group.get(name) for name in group}
-    return {name: _column(path, m) for name, m in members.items() if is_column(m)}
-
-
-def column_of(path: Path, name: str) -> tuple[Hdf5Column, dict[str, Hdf5Column]]:
-    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
-
-    Raises
-    ------
-    CpunetError
-        If there is no such file or column; the message lists the other columns of the group.
-    """
-    with opened(path) as file:
-        found = file.get(name)
-        if is_column(found):
-            return _column(path, found), columns_of(path, found.parent)
-        parent = file.get(name.strip("/").rpartition("/")[0] or "/")
-        known = list(columns_of(path, parent)) if isinstance(parent, h5py.Group) else list(file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(known)}")
-
-
-def _column(path: Path, dataset: h5py.Dataset) -> Hdf5Column:
-    units = text_attribute(dataset, "units")
-    return Hdf5Column(path, dataset.name, units, dataset.size, dataset.ndim == 0)
+            return file[self.dataset][part if self.rows is None else self.rows[part]]

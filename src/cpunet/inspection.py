@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -43,41 +40,31 @@ class InfoResult:
         What was looked at.
     lines
         Topics and texts.
-    values
-        The same as numbers.
-    tables
-        All tables of a file, if these were wanted, or the reason why one cannot be read.
     ok
         Whether all that was wanted can be read.
     """
 
     path: str
-    lines: Lines = ()
-    values: Mapping[str, Any] = field(default_factory=dict)
-    tables: Mapping[str, InfoResult | str] = field(default_factory=dict)
+    lines: Lines
     ok: bool = True
     _draw: Callable[[], Figure] | None = None
 
     def __str__(self) -> str:
-        whole = [f"{name}:\n{one}" for name, one in self.tables.items()]
-        return "\n".join([aligned(self.lines), *whole] if self.lines else whole)
+        return aligned(self.lines)
 
     def __repr__(self) -> str:
         return f"<InfoResult {self.path}>"
 
     def plot(self) -> Figure:
-        """Draw the spectrum of pulses, or the fields of a detector.
+        """Draw the fields of a detector.
 
         Raises
         ------
         CpunetError
-            If there is neither.
+            If it is none.
         """
         if self._draw is None:
-            raise CpunetError(
-                f"{self.path}: no spectrum to draw",
-                "give one detector or the `table` of one detector's pulses, or no `out`",
-            )
+            raise CpunetError(f"{self.path}: is no detector to draw", "leave out `out`")
         return self._draw()
 
     def save(self, path: str | Path, force: bool = False) -> None:
@@ -108,9 +95,9 @@ def info(
     """Say what is in a file, detector, run, stand or report.
 
     Of pulses: events, sampling, energies, peaks and provenance; of measured traces, also
-    trigger, baseline, decay, noise, saturation and pile-up, and what earlier pulses have left
-    under them. Of hits: events, energies and where they lie. Of a detector: its capacitance,
-    depletion voltage and fields. Of a run: what was trained on what, and how well it fits.
+    decay, noise, what quality cuts leave out, and pile-up tails. Of hits: events, energies and
+    where they lie. Of a detector: its capacitance, depletion voltage and fields. Of a run: what
+    was trained on what, and how well it fits.
 
     Parameters
     ----------
@@ -126,7 +113,7 @@ def info(
     settings
         Override a value of the detector looked at: bias_V=3500 (repeatable).
     out
-        Figure of the spectrum and its lines, or of the fields: .png, .pdf or .svg.
+        Figure of the fields of a detector: .png, .pdf or .svg.
     force
         Replace an existing figure.
 
@@ -137,8 +124,6 @@ def info(
 
     Examples
     --------
-    cpunet info raw.lh5 --out raw.png
-
     cpunet info raw.lh5 --table all
 
     cpunet info icpc --set bias_V=3500 --out icpc.png
@@ -206,15 +191,12 @@ def _look(
 
     recipe = load_recipe("fast")
     if holds_hits(path):
-        told: dict[str, Any] = {}
         inside = None if crystal is None else read_detector(crystal)
         hits = describe_hits(Path(path), frame, recipe.peaks, inside)
         lines = [("file", str(path))]
         for name, one in hits.items():
-            lines.append(("detector", name))
-            lines += [("hits", one)] if isinstance(one, str) else one.lines
-            told[name] = one if isinstance(one, str) else asdict(one)
-        return InfoResult(str(path), lines, told)
+            lines += [("detector", name), *one]
+        return InfoResult(str(path), lines)
     return _file(pulse_file(path, read), recipe)
 
 
@@ -239,12 +221,7 @@ def _detector(detector: Detector, path: str) -> InfoResult:
 
         return detector_figure(detector, fields)
 
-    values = {
-        "capacitance_pF": fields.capacitance_pF,
-        "depletion_V": fields.depletion_V,
-        "impurity_scale": detector.impurity_scale,
-    }
-    return InfoResult(path, fields_in_words(detector, fields), values, _draw=draw)
+    return InfoResult(path, fields_in_words(detector, fields), _draw=draw)
 
 
 def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
@@ -252,84 +229,71 @@ def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
 
     path = str(file.path)
     if file.table == ALL:
-        channels: dict[str, InfoResult | str] = {}
+        texts, ok = [], True
         for name, one in channels_of(file).items():
             try:
-                channels[name] = _pulses(one, recipe)
+                text = aligned(_pulses(one, recipe))
             except CpunetError as error:
-                channels[name] = str(error).removeprefix(f"{path}: ")
-        ok = not any(isinstance(one, str) for one in channels.values())
-        return InfoResult(path, tables=channels, ok=ok)
+                text, ok = str(error).removeprefix(f"{path}: "), False
+            texts.append(("", f"{name}:\n{text}"))
+        return InfoResult(path, texts, ok)
     tables = table_sizes(file.path) if file.table is None else {}
     if len(tables) < 2:
-        return _pulses(file, recipe)
-    values: dict[str, Any] = {}
-    rows = []
+        return InfoResult(path, _pulses(file, recipe))
+    rows: list[list[object]] = []
     for name, number in tables.items():
         try:
             source = replace(file, table=name).open()
         except CpunetError as error:
-            values[name] = str(error).removeprefix(f"{path}: ")
-            rows.append([name, "", "", "", values[name]])
+            rows.append([name, "", "", "", str(error).removeprefix(f"{path}: ")])
         else:
-            n, energy = number or source.n_pulses, source.energies.description
-            values[name] = {"n_pulses": n, "length": source.length}
-            values[name] |= {"dt_ns": source.dt_ns, "energy": energy}
-            rows.append([name, n, source.length, f"{source.dt_ns:g}", energy])
+            numbers = [number or source.n_pulses, source.length, f"{source.dt_ns:g}"]
+            rows.append([name, *numbers, source.energies.description])
     text = text_table(["table", "traces", "samples", "ns", "energies"], rows)
-    lines = [("", text), ("", "one of them: `table` NAME; each in full: `table` all")]
-    return InfoResult(path, lines, values)
+    return InfoResult(
+        path, [("", text), ("", "one of them: `table` NAME; each in full: `table` all")]
+    )
 
 
-def _pulses(file: PulseFile, recipe: Recipe) -> InfoResult:
+def _pulses(file: PulseFile, recipe: Recipe) -> list[tuple[str, str]]:
     """Describe the pulses of one table."""
     from cpunet.pulses.description import describe_pulses
-    from cpunet.pulses.spectrum import spectrum_figure
 
     source = file.open()
-    found, spectrum = describe_pulses(source, recipe.peaks)
-    told: dict[str, Any] = {k: v for k, v in asdict(found).items() if v not in ("", {})}
-    lines = found.lines
-    if _is_measured(source):
-        more, words = _traces(source, recipe)
-        told, lines = told | more, lines + words
-    some = bool(np.isfinite(spectrum.values).any())
-    draw = partial(spectrum_figure, spectrum) if some else None
-    return InfoResult(str(file.path), lines, told, _draw=draw)
+    lines = describe_pulses(source, recipe.peaks)
+    return lines + _traces(source, recipe) if _is_measured(source) else lines
 
 
 def _is_measured(source: PulseSource) -> bool:
     """Whether they are raw traces, by what the file records or by the shape of the pulses."""
-    from cpunet.pulses.provenance import apparent_side, recorded_side
+    from cpunet.pulses.provenance import (
+        TRANSLATED_BY,
+        apparent_side,
+        recorded_attributes,
+        recorded_side,
+    )
 
     found = recorded_side(source)
     if found is None:
         first = next(iter(source.blocks(_FIRST_PULSES)), None)
         found = None if first is None else apparent_side(first.waveforms)
     # translated windows look measured, but are not raw traces
-    return found is not None and found.side == "measured" and "translated" not in found.why
+    translated = TRANSLATED_BY in recorded_attributes(source)
+    return found is not None and found.side == "measured" and not translated
 
 
-def _traces(
-    source: PulseSource, recipe: Recipe
-) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+def _traces(source: PulseSource, recipe: Recipe) -> list[tuple[str, str]]:
     """Properties of measured traces, and the pile-up tails under them."""
     from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
     from cpunet.pulses.baselines import Baselines
     from cpunet.pulses.description import BLOCK, trace_properties
 
-    told: dict[str, Any] = {}
     try:
-        traces = trace_properties(source.blocks(BLOCK), recipe)
-        told["traces"], lines = asdict(traces), traces.lines
+        lines = trace_properties(source.blocks(BLOCK), recipe)
     except CpunetError as error:
-        told["traces"] = f"cannot be described: {error}"
-        lines = [("", told["traces"])]
+        lines = [("", f"cannot be described: {error}")]
     try:
         baselines = Baselines.of(source.blocks(_TAILS_BLOCK), recipe.preparation)
-        told["tails"] = PileUpTails.of(baselines).describe()
-        lines += tails_in_words(told["tails"])
+        return lines + tails_in_words(PileUpTails.of(baselines).describe())
     except CpunetError as error:
-        told["tails"] = f"not known: {error}"
-        lines += [("pile-up tails", told["tails"])]
-    return told, lines
+        return [*lines, ("pile-up tails", f"not known: {error}")]

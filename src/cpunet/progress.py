@@ -18,23 +18,9 @@ LOG_EVERY_S = 30.0  # between lines of a log
 
 
 class Stage(tqdm):  # type: ignore[misc]
-    """A bar whose rate leaves out the first update, in which loops are compiled."""
+    """A bar that no thread draws."""
 
-    monitor_interval = 0  # no thread that draws
-    _first: tuple[float, float] | None = None
-
-    def update(self, n: float = 1) -> None:
-        """Count `n` further items."""
-        self._first = self._first or (self.n + n, time.monotonic())
-        super().update(n)
-
-    @property
-    def format_dict(self) -> dict[str, Any]:
-        """What is shown; a rate of 0 is one that is not known yet."""
-        done, since = self._first or (self.n, 0.0)
-        rate = (self.n - done) / max(time.monotonic() - since, 1e-9)
-        form = None if self.total or self.n else "{desc}: {elapsed}"
-        return {**super().format_dict, "rate": rate, "bar_format": form}
+    monitor_interval = 0
 
 
 class _Logged(Stage):

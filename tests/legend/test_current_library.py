@@ -1,4 +1,4 @@
-"""Templates behind a chain, and libraries of currents: layout, components, A/E by reboost."""
+"""Templates behind a chain, and libraries of currents: layout, and A/E by reboost."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import pytest
 from lgdo import Array, Scalar, Struct
 
 from cpunet.errors import CpunetError
-from cpunet.legend.current_library import expand_library, merge_libraries, read_library
 from cpunet.legend.currents import (
     PEAK,
     continued,
@@ -22,9 +21,9 @@ from cpunet.legend.currents import (
     most_frequent,
     with_rings,
 )
-from cpunet.legend.library_files import chosen_libraries, known_detector
+from cpunet.legend.library_files import chosen_libraries, known_detector, merge_libraries
 from cpunet.legend.make_library import make_library
-from cpunet.legend.translate_library import TemplateTranslator, enclosed, translate_library
+from cpunet.legend.translate_library import TemplateTranslator, translate_library
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.clustering import cluster_hits
@@ -136,8 +135,6 @@ def test_rings_go_on_from_the_crystal() -> None:
     filled = with_rings(known[..., None].astype(np.float32).copy(), 3)[..., 0]
     np.testing.assert_array_equal(filled[there], known[there])
     np.testing.assert_array_equal(np.isfinite(filled), reached)
-    assert enclosed(there)[2, 5]
-    assert not enclosed(there)[8, 0]
 
 
 def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Path) -> None:
@@ -179,8 +176,8 @@ def test_a_period_in_a_column_with_units_in_bytes(chain: Path, tmp_path: Path) -
     source = write(tmp_path / "ideal.lh5", charge(), dt=Array(np.array([1e-3])))
     with h5py.File(source, "a") as file:
         file["V01/dt"].attrs["units"] = np.bytes_(b"us")
-    translate_library(chain, source, tmp_path / "psl.lh5", low_rank=2)
-    assert read_library(tmp_path / "psl.lh5").dt_ns == 1
+    translate_library(chain, source, tmp_path / "psl.lh5")
+    assert lh5.read("V01/dt", str(tmp_path / "psl.lh5")).value == 1
 
 
 def test_without_rings_the_nodes_stay(chain: Path, tmp_path: Path) -> None:
@@ -188,53 +185,13 @@ def test_without_rings_the_nodes_stay(chain: Path, tmp_path: Path) -> None:
     nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
     source = write(tmp_path / "ideal.lh5", charge(), r=Array(nodes, attrs={"units": "m"}))
     translate_library(chain, source, tmp_path / "psl.lh5", rings=0)
-    library = read_library(tmp_path / "psl.lh5")
-    np.testing.assert_allclose(library.r_mm, 1000 * nodes)
+    library = lh5.read("V01", str(tmp_path / "psl.lh5"))
+    np.testing.assert_allclose(library["r"].nda, 1000 * nodes)
     np.testing.assert_array_equal(
-        np.isfinite(library.drift_time_ns[0]), np.isfinite(charge()[..., 0])
+        np.isfinite(library["drift_time_000_deg"].nda), np.isfinite(charge()[..., 0])
     )
     with pytest.raises(CpunetError, match="-1: give 0 to 100 rings"):
         translate_library(chain, source, tmp_path / "x.lh5", rings=-1)
-
-
-def test_components_are_read_and_made_whole(chain: Path, ideal: Path, tmp_path: Path) -> None:
-    translate_library(chain, ideal, tmp_path / "whole.lh5")
-    told = translate_library(chain, ideal, tmp_path / "few.lh5", low_rank=8).numbers["V01"]
-    whole, few = read_library(tmp_path / "whole.lh5"), read_library(tmp_path / "few.lh5", "V01")
-    assert few.told["rank"] == 8
-    np.testing.assert_array_equal(whole.drift_time_ns[45], few.drift_time_ns[45])
-    apart = few.currents(45) - whole.currents(45)
-    assert np.nanmax(np.abs(apart)) == pytest.approx(told.loss["largest"], rel=1e-3)
-    assert 0 < told.loss["largest"] < 0.02
-    assert told.loss["a_over_e_percent"] < 0.5
-    np.testing.assert_array_equal(few.template(2.2, 3.9), few.currents(0)[2, 7])
-    assert (tmp_path / "few.lh5").stat().st_size < (tmp_path / "whole.lh5").stat().st_size / 3
-    assert expand_library(tmp_path / "few.lh5", tmp_path / "again.lh5") == ["V01"]
-    again = read_library(tmp_path / "again.lh5")
-    np.testing.assert_array_equal(again.currents(0), few.currents(0))
-    np.testing.assert_array_equal(again.drift_time_ns[45], few.drift_time_ns[45])
-    # whole libraries beside components are copied, with the groups about them
-    with h5py.File(tmp_path / "few.lh5", "a") as file, h5py.File(tmp_path / "whole.lh5") as one:
-        one.copy("V01", file, "geds/B02")
-    assert expand_library(tmp_path / "few.lh5", tmp_path / "both.lh5") == ["V01", "geds/B02"]
-    assert set(lh5.read("geds", str(tmp_path / "both.lh5"))) == {"B02"}
-    copied = read_library(tmp_path / "both.lh5", "geds/B02")
-    np.testing.assert_array_equal(copied.currents(0), whole.currents(0))
-    with pytest.raises(CpunetError, match="no library of components"):
-        expand_library(tmp_path / "whole.lh5", tmp_path / "x.lh5")
-
-
-def test_components_of_a_detector_are_its_own(
-    chain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cpunet.legend.translate_library.MAX_TEMPLATES", 20)
-    source = write(tmp_path / "ideal.lh5", charge())
-    alone = translate_library(chain, source, tmp_path / "alone.lh5", low_rank=8).numbers
-    with h5py.File(source, "a") as file:
-        for name in ("V02", "V03", "V04"):
-            file.copy("V01", name)
-    beside = translate_library(chain, source, tmp_path / "beside.lh5", low_rank=8).numbers
-    assert beside["V01"].loss == alone["V01"].loss
 
 
 def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None:
@@ -249,13 +206,16 @@ def test_detectors_in_one_file(chain: Path, ideal: Path, tmp_path: Path) -> None
         merge_libraries([both[0], tmp_path / "psl.lh5"], tmp_path / "x.lh5")
     with pytest.raises(CpunetError, match="no current library"):
         merge_libraries([ideal], tmp_path / "x.lh5")
-    with h5py.File(both[1], "a") as file:
-        file["B02/t0"][...] = -500.0
-    with pytest.raises(CpunetError, match=r"B02 has 4001 samples of 1 ns from -500 ns, V01"):
-        merge_libraries(both, tmp_path / "x.lh5")
-    with pytest.raises(CpunetError, match="name the detector; the file has B02, V01"):
-        read_library(tmp_path / "psl.lh5")
     assert not (tmp_path / "x.lh5").exists()
+    with h5py.File(both[1], "a") as file:  # with the groups about it
+        file.move("B02", "geds/B02")
+    assert merge_libraries(both, tmp_path / "psl.lh5", force=True) == ["V01", "geds/B02"]
+    inner, alone = (
+        lh5.read(name, str(tmp_path / file))
+        for name, file in (("geds", "psl.lh5"), ("geds/B02", "b.lh5"))
+    )
+    for name in ("waveform_000_deg", "drift_time_045_deg"):
+        np.testing.assert_array_equal(inner["B02"][name].nda, alone[name].nda)
 
 
 def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
@@ -330,10 +290,10 @@ def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
     source = write(tmp_path / "ideal.lh5", without(charge(), np.s_[2, 3]))
     told = translate_library(chain, source, tmp_path / "psl.lh5").numbers
     assert told["V01"].healed == 2
-    times = read_library(tmp_path / "psl.lh5").drift_time_ns[0]
+    times = lh5.read("V01/drift_time_000_deg", str(tmp_path / "psl.lh5")).nda
     whole = write(tmp_path / "whole.lh5", charge())
     translate_library(chain, whole, tmp_path / "psl2.lh5")
-    known = read_library(tmp_path / "psl2.lh5").drift_time_ns[0]
+    known = lh5.read("V01/drift_time_000_deg", str(tmp_path / "psl2.lh5")).nda
     assert times[2, 6] == pytest.approx(known[2, 6], abs=20)  # of 60 from node to node
 
 

@@ -14,16 +14,13 @@ import yaml
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.legend.export import (
-    ae_ratios,
     current_delay_ns,
     equivalent_kernel,
     export_legend,
     kernel_step,
 )
-from cpunet.legend.lithium import LithiumLayer, arrived, delayed, lithium_table
-from cpunet.legend.make_library import make_library
+from cpunet.legend.lithium import LithiumLayer, arrived, lithium_table
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.simulation.geometry_readers import read_detector
 from synthetic import write_chain
 
 MEAN = {"a": -1.5e-6, "b": 1.0024, "per_mev_percent": -0.15, "per_mev_error_percent": 0.02}
@@ -96,18 +93,6 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in out.glob("*.yaml")) == ["cpunet.yaml", "elecmod.yaml"]
 
 
-@pytest.mark.slow  # a library is made
-def test_two_numbers_on_a_library(chain: Path, tmp_path: Path) -> None:
-    detector = read_detector("ppc", ["grid_mm=0.2"])
-    make_library(detector, tmp_path / "ideal.lh5", grid_mm=6, angles=(0,))
-    told = export_legend(chain, tmp_path / "pars", library=tmp_path / "ideal.lh5")
-    found = told.content["electronics"]["equivalent"]["of_library"]
-    assert found["library"] == detector.name
-    assert found["templates"] > 10
-    assert 0 < found["single_site"]["rms_percent"] < 3
-    assert np.isfinite(found["two_sites"]["largest_percent"])
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -165,11 +150,6 @@ def test_what_two_numbers_cannot_follow_is_told() -> None:
     assert abs(without.late_charge_percent) < 0.1
     assert found.prompt_share < without.prompt_share
     assert 40 < current_delay_ns(fast) < 75
-    time = np.arange(3000.0)
-    charge = np.clip((time - 500) / np.array([[20.0], [60.0], [200.0]]), 0, 1)
-    ratios = ae_ratios(charge, slow, found)
-    assert ratios.shape == (3,)
-    assert np.ptp(ratios) < 2e-2 * 2 * found.ae_error_percent
 
 
 def test_what_arrives_in_the_end() -> None:
@@ -211,19 +191,6 @@ def test_reboosts_model() -> None:
         # in cells of 10 µm and steps of 1 ns
         theirs = surface.get_surface_response(1000, init=1000 * mm)
         np.testing.assert_allclose(share[1:], theirs[: len(share) - 1], atol=0.01)
-
-
-def test_a_delayed_pulse_ends_at_what_arrives() -> None:
-    layer = LithiumLayer(1.0)
-    time = np.arange(8000.0)
-    pulse = np.clip((time - 300) / 400, 0, 1)[np.newaxis].astype(np.float32)
-    share = arrived(layer, [0.8], time)
-    late = delayed(pulse, share)
-    assert late[0, -1] == pytest.approx(share[0, -1], abs=2e-3)
-    half = np.argmax(late[0] > 0.5 * late[0, -1])
-    assert half > np.argmax(pulse[0] > 0.5) + 100
-    at_once = delayed(pulse, np.ones_like(share))
-    np.testing.assert_allclose(at_once, pulse, atol=1e-5)
 
 
 @pytest.mark.parametrize(

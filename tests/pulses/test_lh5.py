@@ -18,7 +18,7 @@ from lh5.compression import ULEB128ZigZagDiff
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.row_columns import RowColumns, repeated
+from cpunet.pulses.row_columns import other_columns
 from cpunet.pulses.writing import PulseWriter
 from synthetic import waveform_table, write_pulses
 
@@ -314,19 +314,6 @@ def test_no_pulses_leave_no_file(tmp_path, blocks):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_columns_must_fit(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    with pytest.raises(CpunetError, match="column a has shape"):
-        write_pulses(path, [some(3), some(3, start=3)], columns={"a": (np.arange(5), "")})
-    with pytest.raises(CpunetError, match="column energy is the pulses' own"):
-        write_pulses(path, some(), columns={"energy": (np.arange(6), "keV")})
-    with PulseWriter(path) as writer:
-        writer.append(some(), {"a": (np.arange(6), "")})
-        with pytest.raises(CpunetError, match="separate files"):
-            writer.append(some())
-    assert open_pulses(path).n_pulses == 6
-
-
 def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
     path = tmp_path / "pulses.lh5"
     pulses = Pulses.of(np.arange(12).reshape(4, 3) * 5000, dt_ns=16)
@@ -335,8 +322,6 @@ def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
         for rows in (slice(0, 1), slice(1, 4)):
             column = VectorOfVectors(hits[rows], dtype=np.float64)
             writer.append(pulses[rows], {"edep": column})
-        with pytest.raises(CpunetError, match="write them to separate files"):
-            writer.append(pulses)
         writer.annotate("made", "by hand", file=True)
     table = lh5.read("geds/sim", path)
     assert table.waveform.values.nda.dtype == np.uint16
@@ -348,32 +333,27 @@ def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
 
 def test_other_columns_are_read_by_rows(tmp_path):
     path = tmp_path / "pulses.lh5"
-    columns = {"a": (np.arange(6), "mm"), "realisation": (np.arange(6), "")}
+    columns = {"a": (np.arange(6), "mm"), "tails_kev": (np.arange(6), "")}
     write_pulses(path, some(), columns=columns)
-    own = {"waveform", "energy", "event_number", "realisation"}
-    others = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
-    assert (others.names, others.left_out) == (
-        {"a": "a", "realisation": "realisation_source"},
-        {},
-    )
-    found = others.read(2, 3, repeats=2)
-    assert found["a"].nda.tolist() == [2, 2, 3, 3, 4, 4]
+    own = {"waveform", "energy", "event_number", "tails_kev"}
+    read, left_out = other_columns(open_pulses(path), own)
+    found = read(2, 3)
+    assert ([*found], left_out) == (["a", "tails_kev_source"], {})
+    assert found["a"].nda.tolist() == [2, 3, 4]
     assert found["a"].attrs["units"] == "mm"
-    inner = Table({"x": Array(np.arange(2)), "y": VectorOfVectors([[1], [2, 3]])})
-    twice = repeated(inner, 2)
-    assert twice.x.nda.tolist() == [0, 0, 1, 1]
-    assert [list(row) for row in twice.y] == [[1], [1], [2, 3], [2, 3]]
 
 
 def test_no_column_replaces_another(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    names = ("rejection", "rejection_source", "scale")
-    write_pulses(path, some(), columns={name: (np.full(6, len(name)), "") for name in names})
+    columns = {
+        name: np.full(6, len(name)) for name in ("rejection", "rejection_source", "scale")
+    }
+    with_units = {name: (values, "") for name, values in columns.items()}
+    write_pulses(tmp_path / "pulses.lh5", some(), columns=with_units)
+    np.savez(tmp_path / "pulses.npz", waveform=some().waveforms, **columns)
     own = {"waveform", "energy", "event_number", "rejection"}
-    in_file = RowColumns.of_hdf5(path, "geds/sim/waveform", 6, own)
-    beside = RowColumns.of_columns(path, open_pulses(path).columns, own)
-    for others in (in_file, beside):
-        values = {name: column.nda[0] for name, column in others.read(0, 6).items()}
+    for name in ("pulses.lh5", "pulses.npz"):
+        read, _ = other_columns(open_pulses(tmp_path / name, dt_ns=16), own)
+        values = {name: column.nda[0] for name, column in read(0, 6).items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
 
 

@@ -230,10 +230,11 @@ def test_a_value_that_is_not_finite_gives_nan_for_that_pulse_only(bad, sample):
 def test_the_documented_table_is_the_registry():
     page = Path(__file__).parents[2] / "docs" / "parameters.md"
     rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]
-    assert rows == [
-        f"| `{name}` | {p.unit} | {p.definition} | {p.source} |"
-        for name, p in SHAPE_PARAMETERS.items()
+    told = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
+    assert [cells[:2] for cells in told] == [
+        [f"`{name}`", one.unit] for name, one in SHAPE_PARAMETERS.items()
     ]
+    assert all(definition and source for _, _, definition, source in told)
 
 
 def edge(time: np.ndarray, sigma: float) -> np.ndarray:

@@ -41,11 +41,10 @@ def write_majorana(path: Path, n: int = 2 * N, *, labels: bool = True, length: i
     return traces
 
 
-def test_one_detector_of_the_majorana_release(tmp_path, monkeypatch):
+def test_one_detector_of_the_majorana_release(tmp_path):
     file = tmp_path / "MJD_Train_0.hdf5"
     traces = write_majorana(file, 50, length=40)
     assert tables_of(file) == ["5", "9"]
-    monkeypatch.setattr("cpunet.pulses.reading.published._SLAB_BYTES", 7 * 40 * 8)
     source = open_pulses(file, table="9", dt_ns=10)
     rows = np.arange(1, 50, 3)
     assert (source.n_pulses, source.length, source.dt_ns) == (len(rows), 40, 10)
@@ -107,12 +106,12 @@ def test_pickled_pulses(tmp_path, lists):
     traces = np.random.default_rng(1).normal(size=(23, 40))
     file = write_pickles(tmp_path / "fep_wf_ornl.pickle", traces, lists=lists, dc_label=0.0)
     source = open_pulses(file, dt_ns=16)
-    assert (source.n_pulses, source.length) == (None, 40)
+    assert (source.n_pulses, source.length) == (23, 40)
     assert source.layout.format == "pickled pulses"
     assert source.energies.description == "column energy [keV]"
-    assert sorted(source.columns) == ["dc_label", "energy", "tp0"]
+    assert sorted(source.columns) == ["dc_label", "energy", "event_number", "tp0"]
     columns = source.columns
-    np.testing.assert_array_equal(columns["tp0"].read(3, 5), [403, 404])  # before any trace
+    np.testing.assert_array_equal(columns["tp0"].read(3, 5), [403, 404])
     blocks = list(source.blocks(5))
     assert [len(block) for block in blocks] == [5, 5, 5, 5, 3]
     pulses = source.read()
@@ -129,10 +128,10 @@ DEFECTS = {
         r"give `dt_ns` \(CPU-Net's pulses are sampled every 16 ns\)",
     ),
     "a table": ({"table": "x"}, r"has no tables; leave out `table`"),
-    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(no dictionary with wf\)"),
+    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(a dictionary of wf"),
     "no numbers": (
         {"then": {"wf": np.zeros(40), "energy": "much"}},
-        r"entry 3 is no pulse \(holds something other than numbers\); write the pulses",
+        r"entry 3 is no pulse .* numbers\); write the pulses",
     ),
     "other length": (
         {"then": {"wf": np.zeros(39)}},
@@ -224,8 +223,8 @@ def test_channels_with_traces_are_listed_and_counted(tmp_path):
     records.append(event(1, {3: trace(2)}, sparse=True))
     path = write(tmp_path / "run.fcio", *records)
     assert tables_of(path) == ["0", "3"]
-    told = info(path).values
-    assert {name: one["n_pulses"] for name, one in told.items()} == {"0": 1, "3": 2}
+    rows = [line.split()[:2] for line in str(info(path)).splitlines()]
+    assert rows[1:3] == [["0", "1"], ["3", "2"]]
     one = write(tmp_path / "one.fcio", config(1), event(0, {0: trace(0)}))
     assert tables_of(one) == ["0"]
     path.write_bytes(path.read_bytes()[:-30])

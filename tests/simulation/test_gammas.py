@@ -6,6 +6,7 @@ import itertools
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from cpunet.errors import CpunetError
@@ -15,11 +16,8 @@ from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.sample import (
     TL208_KEV,
     EnergyWindow,
-    GammaStatistics,
     simulate_gammas,
-    with_resolution,
 )
-from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
@@ -53,7 +51,7 @@ LINES = {
 GEANT4 = {20: (0.4265, 0.0997, 0.01131, 0.00370), 100: (0.4450, 0.1101, 0.01199, 0.00386)}
 
 
-def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, GammaStatistics]:
+def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, int]:
     return simulate_gammas(
         crystal(),
         source_height_mm=height,
@@ -64,37 +62,21 @@ def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, Gam
     )
 
 
-# one keV bin of a window that keeps no event, so that only the statistics cost memory
-NONE = {EnergyWindow("none", 2613.0, 2613.1): 10**9}
-
-
-def counted(height: float, n: int) -> GammaStatistics:
-    """Statistics alone, of blocks small enough not to fill the memory with hits."""
-    blocks = [run(height, n // 8, seed)[1] for seed in range(8)]
-    return GammaStatistics(
-        sum(b.n_primaries for b in blocks), np.sum([b.spectrum for b in blocks], axis=0)
-    )
-
-
-def fraction(seen: GammaStatistics, low_kev: int, high_kev: int) -> float:
-    """Fraction of the primaries with an energy in a range."""
-    return float(seen.spectrum[low_kev:high_kev].sum() / seen.n_primaries)
+def spectrum(height: float, n: int) -> npt.NDArray[np.float64]:
+    """Events per gamma and keV, of blocks small enough not to fill the memory with hits."""
+    energies = (run(height, n // 64, seed)[0].energy_kev for seed in range(64))
+    return np.sum([np.histogram(e, np.arange(2617))[0] for e in energies], axis=0) / n
 
 
 @pytest.mark.parametrize("height", [20, pytest.param(100, marks=pytest.mark.thorough)])
 def test_lines_agree_with_geant4(height: int) -> None:
-    seen = counted(height, 480_000)
+    seen = spectrum(height, 480_000)
 
     def peak(low: int, high: int) -> float:
-        beside = fraction(seen, low - 7, low - 1) + fraction(seen, high + 1, high + 7)
-        return fraction(seen, low, high) - beside / 12 * (high - low)
+        beside = seen[low - 7 : low - 1].sum() + seen[high + 1 : high + 7].sum()
+        return float(seen[low:high].sum() - beside / 12 * (high - low))
 
-    measured = (
-        seen.spectrum.sum() / seen.n_primaries,
-        fraction(seen, 2613, 2616),
-        peak(2102, 2105),
-        peak(1591, 1594),
-    )
+    measured = seen.sum(), seen[2613:2616].sum(), peak(2102, 2105), peak(1591, 1594)
     # 5 %, and two standard deviations of the counts of a line
     for value, truth in zip(measured, GEANT4[height], strict=True):
         assert value == pytest.approx(truth, rel=0.05 + 2 / np.sqrt(truth * 480_000))
@@ -103,12 +85,12 @@ def test_lines_agree_with_geant4(height: int) -> None:
 def test_spectrum_agrees_with_geant4(reference_data: Path) -> None:
     with np.load(reference_data / "geant4" / "spectrum_g4_h20mm.npz") as file:
         truth, n = file["counts"], int(file["N"])
-    seen = counted(20, 160_000)
+    seen = spectrum(20, 160_000)
     edges = [50, 250, 500, 1000, 1500, 1800, 2090, 2120, 2350, 2500, 2610]
     for low, high in itertools.pairwise(edges):
         expected = truth[low:high].sum() / n
         error = np.sqrt(1 / (expected * 160_000))
-        assert fraction(seen, low, high) == pytest.approx(expected, rel=0.05 + 3 * error)
+        assert seen[low:high].sum() == pytest.approx(expected, rel=0.05 + 3 * error)
 
 
 def test_sites_agree_with_geant4() -> None:
@@ -124,9 +106,8 @@ def test_sites_agree_with_geant4() -> None:
 
 
 def test_energies_never_exceed_the_line() -> None:
-    hits, seen = run(20, 5_000)
+    hits, _ = run(20, 5_000)
     assert hits.energy_kev.max() <= TL208_KEV + 1e-6
-    assert hits.n_events == seen.spectrum.sum()
 
 
 # each shape has something at both ends, with walls beside the grid's lines
@@ -154,26 +135,6 @@ SHAPES: dict[str, Detector] = {name: read_detector(name) for name in detector_na
 
 
 @pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
-def test_the_transport_has_the_outline_of_the_detector(detector: Detector) -> None:
-    shape, rng = CrystalShape.of(detector), np.random.default_rng(2)
-    # half of the places lie near the bottom, the top or the wall
-    u = rng.random((3, 4000))
-    z = (u[0] * 1.02 - 0.01) * detector.crystal_length
-    z[:1000] = u[0, :1000] * 12 - 0.5
-    r = detector.crystal_radius * 1.01 * np.sqrt(u[1])
-    r[1000:2000] = detector.crystal_radius - 9.5 + 10 * u[1, 1000:2000]
-    phi = 2 * np.pi * u[2]
-    mine = [
-        in_germanium(shape, *p) for p in zip(r * np.cos(phi), r * np.sin(phi), z, strict=True)
-    ]
-    # surfaces belong to the detector, and rounding may put a place on either side of them
-    nearly = detector.inside(r[:, None] + [-1e-5, 1e-5, 0, 0], z[:, None] + [0, 0, -1e-5, 1e-5])
-    clear = nearly.all(axis=1) | ~nearly.any(axis=1)
-    assert clear.mean() > 0.99
-    np.testing.assert_array_equal(np.array(mine)[clear], detector.inside(r, z)[clear])
-
-
-@pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
 def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
     for height in (1.0, 80.0):
         hits, _ = simulate_gammas(
@@ -185,17 +146,17 @@ def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
 
 def test_wanted_counts_are_met_exactly() -> None:
     wanted = {FEP: 50, EnergyWindow("low", 100, 600): 20}
-    hits, seen = run(100, 100_000, wanted=wanted)
+    hits, n_primaries = run(100, 100_000, wanted=wanted)
     energy = hits.energy_kev
     assert np.sum(energy > 2600) == 50
     assert np.sum(energy < 700) == 20
-    assert seen.n_primaries < 10_000
+    assert n_primaries < 10_000
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"height": 20, "n": 10, "wanted": NONE}, "10 gammas were not enough"),
+        ({"height": 20, "n": 10, "wanted": {FEP: 10**9}}, "10 gammas were not enough"),
         ({"height": 20, "n": 10, "wanted": {EnergyWindow("a", 9, 2): 1}}, "a: window"),
     ],
 )
@@ -206,7 +167,7 @@ def test_impossible_wishes_are_refused(settings: dict[str, object], message: str
 
 def test_electron_range_and_photon_attenuation() -> None:
     table = electron_table()
-    reach = np.interp(1.0, table.energy[::-1], table.range[::-1])
+    reach = np.interp(1.0, table.energy[::-1], np.cumsum(table.step[::-1]))
     # NIST ESTAR: 1.23 mm, which counts losses to hard photons too
     assert reach == pytest.approx(1.23, rel=0.06)
     photons = photon_table()
@@ -224,11 +185,3 @@ def test_compton_mean_energy_is_that_of_klein_and_nishina() -> None:
     share = 1 / (1 + k * (1 - cosine))
     weight = share**2 * (share + 1 / share - 1 + cosine**2)
     assert drawn == pytest.approx(np.sum(weight * share) / weight.sum(), rel=0.01)
-
-
-def test_resolution_has_the_width_asked_for() -> None:
-    energy = with_resolution(np.full(40_000, 2614.5), noise_kev2=1.0, fano_kev=0.002, seed=1)
-    assert energy.std() * 2.3548 == pytest.approx(np.sqrt(1 + 0.002 * 2614.5), rel=0.02)
-    for noise, fano in ((-1, 0), (0, -1), (np.nan, 0), (0, np.inf)):
-        with pytest.raises(CpunetError, match="numbers from 0 up"):
-            with_resolution([1.0], noise_kev2=noise, fano_kev=fano, seed=1)

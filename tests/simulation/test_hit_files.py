@@ -1,4 +1,4 @@
-"""Hits of every format: which deposits are one event, in parts or at once; what is wrong."""
+"""Hits of every format: which deposits are one event; what is wrong."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import pytest
 from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.simulation import hit_sources, hit_tables
+from cpunet.simulation import hit_sources
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_files import describe_hits, hit_detectors, hit_parts, read_hits
+from cpunet.simulation.hit_files import describe_hits, read_hits
 from cpunet.simulation.hit_sources import HitFile
-from cpunet.simulation.hit_tables import parts_of, table_of
 from cpunet.simulation.hits import HitOptions, Hits
 
 N = 12
@@ -104,15 +103,12 @@ def test_decays_of_a_chain_are_events_of_their_own(tmp_path: Path, layout: str) 
     assert read_hits(path, HitOptions(time_window_us=1e-3)).n_events == 3 * N
 
 
-@pytest.mark.parametrize("size", [4, 1000])
-def test_late_deposits_are_counted_once(tmp_path, monkeypatch, caplog, size) -> None:
+def test_late_deposits_are_counted(tmp_path, caplog) -> None:
     """A third of the events has its second step 500 ns after the first."""
-    monkeypatch.setattr(hit_tables, "ROWS", size)
     time = TIME_NS.copy()
     time[1::9] += 500
     path = written(tmp_path, "vectors", steps(time=(time, "ns")))
-    for _ in HitFile(path).open(read_detector("icpc")).blocks:
-        pass
+    HitFile(path).open(read_detector("icpc"))
     (told,) = (text for text in caplog.messages if "lie outside" not in text)
     assert f"{N // 3} events have deposits more than 50 ns after their first" in told
     caplog.clear()
@@ -124,14 +120,15 @@ def test_a_description_has_the_same_events(tmp_path: Path) -> None:
     path = written(tmp_path, "flat", steps(det_uid=(np.tile([11, 11, 2], N), "")), "germanium")
     for window_us, table in ((10.0, {"2": N, "11": N}), (1e-3, {"2": N, "11": 2 * N})):
         told = describe_hits(path, HitOptions(time_window_us=window_us), {})
-        assert {name: one.events for name, one in told.items()} == table
+        events = {name: int(dict(one)["hits"].split()[2]) for name, one in told.items()}
+        assert events == table
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
     uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
     path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")
-    assert hit_detectors(path) == ["2", "11"]
+    assert list(describe_hits(path, HitOptions(), {})) == ["2", "11"]
     with pytest.raises(
         CpunetError, match="holds detectors 2, 11; choose one with `hits_detector`"
     ):
@@ -143,7 +140,7 @@ def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
 def test_detectors_by_the_names_of_their_volumes(tmp_path: Path) -> None:
     names = np.tile(["V01", "V01", "B02"], N)
     path = written(tmp_path, "csv", steps(volume=(names, "")))
-    assert hit_detectors(path) == ["B02", "V01"]
+    assert list(describe_hits(path, HitOptions(), {})) == ["B02", "V01"]
     np.testing.assert_allclose(read_hits(path, HitOptions("B02")).energy_kev, 238.6)
 
 
@@ -183,13 +180,10 @@ def test_units_that_are_not_known_are_refused(tmp_path, layout, change) -> None:
 @pytest.mark.parametrize(
     ("factor", "said"), [(1e-3, "up to 2.615 keV"), (1e3, "2.614e.06 keV")]
 )
-def test_energies_of_another_unit_are_named(tmp_path, monkeypatch, factor, said) -> None:
+def test_energies_of_another_unit_are_named(tmp_path, factor, said) -> None:
     path = written(tmp_path, "flat", steps(edep=(factor * EDEP_KEV, "keV")))
     with pytest.raises(CpunetError, match=rf"{said}.* correct the unit of their column"):
         read_hits(path)
-    monkeypatch.setattr(hit_tables, "ROWS", 4)
-    with pytest.raises(CpunetError, match=said):
-        list(hit_parts(path)())
 
 
 def test_a_time_that_is_no_number_is_refused(tmp_path: Path) -> None:
@@ -214,36 +208,19 @@ def stp(path: Path, numbers: np.ndarray, *, deposits: bool = True) -> Path:
 
 
 def require_same(a: Hits, b: Hits) -> None:
-    for name in ("x_mm", "y_mm", "z_mm", "edep_kev", "offsets", "event_number"):
+    for name in ("position_mm", "edep_kev", "offsets", "event_number"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 EVENTS = 53
 
 
-@pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("size", [pytest.param(1, marks=pytest.mark.thorough), 7, 52, 53, 1000])
-def test_parts_hold_the_same_hits(tmp_path, monkeypatch, size, repeated):
-    numbers = (
-        np.repeat(np.arange(EVENTS), 3)[:EVENTS] if repeated else 10 * np.arange(EVENTS)[::-1]
-    )
-    file = stp(tmp_path / "stp.lh5", numbers)
-    monkeypatch.setattr(hit_tables, "ROWS", size)
-    parts = hit_parts(file)
-    for _ in range(2):  # as often as one likes
-        found = list(parts())
-        assert len(found) > 1 or size >= 52
-        require_same(Hits.concatenate(found), read_hits(file))
-
-
-def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path, monkeypatch):
+def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path):
     small = read_hits(stp(tmp_path / "small.lh5", np.arange(EVENTS)))
     file = stp(tmp_path / "stp.lh5", 2**53 + np.arange(EVENTS))
     read = read_hits(file)
     np.testing.assert_array_equal(read.event_number, 2**53 + small.event_number)
     np.testing.assert_array_equal(read.offsets, small.offsets)
-    monkeypatch.setattr(hit_tables, "ROWS", 5)
-    require_same(Hits.concatenate(list(hit_parts(file)())), read)
 
 
 def test_event_numbers_that_are_text(tmp_path):
@@ -253,37 +230,23 @@ def test_event_numbers_that_are_text(tmp_path):
         content["stp/V01/evtid"] = [b"a"] * EVENTS
         content["stp/V01/evtid"].attrs["datatype"] = "array<1>{real}"
     with pytest.raises(CpunetError, match=r"stp\.lh5: [^\n]+$"):
-        list(hit_parts(file)())
+        read_hits(file)
 
 
-def test_rows_of_an_event_that_lie_apart_are_read_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(hit_tables, "ROWS", 5)
-    file = stp(tmp_path / "stp.lh5", np.r_[np.arange(EVENTS - 1), 0])
-    assert parts_of(file, table_of(file, None)) is None
-    (whole,) = hit_parts(file)()
-    require_same(whole, read_hits(file))
-
-
-def test_a_file_of_hits_gives_the_same_blocks(tmp_path, monkeypatch):
-    detector = read_detector("icpc")
+def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch):
     file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
     monkeypatch.setattr(hit_sources, "BLOCK_EVENTS", 8)
-    windows = (EnergyWindow("some", 100.0, 1500.0),)
-    whole = [HitFile(file), HitFile(file, windows=windows)]
-    expected = [(o.n_events, list(o.blocks)) for o in (one.open(detector) for one in whole)]
-    monkeypatch.setattr(hit_tables, "ROWS", 5)
-    for source, (n_events, blocks) in zip(whole, expected, strict=True):
-        opened = source.open(detector)
-        found = list(opened.blocks)
-        assert opened.n_events == n_events == sum(map(len, found))
-        assert [len(block) for block in found] == [len(block) for block in blocks]
-        for one, other in zip(found, blocks, strict=True):
-            require_same(one, other)
-    assert expected[1][0] < expected[0][0]
+    hits = read_hits(file)
+    kept = hits[(hits.energy_kev >= 100) & (hits.energy_kev <= 1500)]
+    for windows, expected in (((), hits), ((EnergyWindow("some", 100, 1500),), kept)):
+        opened = HitFile(file, windows=windows).open(read_detector("icpc"))
+        blocks = list(opened.blocks)
+        assert opened.n_events == len(expected) == sum(map(len, blocks)) > 8
+        assert {len(block) for block in blocks[:-1]} == {8}
+        require_same(Hits.concatenate(blocks), expected)
 
 
-def test_what_is_wrong_is_told_of_parts_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(hit_tables, "ROWS", 5)
+def test_what_is_wrong_with_a_file_of_hits_is_told(tmp_path):
     detector = read_detector("icpc")
     file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
     with pytest.raises(CpunetError, match="no event in none; widen window_kev"):
@@ -478,18 +441,6 @@ def test_a_file_of_remage_without_steps(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["stp/det1/edep"]
     with pytest.raises(CpunetError, match="no table of stp or default_ntuples has columns"):
-        read_hits(path)
-
-
-def test_stored_hits_of_other_events(tmp_path: Path) -> None:
-    path = tmp_path / "sim.lh5"
-    with h5py.File(path, "w") as file:
-        file["geds/hits/event_number"] = [1, 1, 2]
-        for name, units in (("x", "mm"), ("y", "mm"), ("z", "mm"), ("edep", "keV")):
-            file[f"geds/hits/{name}"] = np.full(3, 10.0)
-            file[f"geds/hits/{name}"].attrs["units"] = units
-        file["geds/sim/event_number"] = [1, 2, 3]
-    with pytest.raises(CpunetError, match="geds/hits has no hit of event 3"):
         read_hits(path)
 
 

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from cpunet.errors import CpunetError
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.hits import FARTHEST_MM, Hits
 
@@ -43,10 +42,6 @@ def test_events_by_their_numbers() -> None:
     assert chosen.event_number.tolist() == [7, 6, 5, 7]
     assert chosen.energy_kev.tolist() == [4, 0, 3, 4]
     assert len(hits.of_events([])) == 0
-    twice = Hits.concatenate([hits, hits[[0]]])
-    assert twice.of_events([7]).energy_kev.tolist() == [4]
-    with pytest.raises(CpunetError, match="several events have the number 5"):
-        twice.of_events([7, 5])
 
 
 def test_hits_at_the_edge_of_what_is_allowed_are_merged() -> None:

@@ -143,18 +143,6 @@ def test_the_file_tells_how_it_was_made(ppc, source, tmp_path: Path):
     assert attributes["made_by"].startswith("cpunet simulate ")
 
 
-def test_resolution_changes_energies_and_nothing_else(ppc, source, tmp_path: Path):
-    sharp, broad = tmp_path / "sharp.lh5", tmp_path / "broad.lh5"
-    simulate(sharp, detector=ppc, hits=source, settings=SETTINGS)
-    simulate(broad, detector=ppc, hits=source, settings=SETTINGS, resolution=(1.0, 0.01))
-    first, second = (next(open_pulses(path).blocks()) for path in (sharp, broad))
-    assert np.array_equal(first.waveforms, second.waveforms)
-    assert np.all(first.energy_kev != second.energy_kev)
-    assert second.energy_kev == pytest.approx(first.energy_kev, abs=30)
-    true = lh5.read("geds/sim/true_energy", str(broad)).nda
-    assert np.array_equal(true, first.energy_kev)
-
-
 def test_pulses_of_a_library_of_the_detector(ppc, tmp_path: Path):
     # in the bulk, and in the lithium layer
     hits = Hits.of([[10, 0, 20], [5, 0, 45.6]], [2614.5, 100], [0, 1, 2])

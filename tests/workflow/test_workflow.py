@@ -173,7 +173,7 @@ def whole_chain() -> dict[str, Any]:
     }
     config["periods"]["p04"] = {"data": "raw*/*.lh5"}
     config["detectors"]["B02"]["periods"] = ["p03"]
-    config["library"] = {"grid_mm": 2, "make": ["--angles=0"], "translate": ["--low-rank=16"]}
+    config["library"] = {"grid_mm": 2, "make": ["--angles=0"], "translate": ["--rings=0"]}
     config["events"] = {"hits": "stp/*.lh5", "translate": ["--length=2000"], "tau_us": 400}
     del config["train"]["set"]
     return config
@@ -206,7 +206,7 @@ def test_a_dry_run_of_libraries_and_events(place):
     assert "--adc --length=2000 --out-table V01/raw --seed 1 --device cpu" in told
     assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in told
     assert "library make --detector=icpc --grid-mm 2 --angles=0 --out" in told
-    assert "'all results/V01/library/ideal.lh5' --low-rank=16 --out" in told
+    assert "'all results/V01/library/ideal.lh5' --rings=0 --out" in told
 
 
 @pytest.mark.thorough

@@ -5,6 +5,7 @@ Noise has a spectrum; earlier pulses, and others within the record, disturb the 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import cast
 
@@ -20,7 +21,6 @@ from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray as PulseArray
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.gammas.sample import with_resolution
 
 # Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
 # the record moves its level and the trace's end is independent of its beginning.
@@ -247,15 +247,13 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         | np.where(n_piled > 0, PILE_UP, 0)
         | np.where(beyond.any(axis=1), SATURATED, 0)
     ).astype(np.uint8)
+    # the resolution grows with the root of the energy
+    fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
+    smeared = np.random.default_rng(int(resolution.integers(2**63)))
     return RawTraces(
         waveforms=cast(PulseArray, np.clip(adc, 0, electronics.adc_top).astype(np.uint16)),
         dt_ns=electronics.dt_ns,
-        energy_kev=with_resolution(
-            energy,
-            noise_kev2=0.0,
-            fano_kev=electronics.resolution_fwhm_kev**2 / REFERENCE_KEV,
-            seed=int(resolution.integers(2**63)),
-        ),
+        energy_kev=smeared.normal(energy, fwhm_kev / math.sqrt(8 * math.log(2))),
         event_number=pulses.event_number,
         peak=pulses.peak,
         flag=flag,

@@ -31,8 +31,9 @@ from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
+from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
+from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import PulseLibrary

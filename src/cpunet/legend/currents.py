@@ -1,4 +1,4 @@
-"""Currents of a pulse-shape library: about their maxima, beyond the crystal, in components.
+"""Currents of a pulse-shape library: about their maxima, and beyond the crystal.
 
 The current of a template is averaged three times over 48 ns, like that of A in A/E, and
 shifted so that its maximum is at sample `PEAK`.  The shift includes the fraction of a sample,
@@ -7,23 +7,16 @@ since half a nanosecond already changes the summed current of two sites.
 Readers of a library interpolate drift times between nodes and take the template of the nearest
 one.  At the surface, some nodes of a cell are outside the crystal; rings of nodes beyond it
 give hits just inside their values.
-
-Once aligned at their maxima, the currents of a detector differ in a few ways only.  Components
-are determined from some of the templates, their error from all of them.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.linalg
 from numba import prange
 
-from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray
 
@@ -31,7 +24,6 @@ WINDOW, WINDOWS = 48, 3  # length of a moving average in ns, and number of avera
 PEAK, LENGTH = 1000, 4001  # sample of the maximum, and length of a template in ns
 MODE_BINS = 1000
 RINGS = 3  # number of rings
-MAX_TEMPLATES = 2000  # that determine the components
 _NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 
 Floats = npt.NDArray[np.float32]
@@ -240,70 +232,3 @@ def _mean(values: Values) -> Values:
     n = known.sum(axis=0)
     total = np.where(known, values, 0.0).sum(axis=0)
     return np.where(n > 0, total / np.maximum(n, 1), np.nan)
-
-
-def components(templates: Floats, rank: int) -> Floats:
-    """Leading principal components, without centring: orthonormal, shape ``(rank, samples)``.
-
-    They minimise the squared error of templates of shape ``(n, samples)``.  Templates that span
-    fewer dimensions have fewer components.
-
-    Raises
-    ------
-    CpunetError
-        If there are fewer templates than components.
-    """
-    if len(templates) < rank:
-        raise CpunetError(
-            f"`low_rank` {rank} of {len(templates)} templates; give a smaller number"
-        )
-    n = len(templates)
-    gram = np.asarray(templates @ templates.T, np.float64)
-    values, vectors = scipy.linalg.eigh(gram, subset_by_index=(n - rank, n - 1))
-    kept = values > 1e-12 * values[-1]
-    made = (vectors[:, kept] / np.sqrt(values[kept])).T @ templates
-    # orthonormalise again, since the sums above are in single precision
-    orthonormal = np.linalg.qr(made[::-1].T)[0].T
-    return np.asarray(orthonormal, np.float32)
-
-
-@dataclass
-class Loss:
-    """Error of the low-rank approximation, in units of the most frequent A/E.
-
-    Attributes
-    ----------
-    largest, rms
-        Largest absolute value and RMS of the differences of all samples.
-    a_over_e_percent, a_over_e_rms_percent
-        Largest absolute value and RMS of the relative changes of A/E, in percent.
-    """
-
-    largest: float = 0.0
-    a_over_e_percent: float = 0.0
-    _squares: float = 0.0
-    _of_heights: float = 0.0
-    _samples: int = 0
-    _templates: int = 0
-
-    def add(self, templates: Floats, coefficients: Floats, basis: Floats) -> None:
-        """Add templates, shape ``(n, samples)``, with coefficients ``(n, rank)``."""
-        if not len(templates):
-            return
-        apart = coefficients @ basis - templates
-        of_height = 100 * (apart[:, PEAK] / templates[:, PEAK]).astype(float)
-        self.largest = max(self.largest, float(np.abs(apart).max()))
-        self.a_over_e_percent = max(self.a_over_e_percent, float(np.abs(of_height).max()))
-        self._squares += float(np.square(apart, dtype=float).sum())
-        self._of_heights += float(of_height @ of_height)
-        self._samples += apart.size
-        self._templates += len(apart)
-
-    def told(self) -> dict[str, float]:
-        """Errors by name."""
-        return {
-            "largest": self.largest,
-            "a_over_e_percent": self.a_over_e_percent,
-            "rms": math.sqrt(self._squares / self._samples),
-            "a_over_e_rms_percent": math.sqrt(self._of_heights / self._templates),
-        }

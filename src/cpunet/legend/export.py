@@ -11,14 +11,13 @@ the chain are reported with them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 import scipy.optimize
 import yaml
 from scipy.special import log_ndtr, ndtr
@@ -26,15 +25,8 @@ from scipy.special import log_ndtr, ndtr
 import cpunet
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened
 from cpunet.legend.currents import WINDOW, WINDOWS
-from cpunet.legend.library_files import (
-    IdealLibrary,
-    chosen_libraries,
-    known_detector,
-    n_not_ending,
-    require_charge,
-)
+from cpunet.legend.library_files import known_detector
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
@@ -47,7 +39,6 @@ AROUND_NS = 500  # compared range on either side of the maximum
 START_NS = (40.0, 60.0)  # initial sigma and tau
 LONGEST_NS = 500.0
 LENGTH, BEGIN = 8192, 1500  # number of 1 ns samples, and the one at which charge moves
-BATCH = 100
 WIDTHS_NS = (1, 20, 50, 100, 150, 200, 300)  # of constant currents, as in a detector
 
 
@@ -78,38 +69,6 @@ class Equivalent:
     current_error_percent: float
     late_charge_percent: float
     ae_error_percent: float
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors of A/E: their RMS and the largest, in percent."""
-
-    rms_percent: float
-    largest_percent: float
-
-    @classmethod
-    def of(cls, ratios: Values) -> Errors:
-        """Errors of ratios of A/E that are 1 without any."""
-        apart = 100 * (ratios - 1)
-        return cls(float(apart.std()), float(np.abs(apart).max()))
-
-
-@dataclass(frozen=True)
-class OnLibrary:
-    """Errors of A/E by a kernel, relative to its chain, for the templates of a library.
-
-    Attributes
-    ----------
-    library, templates
-        Name of the library, and number of its templates.
-    single_site, two_sites
-        Of single templates, and of pairs.
-    """
-
-    library: str
-    templates: int
-    single_site: Errors
-    two_sites: Errors
 
 
 def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
@@ -162,32 +121,6 @@ def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
     )
 
 
-def ae_ratios(
-    charge: npt.NDArray[np.floating], undecayed: Exponentials, nearest: Equivalent
-) -> Values:
-    """Ratio of A/E after the kernel to A/E after the chain, for ideal pulses.
-
-    Parameters
-    ----------
-    charge
-        Ideal pulses sampled every nanosecond, shape (n, samples).
-    undecayed, nearest
-        The chain without decays, and its kernel.
-    """
-    time = np.arange(LENGTH, dtype=float) - BEGIN
-    steps = (undecayed.step(time), kernel_step(time, nearest.sigma_ns, nearest.tau_ns))
-    length = scipy.fft.next_fast_len(LENGTH + charge.shape[1], real=True)
-    of_steps = [scipy.fft.rfft(_averaged(step), length) for step in steps]
-    highest = np.empty((2, len(charge)))
-    for first in range(0, len(charge), BATCH):
-        rows = slice(first, first + BATCH)
-        current = np.diff(charge[rows].astype(float), axis=1, prepend=0)
-        spectra = scipy.fft.rfft(current, length, axis=1)
-        for which, of_step in enumerate(of_steps):
-            highest[which, rows] = scipy.fft.irfft(spectra * of_step, length).max(axis=1)
-    return np.asarray(highest[1] / highest[0], np.float64)
-
-
 def current_delay_ns(undecayed: Exponentials) -> float:
     """Time of the maximum of the averaged current for charge that arrives instantaneously.
 
@@ -231,7 +164,6 @@ LEGEND_PARS = FolderKind(
     command="cpunet export legend",
     own=r"(elecmod|aoemeanmod|aoeresmod|cpunet)\.yaml",
 )
-TEMPLATES = 2000  # approximate number of templates of a library to test the kernel on
 EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
 SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
 
@@ -262,14 +194,6 @@ class LegendParameters:
             f"{two['current_error_percent']:.1f} % of its height off, A/E "
             f"± {two['ae_error_percent']:.1f} % between currents of 1 and 300 ns"
         ]
-        if found := two.get("of_library"):
-            alone, pairs = found["single_site"], found["two_sites"]
-            lines.append(
-                f"on {found['templates']} places of {found['library']}, A/E is off by "
-                f"{alone['rms_percent']:.2g} % RMS, {alone['largest_percent']:.2g} % at most; "
-                f"on pairs of them by {pairs['rms_percent']:.2g} and "
-                f"{pairs['largest_percent']:.2g} %"
-            )
         for method, one in self.content["ae_against_energy"].items():
             line = one["mean"]
             lines.append(
@@ -287,7 +211,6 @@ def export_legend(
     *,
     detector: str | None = None,
     report: str | Path | None = None,
-    library: str | Path | None = None,
     force: bool = False,
 ) -> LegendParameters:
     """Export a readout chain as parameters for LEGEND's simulation chain.
@@ -309,8 +232,6 @@ def export_legend(
     report
         Report on this run, as source of A/E.  Without it, the two files on A/E are not
         written.
-    library
-        Library of ideal charge pulses on which the error of the kernel is determined.
     force
         Replace an existing folder.
 
@@ -326,28 +247,21 @@ def export_legend(
 
     Examples
     --------
-    cpunet export legend run --report report --library ideal.lh5 --out pars
+    cpunet export legend run --report report --out pars
     """
     out = Path(out)
-    report, library = (None if path is None else Path(path) for path in (report, library))
-    run = as_run(run)
-    given = (run.folder, report, library)
+    report, run = None if report is None else Path(report), as_run(run)
+    given = (run.folder, report)
     refuse_existing(out, *given, force=force)
     told = describe_chain(run)
     for doubt in told.doubts:
         log.warning(doubt)
-    known = known_detector(run)
     trained = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed}
-    name = detector or known or EVERY_DETECTOR
+    name = detector or known_detector(run) or EVERY_DETECTOR
     methods, ae_pars = ({}, {}) if report is None else _against_energy(report, trained)
     undecayed = told.chain.undecayed
     with stage("Two numbers for the chain"):
         nearest = equivalent_kernel(undecayed)
-        equivalent: dict[str, Any] = asdict(nearest)
-        if library is not None:
-            wanted = () if detector is None else (detector,)
-            found = _of_library(library, wanted, known, undecayed, nearest)
-            equivalent["of_library"] = asdict(found)
     whole = {
         "made_of": {
             "cpunet": cpunet.__version__,
@@ -356,7 +270,7 @@ def export_legend(
             "dt_ns": run.dt_ns,
         },
         "electronics": {
-            "equivalent": equivalent,
+            "equivalent": asdict(nearest),
             "chain": told.parameters,
             "chain_errors": told.parameter_errors,
             "numbers": told.values,
@@ -405,33 +319,3 @@ def _against_energy(
     if missing:
         raise CpunetError(f"{report}: no A/E against energy: {missing}")
     return methods, pars
-
-
-def _of_library(
-    source: Path,
-    wanted: Sequence[str],
-    known: str | None,
-    undecayed: Exponentials,
-    nearest: Equivalent,
-) -> OnLibrary:
-    """Errors of A/E by the kernel, relative to the chain, for templates of a detector."""
-    with opened(source) as file:
-        held = chosen_libraries(file, source, wanted, known)
-        library = IdealLibrary.of(file, held[0], source)
-        values = file[f"{library.path}/waveform_{library.angles[0]}"]
-        # of regularly spaced rows of r, a few thousand templates at most
-        step = max(1, values.shape[0] * values.shape[1] // TEMPLATES)
-        rows = [np.asarray(values[i], np.float32) for i in range(0, len(values), step)]
-    charge = np.concatenate(rows)
-    charge = charge[np.isfinite(charge).all(axis=1) & charge.any(axis=1)]
-    if not len(charge):
-        raise CpunetError(f"{source}: {library.path}: no template of charge")
-    n = len(charge)
-    require_charge(f"{source}: {library.path}", n, n, n_not_ending(charge))
-    rng = np.random.default_rng(0)
-    share = rng.random((n, 1), np.float32)
-    two_sites = share * charge + (1 - share) * charge[rng.permutation(n)]
-    alone = ae_ratios(charge, undecayed, nearest)
-    pairs = ae_ratios(two_sites, undecayed, nearest)
-    usual = float(np.median(alone))  # divided out, since A/E is calibrated
-    return OnLibrary(library.path, n, Errors.of(alone / usual), Errors.of(pairs / usual))

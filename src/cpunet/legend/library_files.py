@@ -1,4 +1,4 @@
-"""Pulse-shape libraries in files: the ideal ones to be translated, found and checked."""
+"""Pulse-shape libraries in files: ideal ones found and checked, those of currents merged."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, text_attribute
+from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.outputs import refuse_existing
 from cpunet.pulses.provenance import recorded_detector
 from cpunet.pulses.reading.energies import TIME_UNITS
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import read_values
 from cpunet.training.run import Run
 
@@ -25,8 +27,6 @@ PERIOD_NS = 1.0
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
-# Templates of charge end near their maximum; templates of current do not.
-_MIN_END = 0.5
 
 Values = npt.NDArray[np.float64]
 
@@ -139,20 +139,12 @@ def chosen_libraries(
         If there is no library, a named one is missing, or none belongs to the detector of the
         run.
     """
-    found: set[str] = set()
-
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        group, _, last = name.rpartition("/")
-        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
-            found.add(group)
-
-    file.visititems(visit)
-    if not found:
+    there = _libraries(file)
+    if not there:
         raise CpunetError(
             f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
             "struct{r, z, dt, t0, waveform_000_deg}"
         )
-    there = sorted(found)
     held = ", ".join(path or "/" for path in there)
     for name in wanted:
         if name not in there:
@@ -168,6 +160,24 @@ def chosen_libraries(
             "all the same"
         )
     return [known]
+
+
+def _libraries(file: h5py.File) -> list[str]:
+    """Paths of the groups that hold templates."""
+    found: set[str] = set()
+
+    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        group, _, last = name.rpartition("/")
+        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
+            found.add(group)
+
+    file.visititems(visit)
+    return sorted(found)
+
+
+def _is_current(library: h5py.Group) -> bool:
+    """Whether times are relative to the maxima, as those of currents are."""
+    return {"r", "z", "dt", "t0"} <= library.keys() and bool(library["t0"][()] < 0)
 
 
 def known_detector(run: Run) -> str | None:
@@ -213,34 +223,6 @@ def require_complete(
                 )
 
 
-def n_not_ending(templates: npt.NDArray[np.floating]) -> int:
-    """Number of templates that end below half of their height, as those of current do."""
-    return int((templates[:, -1] < _MIN_END * np.abs(templates).max(axis=1)).sum())
-
-
-def require_charge(where: str, n: int, moving: int, not_ending: int) -> None:
-    """Raise an error if none of `n` templates has a signal, or most are no charge pulses.
-
-    Parameters
-    ----------
-    where
-        File, and library in it, for the message.
-    n, moving, not_ending
-        Numbers of templates, of those with a translated signal, and among these of those
-        that end low (`n_not_ending`).
-    """
-    if not moving:
-        raise CpunetError(
-            f"{where}: none of {n} templates can be translated; are they charge pulses?"
-        )
-    if 2 * not_ending > moving:
-        raise CpunetError(
-            f"{where}: {not_ending} of {moving} templates end below half of their maximum: "
-            "these are currents, of negative sign, or behind electronics already; give the "
-            "library of charge pulses"
-        )
-
-
 def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
     """Store a number or an array with LH5 attributes."""
     group[name] = values
@@ -265,3 +247,57 @@ def put_array(
     )
     made.attrs.update({"datatype": f"array<{len(shape)}>{{real}}", "units": units})
     return made
+
+
+def describe(group: h5py.Group) -> None:
+    """Add LH5's attribute to a complete library and to every level above it."""
+    while group.name != "/":
+        group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
+        group = group.parent
+
+
+def merge_libraries(
+    sources: Sequence[str | Path], out: str | Path, *, force: bool = False
+) -> list[str]:
+    """Copy current libraries of several detectors into one file, as in production.
+
+    Parameters
+    ----------
+    sources
+        Files that `cpunet library translate` made, each of one detector or more.
+    out
+        File to write.
+    force
+        Whether to replace an existing file.
+
+    Returns
+    -------
+    list of str
+        Names of the detectors.
+
+    Raises
+    ------
+    CpunetError
+        If a file contains no current library, or two libraries belong to one detector.
+    """
+    paths, out = [*map(Path, sources)], Path(out)
+    refuse_existing(out, *paths, force=force)
+    first: dict[str, Path] = {}
+    with written_hdf5(out) as (made, _):
+        for path in paths:
+            with opened(path) as file:
+                names = [name for name in _libraries(file) if name and _is_current(file[name])]
+                if not names:
+                    raise CpunetError(
+                        f"{path}: no current library; make it with `cpunet library translate`"
+                    )
+                for name in names:
+                    if name in first:
+                        raise CpunetError(
+                            f"{path}: a second library of {name}, which {first[name]} has "
+                            "already; give one of each detector"
+                        )
+                    first[name] = path
+                    file.copy(name, made, name)
+                    describe(made[name].parent)
+    return sorted(first)

@@ -16,14 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import scipy.fft
 import scipy.linalg
 
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.legend.library_files import put_column
-from cpunet.outputs import refuse_existing, written_aside
-from cpunet.pulses.writing import FileInTheMaking
+from cpunet.outputs import refuse_existing
+from cpunet.pulses.writing import written_hdf5
 
 Values = npt.NDArray[np.float64]
 
@@ -117,28 +116,6 @@ def arrived(layer: LithiumLayer, depth_mm: npt.ArrayLike, time_ns: npt.ArrayLike
     return np.asarray(np.clip(there, 0, 1), np.float64)
 
 
-def delayed(charge: npt.NDArray[np.floating], share: Values) -> npt.NDArray[np.float32]:
-    """Pulses of charge that reaches the boundary gradually.
-
-    Parameters
-    ----------
-    charge
-        Pulses of charge released at the boundary, shape (n, samples).
-    share
-        Fraction that has arrived at each sample, shape (n, samples) or (samples,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Float32 (n, samples), in units of the charge released in the layer.
-    """
-    n_samples = charge.shape[1]
-    coming = np.diff(np.broadcast_to(share, charge.shape), axis=1, prepend=0)
-    length = scipy.fft.next_fast_len(2 * n_samples, real=True)
-    spectra = scipy.fft.rfft(charge.astype(float), length) * scipy.fft.rfft(coming, length)
-    return np.asarray(scipy.fft.irfft(spectra, length)[:, :n_samples], np.float32)
-
-
 @dataclass(frozen=True)
 class LithiumTable:
     """A table of delayed charge.
@@ -194,8 +171,8 @@ def lithium_table(layer: LithiumLayer, out: str | Path, *, force: bool = False) 
         "arrived": (share.T.copy(), ""),
         "activeness": (share[:, -1].copy(), ""),
     }
-    with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
-        group = made.h5.create_group("lithium")
+    with written_hdf5(out) as (made, _):
+        group = made.create_group("lithium")
         for key, (values, units) in arrays.items():
             put_column(group, key, values, units)
         group.attrs["datatype"] = f"struct{{{','.join(arrays)}}}"

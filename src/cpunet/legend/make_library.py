@@ -15,9 +15,9 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.legend.library_files import put_array, put_column
-from cpunet.outputs import refuse_existing, written_aside
+from cpunet.outputs import refuse_existing
 from cpunet.progress import Stage, stage
-from cpunet.pulses.writing import FileInTheMaking
+from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import Set
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
@@ -125,12 +125,8 @@ def make_library(
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
     counts = MadeLibrary(out)
     total = len(angles_deg) * len(r_mm) * len(z_mm)
-    with (
-        written_aside(out) as aside,
-        FileInTheMaking(aside, out) as made,
-        stage("Templates", total) as bar,
-    ):
-        library = made.h5.create_group(detector.name or "detector")
+    with written_hdf5(out) as (made, _), stage("Templates", total) as bar:
+        library = made.create_group(detector.name or "detector")
         put_column(library, "r", r_mm, "mm")
         put_column(library, "z", z_mm, "mm")
         put_column(library, "dt", wanted.dt_ns, "ns")

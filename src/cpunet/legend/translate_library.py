@@ -15,25 +15,21 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 import torch
+from scipy.ndimage import binary_fill_holes
 
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.legend.current_library import TOLD, NewLibrary, describe
 from cpunet.legend.currents import (
     LENGTH,
-    MAX_TEMPLATES,
     PEAK,
     RINGS,
     Floats,
-    Loss,
-    components,
+    Values,
     continued,
     currents_about_peak,
     most_frequent,
@@ -44,16 +40,17 @@ from cpunet.legend.library_files import (
     PERIOD_NS,
     IdealLibrary,
     chosen_libraries,
+    describe,
     known_detector,
-    n_not_ending,
-    require_charge,
+    put_array,
+    put_column,
     require_complete,
 )
 from cpunet.networks.response_layer import PADDING_BEFORE
-from cpunet.outputs import refuse_existing, written_aside
-from cpunet.progress import Stage, stage
+from cpunet.outputs import refuse_existing
+from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.writing import FileInTheMaking
+from cpunet.pulses.writing import written_hdf5
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.translator import BATCH, REN
 
@@ -102,7 +99,8 @@ class TemplateTranslator:
         return results
 
 
-ROWS = 16  # rows of r translated at a time
+ROWS = 16  # rows of r read at a time
+MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
@@ -120,8 +118,6 @@ class LibraryNumbers:
         A/E by which currents are divided.
     delay_ns
         Time that is subtracted from drift times.
-    rank, loss
-        Number of components and their errors, see `Loss`; None for whole templates.
     """
 
     templates: int
@@ -130,22 +126,13 @@ class LibraryNumbers:
     healed: int
     mode_per_ns: float
     delay_ns: float
-    rank: int | None = None
-    loss: dict[str, float] | None = None
 
     def __str__(self) -> str:
         healed = f", {self.healed} of them within it" if self.healed else ""
-        text = (
+        return (
             f"{self.translated} of {self.templates} templates translated, {self.padded} added "
             f"about the crystal{healed}; A/E is most often {self.mode_per_ns:.4g}/ns"
         )
-        if loss := self.loss:
-            text += (
-                f"\n{self.rank} components: samples within {loss['largest']:.1e} of the most "
-                f"frequent A/E (RMS {loss['rms']:.1e}), A/E within "
-                f"{loss['a_over_e_percent']:.2g} % (RMS {loss['a_over_e_rms_percent']:.2g} %)"
-            )
-        return text
 
 
 @dataclass(frozen=True)
@@ -174,15 +161,14 @@ def translate_library(
     *,
     detector: Sequence[str] = (),
     rings: int = RINGS,
-    low_rank: int | None = None,
     force: bool = False,
 ) -> TranslatedLibrary:
     """Translate every template of a library without noise, to currents for LEGEND's production.
 
     A library is an LH5 ``struct{r, z, dt, t0, waveform_000_deg, ...}`` with templates of
     charge in arrays of shape (r, z, samples), as SolidStateDetectors.jl and
-    `cpunet.make_library` make them; a file may hold several, at any depth.  Files are
-    streamed.
+    `cpunet.make_library` make them; a file may hold several, at any depth.  The currents of
+    one are in memory: 16 kB for each template.
 
     Each template is translated, differentiated, averaged three times over 48 ns and shifted so
     that its maximum is at sample 1,000 of 4,001.  All are divided by the mode of A/E of the
@@ -203,8 +189,6 @@ def translate_library(
         the run was trained with, or all if it is unknown.
     rings
         Rings of nodes beyond the crystal; 3 as production.
-    low_rank
-        Number of components in place of whole templates, see `cpunet.read_library`.
     force
         Replace an existing file.
 
@@ -225,8 +209,6 @@ def translate_library(
     """
     if not 0 <= rings <= 100:
         raise CpunetError(f"`rings` {rings}: give 0 to 100 rings of padding")
-    if low_rank is not None and not 1 <= low_rank <= 1000:
-        raise CpunetError(f"`low_rank` {low_rank}: give 1 to 1000 components")
     run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
     translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
@@ -235,130 +217,83 @@ def translate_library(
         names = chosen_libraries(given, source, detector, known_detector(run))
         ideal = [IdealLibrary.of(given, name, source) for name in names]
         made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
-        with written_aside(out) as aside, FileInTheMaking(aside, out) as made:
+        with written_hdf5(out) as (made, _):
             for one in ideal:
-                looked = _look(translate, one, given[one.path], source)
-                group = made.h5.require_group(one.path)
-                found = looked.write(given[one.path], group, rings, low_rank)
-                told = {k: v for k, v in asdict(found).items() if v is not None}
-                content = {"cpunet": cpunet.__version__, "rings": rings} | made_from | told
-                group.attrs[TOLD] = json.dumps(content)
+                group = made.require_group(one.path)
+                found = _write(translate, one, given[one.path], group, rings, source)
+                content = {"cpunet": cpunet.__version__, "rings": rings, **made_from}
+                group.attrs["cpunet"] = json.dumps(content | asdict(found))
                 describe(group)
                 numbers[one.path] = found
     return TranslatedLibrary(out, numbers)
 
 
-@dataclass(frozen=True, eq=False)
-class _Looked:
-    """Results of a first pass over all templates of a library, which a second pass writes."""
-
-    translate: TemplateTranslator
-    library: IdealLibrary
-    delay_ns: float
-    mode: float
-    kept: Floats
-    inside: dict[str, npt.NDArray[np.bool_]]
-
-    def write(
-        self, given: h5py.Group, group: h5py.Group, rings: int, rank: int | None
-    ) -> LibraryNumbers:
-        """Write currents, and drift times within the crystal and beside it."""
-        library = self.library
-        r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
-        z_mm = padded_axis(library.z_mm, rings, rings)
-        basis = None if rank is None else components(self.kept, rank)
-        made = NewLibrary.begin(group, r_mm, z_mm, PERIOD_NS, basis)
-        padded = healed = 0
-        loss = Loss()
-        for angle, mask in self.inside.items():
-            values, drift_times = made.arrays(angle)
-            times = np.full((len(r_mm), len(z_mm)), np.nan)
-            with stage(f"{library.path}, {angle}", len(r_mm)) as bar:
-                for rows, currents, when in self._rows(given[f"waveform_{angle}"], rings, bar):
-                    values[rows] = made.stored(currents, loss)
-                    times[rows] = when
-            times = continued(times, rings)
-            drift_times[...] = times
-            padded += int(np.isfinite(times).sum() - mask.sum())
-            inner = np.isfinite(times[: len(mask), rings:][:, : mask.shape[1]])
-            healed += int((inner & ~mask & enclosed(mask)).sum())
-        return LibraryNumbers(
-            templates=library.n_templates,
-            translated=sum(int(mask.sum()) for mask in self.inside.values()),
-            padded=padded,
-            healed=healed,
-            mode_per_ns=self.mode,
-            delay_ns=self.delay_ns,
-            rank=None if basis is None else len(basis),
-            loss=None if basis is None else loss.told(),
-        )
-
-    def _rows(
-        self, given: h5py.Dataset, rings: int, bar: Stage
-    ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.float64]]]:
-        """Rows of the padded grid: normalised currents, and drift times within the crystal."""
-        n_r, n_z, _ = given.shape
-        for first in range(0, n_r + rings, ROWS):
-            last = min(first + ROWS, n_r + rings)
-            # a padded grid point depends only on rows at most `rings` away
-            low, high = max(0, first - rings), min(last + rings, n_r)
-            shape = (last + rings - low, n_z + 2 * rings)
-            currents = np.full((*shape, LENGTH), np.nan, np.float32)
-            times = np.full(shape, np.nan)
-            if high > low:
-                charge = _charge(given[low:high])
-                there = ~np.isnan(charge[:, :, 0])
-                of_these, when = currents_about_peak(self.translate(charge[there]))
-                inner = (slice(0, high - low), slice(rings, rings + n_z))
-                currents[inner][there] = of_these / np.float32(self.mode)
-                times[inner][there] = when - self.delay_ns
-            own = slice(first - low, last - low)
-            yield slice(first, last), with_rings(currents, rings)[own], times[own]
-            bar.update(last - first)
-
-
-def _look(
-    translate: TemplateTranslator, library: IdealLibrary, given: h5py.Group, source: Path
-) -> _Looked:
-    """First pass over all templates, to find the mode of A/E before any is written."""
+def _write(
+    translate: TemplateTranslator,
+    library: IdealLibrary,
+    given: h5py.Group,
+    group: h5py.Group,
+    rings: int,
+    source: Path,
+) -> LibraryNumbers:
+    """Write currents, and drift times within the crystal and beside it."""
     step = np.zeros((1, STEP_LENGTH), np.float32)
     step[:, STEP_SAMPLE:] = 1
-    _, delay = currents_about_peak(translate(step))
-    rng = np.random.default_rng(0)
-    share = min(1.0, 2 * MAX_TEMPLATES / max(library.n_templates, 1))
-    amplitudes, kept, inside = [], [], {}
-    moving = not_ending = 0
-    with stage(f"A/E of {library.path}", library.n_templates) as bar:
+    delay_ns = float(currents_about_peak(translate(step))[1][0]) - STEP_SAMPLE
+    r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
+    z_mm = padded_axis(library.z_mm, rings, rings)
+    shape, inner = (len(r_mm), len(z_mm)), np.s_[: len(library.r_mm), rings : len(z_mm) - rings]
+    currents, times = dict[str, Floats](), dict[str, Values]()
+    not_ending = 0
+    with stage(f"Translating {library.path}", library.n_templates) as bar:
         for angle in library.angles:
-            masks = []
-            for block in _blocks(given[f"waveform_{angle}"], library, source):
-                there = ~np.isnan(block[:, :, 0])
-                templates = block[there]
-                currents, times = currents_about_peak(translate(templates))
-                good = np.isfinite(times)
-                there[there] = good
-                masks.append(there)
-                moving += int(good.sum())
-                not_ending += n_not_ending(templates[good])
-                amplitudes.append(currents[good, PEAK].astype(float))
-                kept.append(currents[good][rng.random(int(good.sum())) < share])
-                bar.update(block.shape[0] * block.shape[1])
-            inside[angle] = np.concatenate(masks)
-    require_charge(f"{source}: {library.path}", library.n_templates, moving, not_ending)
+            currents[angle] = np.full((*shape, LENGTH), np.nan, np.float32)
+            times[angle] = np.full(shape, np.nan)
+            there = currents[angle][inner], times[angle][inner]
+            for rows, charge in _blocks(given[f"waveform_{angle}"], library, source):
+                held = ~np.isnan(charge[:, :, 0])
+                templates = charge[held]
+                there[0][rows][held], when = currents_about_peak(translate(templates))
+                there[1][rows][held] = when - delay_ns
+                ends, heights = templates[:, -1], np.abs(templates).max(axis=1)
+                not_ending += int((np.isfinite(when) & (ends < MIN_END * heights)).sum())
+                bar.update(held.size)
+    inside = {angle: np.isfinite(found[inner]) for angle, found in times.items()}
+    translated = sum(int(mask.sum()) for mask in inside.values())
+    _require_charge(f"{source}: {library.path}", library.n_templates, translated, not_ending)
     require_complete(inside, library, source)
-    mode = most_frequent(np.concatenate(amplitudes))
-    some = np.concatenate(kept)
-    if len(some) > MAX_TEMPLATES:
-        some = some[np.sort(rng.choice(len(some), MAX_TEMPLATES, replace=False))]
-    delay_ns = float(delay[0]) - STEP_SAMPLE
-    return _Looked(translate, library, delay_ns, mode, some / np.float32(mode), inside)
+    amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
+    mode = most_frequent(np.concatenate(amplitudes).astype(float))
+
+    put_column(group, "r", r_mm, "mm")
+    put_column(group, "z", z_mm, "mm")
+    put_column(group, "dt", PERIOD_NS, "ns")
+    put_column(group, "t0", -PEAK * PERIOD_NS, "ns")
+    padded = healed = 0
+    for angle, mask in inside.items():
+        values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
+        drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
+        currents[angle] /= np.float32(mode)
+        values[...] = with_rings(currents.pop(angle), rings)
+        drift_times[...] = filled = continued(times[angle], rings)
+        padded += int(np.isfinite(filled).sum() - mask.sum())
+        healed += int((np.isfinite(filled[inner]) & ~mask & binary_fill_holes(mask)).sum())
+    return LibraryNumbers(library.n_templates, translated, padded, healed, mode, delay_ns)
 
 
-def _blocks(given: h5py.Dataset, library: IdealLibrary, source: Path) -> Iterator[Floats]:
-    """Rows of charge templates; raise an error if only a part of a template is NaN."""
+def _blocks(
+    given: h5py.Dataset, library: IdealLibrary, source: Path
+) -> Iterator[tuple[slice, Floats]]:
+    """Rows of charge templates, NaN for those of only zeros.
+
+    Raises
+    ------
+    CpunetError
+        If only a part of a template is NaN.
+    """
     for first in range(0, given.shape[0], ROWS):
-        values = np.asarray(given[first : first + ROWS], np.float32)
-        bad = np.isnan(values)
+        charge = np.array(given[first : first + ROWS], np.float32)
+        bad = np.isnan(charge)
         part = bad.any(axis=2) & ~bad.all(axis=2)
         if part.any():
             i, j = np.argwhere(part)[0]
@@ -368,20 +303,19 @@ def _blocks(given: h5py.Dataset, library: IdealLibrary, source: Path) -> Iterato
                 f"{library.z_mm[j]:g} mm; simulate the library again, with longer records if "
                 "charge was late"
             )
-        yield _charge(values)
+        charge[~charge.any(axis=2)] = np.nan
+        yield slice(first, first + len(charge)), charge
 
 
-def _charge(values: npt.NDArray[Any]) -> Floats:
-    """Templates as float32; those of only zeros become NaN."""
-    charge = np.array(values, np.float32)
-    charge[~charge.any(axis=2)] = np.nan
-    return charge
-
-
-def enclosed(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Mask of grid points between others on all four sides, at any distance."""
-    held = np.ones_like(mask)
-    for axis in (0, 1):
-        back = np.flip(np.logical_or.accumulate(np.flip(mask, axis), axis), axis)
-        held &= np.logical_or.accumulate(mask, axis) & back
-    return held
+def _require_charge(where: str, n: int, translated: int, not_ending: int) -> None:
+    """Raise an error if none of `n` templates has a signal, or most end below their height."""
+    if not translated:
+        raise CpunetError(
+            f"{where}: none of {n} templates can be translated; are they charge pulses?"
+        )
+    if 2 * not_ending > translated:
+        raise CpunetError(
+            f"{where}: {not_ending} of {translated} templates end below half of their maximum: "
+            "these are currents, of negative sign, or behind electronics already; give the "
+            "library of charge pulses"
+        )

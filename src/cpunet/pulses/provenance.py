@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.reading.source import PulseSource
+from cpunet.settings import flat
 
 if TYPE_CHECKING:  # compiled loops, which a look into a file does not need
     from cpunet.pulses.preparation import Kind
@@ -179,17 +179,6 @@ def _turns(
     return np.array([np.count_nonzero(np.diff(row[row != 0])) for row in signs])
 
 
-# default values of the options of a translation; that of all others is None
-_DEFAULTS = {
-    "inverse": False,
-    "noise": True,
-    "seed": 0,
-    "realisations": 1,
-    "tails": "none",
-    "pile_up_khz": 0.0,
-}
-
-
 def provenance(source: PulseSource) -> dict[str, str]:
     """Describe how the pulses of a file were made.
 
@@ -208,7 +197,8 @@ def provenance(source: PulseSource) -> dict[str, str]:
     with suppress(ValueError, LookupError, TypeError, AttributeError):
         words |= _of_simulation(json.loads(told[SIMULATION]))
     with suppress(ValueError, LookupError, TypeError, AttributeError):
-        words["options"] = ", ".join(_given(json.loads(told[TRANSLATION])["options"]))
+        given = flat(json.loads(told[TRANSLATION])["options"], " ")
+        words["options"] = ", ".join(f"{k} {v}" for k, v in given if v is not None)
     return {name: text for name, text in words.items() if text}
 
 
@@ -225,15 +215,4 @@ def _of_simulation(made: Any) -> dict[str, str]:
     if "events" in made:  # a stand records them in its ``stand.json``
         lost, seed = made["events_without_signal"], made["seed"]
         words["events"] = f"{made['events']}, of which {lost} without a signal; seed {seed}"
-    return words
-
-
-def _given(options: Mapping[str, Any]) -> list[str]:
-    """Names and values of the options that differ from their defaults."""
-    words = []
-    for name, value in options.items():
-        if isinstance(value, Mapping):  # settings of traces in ADC counts
-            words.append(" ".join([name, *_given(value)]))
-        elif value != _DEFAULTS.get(name):
-            words.append(f"{name} {value}")
     return words

@@ -2,118 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Collection
+from typing import Any, TypeAlias
 
 import h5py
 import lh5
 import numpy as np
-from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
+from lgdo import LGDO, Array, ArrayOfEqualSizedArrays
 
 from cpunet.hdf5_files import lh5_rows, opened, text_attribute
 from cpunet.pulses.reading.energies import ENERGY_UNITS, Column
+from cpunet.pulses.reading.source import PulseSource
 
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
 _NUMBERS = "iufb"
 
+Read: TypeAlias = Callable[[int, int], dict[str, LGDO]]  # from a row on, so many rows
 
-@dataclass(frozen=True)
-class RowColumns:
-    """Columns of one table of a file, read by rows as LH5 objects.
+
+def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict[str, str]]:
+    """Columns beside the waveforms of a file.
 
     Parameters
     ----------
-    path
+    source
         The file.
-    table
-        Group that holds them; not used for other formats.
-    names
-        Name in the file → name in the output.
+    own
+        Names that the output uses itself.  A column with such a name gets `SUFFIX`, or is
+        omitted if it has the same meaning (event number, energy in energy units).
+
+    Returns
+    -------
+    read
+        Reads rows of all columns as LH5 objects, by name in the output.
     left_out
-        Name of each column that cannot be copied → the reason.
-    columns
-        Columns that the reader of a format other than HDF5 found.
+        The reason for each column that cannot be copied.
     """
-
-    path: Path
-    table: str = ""
-    names: Mapping[str, str] = field(default_factory=dict)
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    columns: Mapping[str, Column] = field(default_factory=dict)
-
-    @classmethod
-    def of_hdf5(
-        cls, path: Path, waveforms: str, n_pulses: int, own: Collection[str]
-    ) -> RowColumns:
-        """Find the columns beside the waveforms, without the waveforms themselves.
-
-        Parameters
-        ----------
-        path
-            LH5 or HDF5 file.
-        waveforms
-            Path of the waveforms in the file.
-        n_pulses
-            Number of rows that each column must have.
-        own
-            Names that the output uses itself.  A column with such a name gets `SUFFIX`, or
-            is omitted if it has the same meaning (event number, energy in energy units).
-        """
-        table, _, chosen = waveforms.rpartition("/")
-        names, left_out = list[str](), dict[str, str]()
-        with opened(path) as file:
-            group = file[table or "/"]
-            for name in group:
-                item = group.get(name)
-                if name == chosen or _is_same(name, item, own):
-                    continue
-                if reason := _unreadable(item, n_pulses):
-                    left_out[name] = reason
-                else:
-                    names.append(name)
-        return cls(path, table or "/", _renamed(names, own), left_out)
-
-    @classmethod
-    def of_columns(
-        cls, path: Path, columns: Mapping[str, Column], own: Collection[str]
-    ) -> RowColumns:
-        """Use the columns that the reader of another format found; names as above."""
-        names = [
-            name
-            for name, column in columns.items()
-            if not (name == "event_number" or _in_kev(name, column.units)) or name not in own
-        ]
-        return cls(path, names=_renamed(names, own), columns=columns)
-
-    def read(self, start: int, n: int, repeats: int = 1) -> dict[str, LGDO]:
-        """The `n` rows from `start` on, each repeated `repeats` times."""
-        if not self.names:
-            return {}
-        if self.columns:
-            found = {name: _from_column(self.columns[name], start, n) for name in self.names}
-        else:
-            with opened(self.path) as file:
-                group = file[self.table]
-                found = {name: _rows(group[name], start, n) for name in self.names}
-        return {
-            self.names[name]: repeated(column, repeats) if repeats > 1 else column
-            for name, column in found.items()
+    if source.layout.format not in ("LH5", "HDF5"):
+        columns = {
+            name: column
+            for name, column in source.columns.items()
+            if not _is_same(name, column.units, own)
         }
+        shown = _renamed(columns, own)
+        return lambda start, n: {
+            shown[name]: _from_column(column, start, n) for name, column in columns.items()
+        }, {}
+    table, _, chosen = source.layout.table.rpartition("/")
+    names, left_out = list[str](), dict[str, str]()
+    with opened(source.path) as file:
+        group = file[table or "/"]
+        for name in group:
+            item = group.get(name)  # None for a broken link
+            is_plain = isinstance(item, h5py.Dataset)
+            units = text_attribute(item, "units") if is_plain else ""
+            if name == chosen or (is_plain and _is_same(name, units, own)):
+                continue
+            if reason := _unreadable(item, source.n_pulses or 0):
+                left_out[name] = reason
+            else:
+                names.append(name)
+    shown = _renamed(names, own)
 
+    def read(start: int, n: int) -> dict[str, LGDO]:
+        with opened(source.path) as file:
+            group = file[table or "/"]
+            return {shown[name]: _rows(group[name], start, n) for name in names}
 
-def repeated(column: LGDO, repeats: int) -> LGDO:
-    """An LH5 object with each row repeated `repeats` times."""
-    attrs = {k: v for k, v in column.attrs.items() if k != "datatype"}
-    if isinstance(column, Table):
-        inner = {name: repeated(values, repeats) for name, values in column.items()}
-        return Table(inner, attrs=attrs)
-    if isinstance(column, VectorOfVectors):
-        values = column.view_as("ak")
-        return VectorOfVectors(values[np.repeat(np.arange(len(values)), repeats)], attrs=attrs)
-    rows = np.repeat(column.nda, repeats, axis=0)
-    return type(column)(nda=rows, attrs=dict(column.attrs))
+    return read, left_out
 
 
 def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:
@@ -132,10 +88,13 @@ def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:
 
 def _from_column(column: Column, start: int, n: int) -> Array:
     attrs = {"units": column.units} if column.units else {}
-    values = np.asarray(column.read(start, start + n))
-    if values.dtype.kind == "U":
-        values = np.char.encode(values, "utf-8")
-    return Array(values, attrs=attrs)
+    return Array(np.asarray(column.read(start, start + n)), attrs=attrs)
+
+
+def _is_same(name: str, units: str, own: Collection[str]) -> bool:
+    """Whether a column has the same meaning as the output's column of that name."""
+    in_energy_units = name == "energy" and units in ENERGY_UNITS
+    return name in own and (name == "event_number" or in_energy_units)
 
 
 def _renamed(names: Collection[str], own: Collection[str]) -> dict[str, str]:
@@ -148,17 +107,6 @@ def _renamed(names: Collection[str], own: Collection[str]) -> dict[str, str]:
                 renamed[name] += SUFFIX
             taken.add(renamed[name])
     return renamed
-
-
-def _is_same(name: str, item: object, own: Collection[str]) -> bool:
-    """Whether a column has the same meaning as the output's column of that name."""
-    if name not in own or not isinstance(item, h5py.Dataset):
-        return False
-    return name == "event_number" or _in_kev(name, text_attribute(item, "units"))
-
-
-def _in_kev(name: str, units: str) -> bool:
-    return name == "energy" and units in ENERGY_UNITS
 
 
 def _unreadable(item: h5py.Group | h5py.Dataset, n_pulses: int) -> str:

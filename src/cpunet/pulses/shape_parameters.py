@@ -1,13 +1,10 @@
 """Further pulse-shape parameters: times, current, noise; and bins of a parameter.
 
 `cpunet.pulses.parameters` defines the three parameters by which a translation is
-evaluated.  This module adds others on which an analysis may cut, each with its definition
-and source.
+evaluated.  This module adds others on which an analysis may cut.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import hist
 import numpy as np
@@ -39,80 +36,22 @@ RISE_TIMES = {
 }
 
 
-@dataclass(frozen=True)
-class ShapeParameter(Parameter):
-    """A parameter with its definition and the source of that definition."""
-
-    definition: str
-    source: str
-
-
-_AVSE = "Majorana, arXiv:1901.05388; dspeed"
-_PAPER = "Bhimani et al. 2026"
-_DSPEED_TIME = "dspeed, interpolated_time_point_thresh"
-_RISE = "LEGEND, rt1090 and its like"
-
-
-def _time_point(fraction: float) -> ShapeParameter:
-    return ShapeParameter(
-        rf"$t_{{{100 * fraction:g}\,\%}}$",
-        "ns",
-        f"time of the last crossing of {100 * fraction:g} % of the pulse's own maximum before "
-        "that maximum, interpolated linearly and counted from the aligned sample",
-        _DSPEED_TIME,
-    )
-
-
-def _rise_time(begin: str, end: str) -> ShapeParameter:
-    return ShapeParameter(
-        f"Rise time {int(begin[1:])}–{end[1:]} %", "ns", f"`{end}` less `{begin}`", _RISE
-    )
-
-
-SHAPE_PARAMETERS: dict[str, ShapeParameter] = {
-    "current_amplitude": ShapeParameter(
-        "Current amplitude $I_{max}$",
-        "1/sample",
-        "maximum of the current after three moving averages of 48 ns on a 1-ns grid (at 16 ns "
-        "a sample), which for a normalised pulse is A/E as well as A",
-        _AVSE,
-    ),
-    "current_width": ShapeParameter(
-        "Current width",
-        "ns",
-        "full width at half maximum of that smoothed current, from its highest value to the "
-        "nearest half on either side",
-        "smoothing as for A",
-    ),
-    "drift_time": ShapeParameter(
-        PARAMETERS["drift_time"].label,
-        "ns",
-        "time from the last crossing of `drift_start_fraction` of the maximum to the first "
-        "sample that holds the maximum; on a flat top that of the noise",
-        f"{_PAPER}, section 4.3.1",
-    ),
-    **{name: _time_point(fraction) for name, fraction in TIME_POINTS.items()},
-    **{name: _rise_time(*points) for name, points in RISE_TIMES.items()},
-    "effective_drift_time": ShapeParameter(
-        "Effective drift time",
-        "ns",
-        "area between the pulse and its maximum, from `t01` to the maximum, divided by the "
-        "maximum",
-        "LEGEND, dt_eff (there pole-zero corrected, over 4 µs)",
-    ),
-    "tail_slope": ShapeParameter(
-        "Tail slope",
-        "1/ms",
-        "slope of a straight line through the logarithm of the last `decay_fit_samples`",
-        f"{_PAPER}, section 4.3.3",
-    ),
-    "baseline_rms": ShapeParameter(
-        "Baseline RMS",
-        "pulse height",
-        "square root of the sum of the squared residuals of the first `baseline_samples` about "
-        "a straight line over its degrees of freedom",
-        "as in the preparation, which takes samples nearer the pulse",
-    ),
+# Definitions and sources are in docs/parameters.md.
+SHAPE_PARAMETERS: dict[str, Parameter] = {
+    "current_amplitude": PARAMETERS["current_amplitude"],
+    "current_width": Parameter("Current width", "ns"),
+    "drift_time": PARAMETERS["drift_time"],
+    **{
+        name: Parameter(rf"$t_{{{100 * fraction:g}\,\%}}$", "ns")
+        for name, fraction in TIME_POINTS.items()
+    },
+    **{
+        name: Parameter(f"Rise time {int(begin[1:])}–{end[1:]} %", "ns")
+        for name, (begin, end) in RISE_TIMES.items()
+    },
+    "effective_drift_time": Parameter("Effective drift time", "ns"),
+    "tail_slope": PARAMETERS["tail_slope"],
+    "baseline_rms": Parameter("Baseline RMS", "pulse height"),
 }
 
 

@@ -1,18 +1,11 @@
-"""Lines found in a spectrum, the calibration that they suggest, and its figure."""
+"""Lines found in a spectrum, and the calibration that they suggest."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-
-from cpunet.plotting import COLOURS, DATA_FILL, styled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 Values = npt.NDArray[np.float64]
 
@@ -100,25 +93,6 @@ class Suggestion(NamedTuple):
         return f"{self.source} ({lines} keV) at `kev_per_adc` {self.kev_per_adc:.4g}"
 
 
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Energies in keV, or amplitudes in ADC counts if no energy is known.
-
-    Parameters
-    ----------
-    values
-        One per pulse, shape ``(n,)``.
-    in_kev
-        Whether they are energies.
-    found
-        Lines found, and the calibration that gives them the right energies.
-    """
-
-    values: Values
-    in_kev: bool
-    found: Suggestion | None
-
-
 def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     """Search a spectrum of amplitudes for the lines of calibration sources.
 
@@ -198,59 +172,3 @@ def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, 
     near = np.abs(log_amplitudes + log_factor - np.log(line)) < 2 * LOG_BIN
     middle = float(np.median(log_amplitudes[near])) if near.any() else np.log(line) - log_factor
     return float(line / np.exp(middle))
-
-
-BINS = 1000
-SHOWN = 0.999  # quantile of the values; the axis ends a little above it
-
-
-@styled
-def spectrum_figure(spectrum: Spectrum) -> Figure:
-    """Counts on a logarithmic axis; lines found are marked, others of their source dotted.
-
-    Amplitudes have a second axis in keV if a calibration is suggested.
-    """
-    from matplotlib.figure import Figure  # half a second, which no other function needs
-
-    figure = Figure(figsize=(9.0, 4.2))
-    axes = figure.subplots()
-    values = spectrum.values[np.isfinite(spectrum.values)]
-    top = 1.05 * float(np.quantile(values, SHOWN)) if len(values) else 1.0
-    bins = min(BINS, max(200, len(values) // 10))
-    counts, edges = np.histogram(values, bins, (0.0, max(top, 1e-9)))
-    axes.stairs(counts, edges, fill=True, color=DATA_FILL)
-    axes.stairs(counts, edges, color=COLOURS["data"], linewidth=0.6)
-    unit = "keV" if spectrum.in_kev else "ADC counts"
-    axes.set(
-        xlabel=f"Energy [{unit}]"
-        if spectrum.in_kev
-        else f"Amplitude over the baseline [{unit}]",
-        ylabel=f"Pulses / {edges[1] - edges[0]:.3g} {unit} (logarithmic)",
-        yscale="log",
-        xlim=(0.0, edges[-1]),
-        ylim=(0.5, 10.0 * max(counts.max(), 1)),
-    )
-    found = spectrum.found
-    if found is not None:
-        for line in sorted(SOURCES.get(found.source, found.lines_kev)):
-            place, sure = line / found.kev_per_adc, line in found.lines_kev
-            if place > edges[-1]:
-                continue
-            axes.axvline(place, color=COLOURS["raw"], lw=0.8, ls="-" if sure else ":", zorder=0)
-            axes.annotate(
-                f"{line:.0f}" if sure else f"({line:.0f})",
-                (place, 0.98),
-                xycoords=("data", "axes fraction"),
-                rotation=90,
-                ha="right",
-                va="top",
-                color=COLOURS["raw"],
-            )
-        if not spectrum.in_kev:
-            factor = found.kev_per_adc
-            above = axes.secondary_xaxis(
-                "top",
-                functions=(lambda v: np.multiply(v, factor), lambda v: np.divide(v, factor)),
-            )
-            above.set_xlabel(f"Energy [keV] with {factor:.4g} keV per ADC count")
-    return figure

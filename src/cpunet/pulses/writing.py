@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -35,6 +33,8 @@ _GZIP_LEVEL = 1
 class PulseWriter:
     """Writer of an LH5 file: append blocks of pulses, then leave the ``with`` block.
 
+    All blocks have the same length, sampling and columns.
+
     The table contains ``waveform`` (t0, dt, values; times in ns), ``energy`` (keV),
     ``event_number`` and the columns of the blocks, with the LH5 library's compression.
     The file appears only when it is complete.
@@ -59,8 +59,7 @@ class PulseWriter:
     Raises
     ------
     CpunetError
-        If the file exists (without `force`) or cannot be written, if blocks differ
-        in length, sampling or columns, or if no block was written.
+        If the file exists (without `force`) or cannot be written, or if no block was written.
 
     Examples
     --------
@@ -94,16 +93,13 @@ class PulseWriter:
         self._waveform_units = waveform_units
         self._t0_ns = t0_ns
         self._attrs = dict(attrs or {})
-        self._shape: tuple[int, float, tuple[str, ...]] | None = None
         self._stack = ExitStack()
-        self._file: FileInTheMaking  # within the writer's with block
+        self._file: h5py.File  # within the writer's with block
+        self._held: HeldFile
         refuse_existing(self.path, force=force)
 
     def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            aside = stack.enter_context(written_aside(self.path))
-            self._file = stack.enter_context(FileInTheMaking(aside, self.path))
-            self._stack = stack.pop_all()
+        self._file, self._held = self._stack.enter_context(written_hdf5(self.path))
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -123,8 +119,6 @@ class PulseWriter:
             Further values per event: name → (array of shape ``(n,)``, units), or an LH5 object
             of n rows.
         """
-        extra = dict(columns or {})
-        self._require_same(pulses, extra)
         if len(pulses) == 0:
             return
         content: dict[str, LGDO] = {
@@ -134,16 +128,8 @@ class PulseWriter:
             "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
             "event_number": Array(pulses.event_number),
         }
-        for name, column in extra.items():
-            if isinstance(column, tuple) and np.shape(column[0]) != (len(pulses),):
-                raise CpunetError(
-                    f"{self.path}: column {name} has shape {np.shape(column[0])} beside "
-                    f"{len(pulses)} pulses; give one value per pulse"
-                )
-            content[name] = _column(column)
-        block = Table(col_dict=content, attrs=dict(self._attrs))
-        group, _, name = self._table.rpartition("/")
-        self._file.write(block, name, group or "/")
+        content |= {name: _column(column) for name, column in (columns or {}).items()}
+        self._write(Table(col_dict=content, attrs=dict(self._attrs)), self._table)
         self.n_pulses += len(pulses)
 
     def append_rows(self, table: str, columns: Columns) -> None:
@@ -156,30 +142,19 @@ class PulseWriter:
         columns
             Name → (array of shape ``(rows,)``, units); the same names each time.
         """
-        group, _, name = table.strip("/").rpartition("/")
         content = {key: _column(column) for key, column in columns.items()}
         if len(next(iter(content.values()))) > 0:
-            self._file.write(Table(content), name, group or "/")
+            self._write(Table(content), table.strip("/"))
+
+    def _write(self, rows: Table, table: str) -> None:
+        group, _, name = table.rpartition("/")
+        lh5.write(rows, name, self._file, group=group or "/", wo_mode="append")
+        self._held.require_written()
 
     def annotate(self, name: str, text: str, *, file: bool = False) -> None:
         """Set an attribute of the table of pulses after the first block, or of the `file`."""
-        item = self._file.h5 if file else self._file.h5[self._table]
+        item = self._file if file else self._file[self._table]
         item.attrs[name] = text
-
-    def _require_same(self, pulses: Pulses, extra: Mapping[str, Any]) -> None:
-        taken = {"waveform", "energy", "event_number"} & set(extra)
-        if taken:
-            raise CpunetError(
-                f"{self.path}: column {taken.pop()} is the pulses' own; choose another name"
-            )
-        shape = (pulses.length, pulses.dt_ns, tuple(sorted(extra)))
-        if self._shape is None:
-            self._shape = shape
-        if shape != self._shape:
-            raise CpunetError(
-                f"{self.path}: a block of {_in_words(shape)} after one of "
-                f"{_in_words(self._shape)}; write them to separate files"
-            )
 
 
 def _column(column: tuple[npt.ArrayLike, str] | LGDO) -> LGDO:
@@ -187,23 +162,6 @@ def _column(column: tuple[npt.ArrayLike, str] | LGDO) -> LGDO:
         return column
     values, units = column
     return Array(np.asarray(values), attrs={"units": units} if units else {})
-
-
-def _in_words(shape: tuple[int, float, tuple[str, ...]]) -> str:
-    length, dt_ns, names = shape
-    return f"{length} samples of {dt_ns:g} ns with columns {', '.join(names) or '(none)'}"
-
-
-@contextmanager
-def write_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the HDF5 library, such as a full disk, into a `CpunetError`."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        raise CpunetError(
-            f"{path}: cannot be written ({os_reason(error)}); make room there, or choose "
-            "another place"
-        ) from error
 
 
 class HeldFile(io.FileIO):
@@ -235,53 +193,21 @@ class HeldFile(io.FileIO):
             self.failure = error
         return 0 if size is None else size
 
-
-class FileInTheMaking:
-    """An HDF5 file being written, whose errors are raised as `CpunetError`.
-
-    Parameters
-    ----------
-    aside
-        Temporary path that is written.
-    target
-        Final path, for error messages.
-    """
-
-    def __init__(self, aside: Path, target: Path) -> None:
-        self._target = target
-        with write_errors(target):
-            self._held = HeldFile(aside, "w+")
-            self.h5 = h5py.File(self._held, "w")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with write_errors(self._target):
-            try:
-                self.h5.close()
-            finally:
-                self._held.close()
-            self._raise_failure()
-
-    def write(self, item: LGDO, name: str, group: str) -> None:
-        """Append rows to the object `name` in `group`."""
-        with write_errors(self._target):
-            lh5.write(item, name, self.h5, group=group, wo_mode="append")
-            self._raise_failure()
-
-    def _raise_failure(self) -> None:
-        if self._held.failure is not None:
-            raise self._held.failure
+    def require_written(self) -> None:
+        """Raise the failure, if there was one."""
+        if self.failure is not None:
+            raise self.failure
 
 
-def os_reason(error: Exception) -> str:
-    """The operating system's reason, which HDF5 hides in a message of many lines."""
-    number = error.errno if isinstance(error, OSError) else None
-    hidden = re.search(r"errno = (\d+)", str(error))
-    if number is None and hidden is not None:
-        number = int(hidden.group(1))
-    return os.strerror(number) if number else " ".join(str(error).split())
+@contextmanager
+def written_hdf5(target: Path) -> Iterator[tuple[h5py.File, HeldFile]]:
+    """Yield an HDF5 file that is written aside, and its stream; see `written_aside`."""
+    with written_aside(target) as aside, HeldFile(aside, "w+") as held:
+        try:
+            with h5py.File(held, "w") as file:
+                yield file, held
+        finally:
+            held.require_written()
 
 
 def waveform_table(

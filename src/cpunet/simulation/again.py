@@ -10,11 +10,12 @@ from typing import Self
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened
+from cpunet.hdf5_files import opened
 from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import NOT_IN_PARTS, Superposition, solve, superposed_fields
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import HIT_TABLE, read_hits
+from cpunet.simulation.hit_files import read_hits
+from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 
@@ -57,8 +58,7 @@ class StoredSimulation:
                     f"{file}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
                     "an output of cpunet simulate or of a test stand"
                 )
-            column = content.get(f"{_PULSES}/event_number")
-            numbers = np.asarray(column[()]) if is_column(column) else np.empty(0)
+            numbers = np.asarray(content[f"{_PULSES}/event_number"][()])
         try:
             made = json.loads(text)
             detector = Detector.model_validate(made["detector"])
@@ -72,7 +72,13 @@ class StoredSimulation:
             raise CpunetError(
                 f"{file}: several pulses have the same event_number; simulate them again"
             )
-        return cls(detector, settings, read_hits(file).of_events(numbers))
+        hits = read_hits(file).of_events(numbers)
+        if (without := np.diff(hits.offsets) == 0).any():
+            raise CpunetError(
+                f"{file}: {HIT_TABLE} has no hit of event {hits.event_number[without][0]}; "
+                "simulate it again"
+            )
+        return cls(detector, settings, hits)
 
 
 # Maximum number of time steps that a drift step of quick pulses replaces.

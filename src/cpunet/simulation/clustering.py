@@ -45,8 +45,7 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     """
     near = float(distance_mm) ** 2  # always a float, so that the loop is compiled only once
     merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, near)
-    x, y, z, energy = merged.T.copy()
-    return Hits(x, y, z, energy, offsets, hits.event_number)
+    return Hits.of(merged[:, :3], merged[:, 3].copy(), offsets, hits.event_number)
 
 
 def merge_hits(hits: Hits, detector: Detector, distance_mm: float) -> Hits:
@@ -58,7 +57,7 @@ def merge_hits(hits: Hits, detector: Detector, distance_mm: float) -> Hits:
     """
     if distance_mm == 0:
         return hits
-    active = detector.active(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
+    active = detector.active(hits.r_mm, hits.z_mm)
     parts = cluster_hits(hits.where(active), distance_mm), hits.where(~active)
     order = np.argsort(np.concatenate([part.event_of_hit for part in parts]), kind="stable")
     return Hits.of(

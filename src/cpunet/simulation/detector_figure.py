@@ -1,4 +1,4 @@
-"""The fields of a detector in one figure: potentials, drift paths and collection times."""
+"""The fields of a detector in one figure: potentials and drift paths."""
 
 from __future__ import annotations
 
@@ -6,45 +6,33 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
-from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import distance_transform_edt
 
 from cpunet.plotting import COLOURS, styled
 from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.fields import FieldMaps
-from cpunet.simulation.geometry import (
-    DITCH,
-    LI_CONTACT,
-    POINT_CONTACT,
-    Detector,
-    FloatArray,
-)
+from cpunet.simulation.geometry import Detector, FloatArray
+from cpunet.simulation.outline import DITCH, LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings
 
-# Paths and times tolerate coarse steps, but must not end before the charge is collected.
+# Paths tolerate coarse steps, but must not end before the charge is collected.
 _SETTINGS = SimulationSettings(step_ns=2.0, dt_ns=16.0, length_ns=6000.0, diffusion=False)
-_MAP_POINTS = 70  # grid points of the collection times along the longer side of the crystal
-_OUTLINE_POINTS = 900  # along the same side
-_BLOCK = 500  # paths per block
+_OUTLINE_POINTS = 900  # along the longer side of the crystal
 _ELECTRON, _HOLE = COLOURS["ren"], COLOURS["raw"]
 _REGIONS = ((LI_CONTACT, "Li contact", "0.55"), (POINT_CONTACT, "p⁺ contact", "#009E73"))
 _WEIGHTING_LEVELS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
-_RAY_RAD = np.deg2rad(55)
 
 
 @styled
 def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
-    """Potential, weighting potential and collection times on the cross-section r, z.
+    """Potential with drift paths, and weighting potential, on the cross-section r, z.
 
-    Collection times are those of holes at the point contact.  They and the paths start in
-    the plane y = 0.  A path ends where its carrier is collected or can induce no further
-    signal; far from the point contact, electron paths end soon after they start.
+    Paths start in the plane y = 0. A path ends where its carrier is collected or can induce no
+    further signal; far from the point contact, electron paths end soon after they start.
 
     Parameters
     ----------
@@ -54,11 +42,17 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
         Field maps of the detector.
     """
     ratio = detector.crystal_length / detector.crystal_radius
-    figure = Figure(figsize=(10.5, min(max(1.6 + 2.5 * ratio, 3.4), 7.5)))
-    panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    _potential(figure, panels[0], fields)
-    _weighting_potential(figure, panels[1], fields)
-    _collection_times(figure, panels[2], detector, fields)
+    figure = Figure(figsize=(7.2, min(max(1.6 + 2.5 * ratio, 3.4), 7.5)))
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    top, low = float(fields.potential_V.max()), _WEIGHTING_LEVELS[0]
+    lines = np.linspace(0, top, 11)[1:-1], _WEIGHTING_LEVELS
+    bar = f"Potential [V], lines every {top / 10:.0f} V"
+    how: dict[str, Any] = {"cmap": "viridis", "vmin": 0, "vmax": top}
+    _map(panels[0], fields, fields.potential_V, lines[0], bar, how)
+    weighting = np.maximum(fields.weighting_potential, low / 10)
+    bar = f"Weighting potential, lines at {low} to {lines[1][-1]}"
+    how = {"cmap": "cividis", "norm": LogNorm(low / 10, 1)}
+    _map(panels[1], fields, weighting, lines[1], bar, how)
     _paths(panels[0], detector, fields)
     for axes in panels:
         _outline(axes, detector)
@@ -80,77 +74,24 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     return figure
 
 
-def _potential(figure: Figure, axes: Axes, fields: FieldMaps) -> None:
-    values = _in_germanium(fields, fields.potential_V)
-    top = float(np.nanmax(fields.potential_V))
-    levels = np.linspace(0, top, 11)[1:-1]
-    bar = f"Potential [V], lines every {top / 10:.0f} V"
-    _map(
-        figure, axes, fields, values, levels, "Potential", bar, cmap="viridis", vmin=0, vmax=top
-    )
-
-
-def _weighting_potential(figure: Figure, axes: Axes, fields: FieldMaps) -> None:
-    low, name = _WEIGHTING_LEVELS[0], "Weighting potential"
-    values = np.maximum(_in_germanium(fields, fields.weighting_potential), low / 10)
-    how = {"cmap": "cividis", "norm": LogNorm(low / 10, 1)}
-    lines = _map(figure, axes, fields, values, _WEIGHTING_LEVELS, name, name, **how)
-    axes.clabel(lines, manual=_along_a_ray(fields), fmt="%g", fontsize=7.5)
-
-
 def _map(
-    figure: Figure, axes: Axes, fields: FieldMaps, values: FloatArray, levels: Any, title: str,
-    bar: str, **how: Any,
-) -> ContourSet:  # fmt: skip
-    """Draw values at the nodes in colour, with lines at some levels."""
-    places = fields.r_mm, fields.z_mm, values.T
-    image = axes.pcolormesh(*places, rasterized=True, **how)
-    axes.set_title(title)
-    _bar(figure, axes, image, bar)
-    return axes.contour(*places, levels, colors="white", linewidths=0.65, alpha=0.9)
-
-
-def _along_a_ray(fields: FieldMaps) -> list[tuple[float, float]]:
-    """Positions of the contour labels on a ray from the contact, so none is cut off."""
-    distance = np.arange(0, fields.z_mm[-1], fields.grid_mm)
-    r, z = distance * np.cos(_RAY_RAD), distance * np.sin(_RAY_RAD)
-    r, z = r[r < fields.r_mm[-1]], z[r < fields.r_mm[-1]]
-    rows, columns = (np.rint(x / fields.grid_mm).astype(int) for x in (r, z))
-    along = fields.weighting_potential[rows, columns]
-    # at the first contact that it meets, the ray leaves the crystal
-    end = int(np.argmax((along <= 0) & (r > 0))) or len(along)
-    firsts = [int(np.argmax(along[:end] <= level)) for level in _WEIGHTING_LEVELS[:-1]]
-    return [(float(r[i]), float(z[i])) for i in firsts if i]
-
-
-def _collection_times(
-    figure: Figure, axes: Axes, detector: Detector, fields: FieldMaps
+    axes: Axes, fields: FieldMaps, values: FloatArray, levels: Any, bar: str, how: Any
 ) -> None:
-    step = max(detector.crystal_length, detector.crystal_radius) / _MAP_POINTS
-    r = np.arange(step / 2, detector.crystal_radius + step / 2, step)
-    z = np.arange(step / 2, detector.crystal_length + step / 2, step)
-    rr, zz = np.meshgrid(r, z, indexing="ij")
-    blocks = [
-        _hole_times(fields, rr.ravel()[i : i + _BLOCK], zz.ravel()[i : i + _BLOCK])
-        for i in range(0, rr.size, _BLOCK)
-    ]
-    times = np.concatenate(blocks).reshape(rr.shape)
-    top = float(np.nanmax(times))
-    times = _filled(times)
-    image = axes.pcolormesh(r, z, times.T, cmap="YlOrRd", vmin=0, vmax=top, rasterized=True)
-    levels = MaxNLocator(12, steps=[1, 2, 5, 10]).tick_values(0, top)[1:-1]
-    lines = axes.contour(r, z, times.T, levels, colors="black", linewidths=0.7)
-    axes.clabel(lines, levels=levels[1::2], fmt="%g", fontsize=7.5)
-    axes.set_title("Hole collection time")
-    _bar(figure, axes, image, f"To the p⁺ contact [ns], lines every {levels[0]:g} ns")
+    """Draw values at the nodes in colour, with lines at some levels.
 
-
-def _hole_times(fields: FieldMaps, r: FloatArray, z: FloatArray) -> FloatArray:
-    """Drift time in ns from each point to the point contact; NaN if it is not reached."""
-    height = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS).holes[:, :, 2]
-    steps = np.isfinite(height).sum(axis=1)
-    arrived = (steps > 0) & (steps < height.shape[1])
-    return np.asarray(np.where(arrived, (steps - 1) * _SETTINGS.step_ns, np.nan))
+    Those of the germanium are extended into the lithium layer and the ditch, so that no gap
+    shows at the edges of what is drawn there.
+    """
+    covered = np.isin(fields.region, (LI_CONTACT, DITCH))
+    nearest = distance_transform_edt(covered, return_distances=False, return_indices=True)
+    values = values[tuple(nearest)].T
+    image = axes.pcolormesh(fields.r_mm, fields.z_mm, values, rasterized=True, **how)
+    axes.contour(
+        fields.r_mm, fields.z_mm, values, levels, colors="white", linewidths=0.65, alpha=0.9
+    )
+    axes.figure.colorbar(
+        image, ax=axes, label=bar, location="bottom", shrink=0.95, pad=0.02, aspect=25
+    )
 
 
 def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
@@ -188,21 +129,3 @@ def _outline(axes: Axes, detector: Detector) -> None:
     # contours do not run along the edge of the axes
     bottom = np.where(inside[0], 0.0, np.nan)
     axes.plot(r, bottom, color="black", linewidth=1.0, zorder=2.3)
-
-
-def _in_germanium(fields: FieldMaps, values: FloatArray) -> FloatArray:
-    """The map with the germanium's values extended into the lithium layer and the ditch."""
-    return _filled(np.where(np.isin(fields.point_type, (LI_CONTACT, DITCH)), np.nan, values))
-
-
-def _filled(values: FloatArray) -> FloatArray:
-    """Fill missing values with the nearest ones, which avoids gaps at the covered edges."""
-    nearest = distance_transform_edt(
-        np.isnan(values), return_distances=False, return_indices=True
-    )
-    return np.asarray(values[tuple(nearest)])
-
-
-def _bar(figure: Figure, axes: Axes, image: ScalarMappable, text: str) -> None:
-    bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.95, pad=0.02, aspect=25)
-    bar.set_label(text)

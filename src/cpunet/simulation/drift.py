@@ -14,20 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.field_lookup import (
-    DriftMaps,
-    drift_maps,
-    in_active_volume,
-    look_up,
-)
+from cpunet.simulation.field_lookup import DriftMaps, drift_maps, in_active_volume, look_up
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.velocity import (
-    ELECTRON,
-    HOLE,
-    FloatArray,
-    carrier_velocity,
-)
+from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray, carrier_velocity
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 # siggen's rounded value, used in its formulas
@@ -308,11 +298,9 @@ def drift(
         if stride > 1:
             wx, wy, wz = vx, vy, vz
             if k > 0:
-                vx, vy, vz = (
-                    vx + ahead * (vx - ux),
-                    vy + ahead * (vy - uy),
-                    vz + ahead * (vz - uz),
-                )
+                vx += ahead * (vx - ux)
+                vy += ahead * (vy - uy)
+                vz += ahead * (vz - uz)
             ux, uy, uz = wx, wy, wz
         # no charge leaves through the passivated face: it slides along the face
         x, y, z = x + vx * step_ns, y + vy * step_ns, max(z + vz * step_ns, 0.0)

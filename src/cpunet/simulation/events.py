@@ -183,11 +183,7 @@ def _sum_events(
 
 @kernel
 def _add_drifted(
-    maps: DriftMaps,
-    hit: FloatArray,
-    task: Task,
-    signal: FloatArray,
-    out: FloatArray,
+    maps: DriftMaps, hit: FloatArray, task: Task, signal: FloatArray, out: FloatArray
 ) -> tuple[int, float]:
     """Add the pulse of one drifted hit to `out`; return its outcome and trapped fraction."""
     last, arrived, fwhm, trapped = point_signal(maps, hit, task, signal)

@@ -18,14 +18,14 @@ from scipy.interpolate import RectBivariateSpline
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.fields import FieldMaps
-from cpunet.simulation.geometry import DITCH
+from cpunet.simulation.outline import DITCH
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.velocity import FloatArray, velocity_table
 
 BoolArray = npt.NDArray[np.bool_]
 
 # Columns of `DriftMaps.values`.
-E_R, E_Z, WP, POTENTIAL = range(4)
+E_R, E_Z, WP, VOLTS = range(4)
 
 # Maximum step of refined maps.
 _FINE_MM = 0.1
@@ -62,21 +62,14 @@ def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
     CpunetError
         If no cell of the maps has a field.
     """
-    stacked = np.stack(
-        [
-            fields.e_r_V_per_cm,
-            fields.e_z_V_per_cm,
-            fields.weighting_potential,
-            fields.potential_V,
-        ],
-        axis=-1,
-    ).astype(np.float64)
+    e_r, e_z, volts = fields.e_r_V_per_cm, fields.e_z_V_per_cm, fields.potential_V
+    stacked = np.stack([e_r, e_z, fields.weighting_potential, volts], axis=-1).astype(float)
     # nothing drifts in the ditch, and the field is discontinuous at its walls
-    ditch = np.asarray(fields.point_type) == DITCH
+    ditch = np.asarray(fields.region) == DITCH
     with_field = np.isfinite(stacked).all(-1) & ~ditch & (stacked[..., :2] != 0).any(-1)
     if not with_field.any():
         raise CpunetError("the field maps hold no field; compute them again")
-    bias = float(np.nanmax(stacked[..., POTENTIAL]))
+    bias = float(np.nanmax(stacked[..., VOLTS]))
     values, known = with_ghost_nodes(np.where(with_field[..., None], stacked, 0.0), with_field)
     usable = _all_corners(known) & ~_all_corners(~with_field)
     parts = math.ceil(fields.grid_mm / _FINE_MM - 1e-6)
@@ -178,13 +171,8 @@ def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, f
     er = w00 * m00[E_R] + w10 * m10[E_R] + w01 * m01[E_R] + w11 * m11[E_R]
     ez = w00 * m00[E_Z] + w10 * m10[E_Z] + w01 * m01[E_Z] + w11 * m11[E_Z]
     wp = w00 * m00[WP] + w10 * m10[WP] + w01 * m01[WP] + w11 * m11[WP]
-    potential = (
-        w00 * m00[POTENTIAL]
-        + w10 * m10[POTENTIAL]
-        + w01 * m01[POTENTIAL]
-        + w11 * m11[POTENTIAL]
-    )
-    return er, ez, min(max(wp, 0.0), 1.0), potential, True
+    volts = w00 * m00[VOLTS] + w10 * m10[VOLTS] + w01 * m01[VOLTS] + w11 * m11[VOLTS]
+    return er, ez, min(max(wp, 0.0), 1.0), volts, True
 
 
 @kernel

@@ -16,7 +16,6 @@ is not depleted, and the potential is refused.
 
 from __future__ import annotations
 
-import heapq
 import logging
 import math
 import os
@@ -28,28 +27,14 @@ from typing import Any
 
 import numpy as np
 import platformdirs
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import binary_erosion, label, minimum_filter
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.simulation.geometry import (
-    DITCH,
-    GERMANIUM,
-    LI_CONTACT,
-    Detector,
-    FloatArray,
-    RegionArray,
-)
-from cpunet.simulation.poisson import (
-    CONTACT_EDGE,
-    DITCH_EDGE,
-    Grid,
-    Potentials,
-    make_grid,
-    point_types,
-    solve_potentials,
-)
+from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
+from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
+from cpunet.simulation.poisson import Grid, Potentials, make_grid, solve_potentials
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +43,6 @@ log = logging.getLogger(__name__)
 POCKET_DEPTH_V = 0.01
 HIGHEST_BIAS_V = 20_000.0
 _RESOLUTION_V = 0.5
-_NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j)
 
 
 def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
@@ -89,10 +73,8 @@ def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionAr
         return 0.0
     while high - low > _RESOLUTION_V:
         middle = (low + high) / 2
-        if has_pocket(middle * bias + impurities, region):
-            low = middle
-        else:
-            high = middle
+        pocket = has_pocket(middle * bias + impurities, region)
+        low, high = (middle, high) if pocket else (low, middle)
     return high
 
 
@@ -119,24 +101,12 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
 def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) -> bool:
     """Whether leaving a minimum requires a climb of more than `POCKET_DEPTH_V`.
 
-    Floods from the minimum, lowest node first, until a lower node or a contact is reached.
+    Otherwise a lower node or a contact can be reached from it below that level.
     """
     start = potential[row, column]
-    heap = [(float(start), row, column)]
-    seen = {(row, column)}
-    while heap:
-        level, i, j = heapq.heappop(heap)
-        if level > start + POCKET_DEPTH_V:
-            return True
-        if level < start or region[i, j] < GERMANIUM:
-            return False
-        for di, dj in _NEIGHBOURS:
-            node = (i + di, j + dj)
-            inside = 0 <= node[0] < region.shape[0] and 0 <= node[1] < region.shape[1]
-            if inside and node not in seen:
-                seen.add(node)
-                heapq.heappush(heap, (float(potential[node]), *node))
-    return True
+    basins, _ = label(potential <= start + POCKET_DEPTH_V, np.ones((3, 3)))
+    basin = basins == basins[row, column]
+    return bool((region[basin] >= GERMANIUM).all() and (potential[basin] >= start).all())
 
 
 # part of the file name, so that results of an older solver are not used
@@ -219,7 +189,7 @@ class Superposition:
         CpunetError
             If the detector is not depleted, so that the superposition does not hold.
         """
-        potential = self._sum(bias_V, impurity_scale, impurity_tilt)
+        potential = self.total_V(bias_V, impurity_scale, impurity_tilt)
         if has_pocket(potential, self.grid.region):
             depletion = self.depletion_V(impurity_scale, impurity_tilt)
             name = self.detector.name
@@ -243,45 +213,15 @@ class Superposition:
             return depletion if depletion <= HIGHEST_BIAS_V else math.inf
         return depletion_voltage(
             self.potentials.bias,
-            self._sum(0.0, impurity_scale, impurity_tilt),
+            self.total_V(0.0, impurity_scale, impurity_tilt),
             self.grid.region,
         )
 
-    def scale_of_depletion(self, depletion_V: float, impurity_tilt: float = 0.0) -> float:
-        """Scale of the impurities at which the detector just depletes at `depletion_V`.
-
-        Raises
-        ------
-        CpunetError
-            If there is no such scale.
-        """
-        low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
-        what = f"detector {self.detector.name}: {depletion_V:g} V"
-        if self._pocket(depletion_V, low, impurity_tilt):
-            raise CpunetError(
-                f"{what} do not deplete it even with {low:g} of its impurities; correct "
-                "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
-            )
-        if not self._pocket(depletion_V, high, impurity_tilt):
-            raise CpunetError(
-                f"{what} deplete it even with {high:g} times its impurities; correct "
-                "measured_depletion_V or impurity_z0_1e10_per_cm3"
-            )
-        while high / low > 1 + _SCALE_RESOLUTION:
-            middle = math.sqrt(low * high)
-            if self._pocket(depletion_V, middle, impurity_tilt):
-                high = middle
-            else:
-                low = middle
-        return low
-
-    def _sum(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
+    def total_V(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
+        """Sum of the parts in V, also where the detector is not depleted."""
         parts = self.potentials
         total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
         return total + impurity_tilt * parts.tilt if impurity_tilt else total
-
-    def _pocket(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> bool:
-        return has_pocket(self._sum(bias_V, impurity_scale, impurity_tilt), self.grid.region)
 
 
 def solve(detector: Detector, *, cache: bool = True) -> Superposition:
@@ -325,10 +265,8 @@ class FieldMaps:
     """Fields at the nodes ``r_mm`` (nr) times ``z_mm`` (nz), spaced by `grid_mm`.
 
     Maps have shape (nr, nz). The field is E = -grad V in V/cm. It is 0 in contacts and
-    outside; on the walls of the ditch it is that of the germanium. `point_type` is 0 in the
-    point contact, 1 in the lithium contact and outside, 2 in germanium, 3 in germanium on the
-    passivated face z = 0, 5 in the ditch, 6 and 7 in germanium next to the ditch and next to
-    a contact.
+    outside; on the walls of the ditch it is that of the germanium. `region` is
+    `Detector.region` at the nodes.
     """
 
     r_mm: FloatArray
@@ -338,7 +276,7 @@ class FieldMaps:
     e_r_V_per_cm: FloatArray
     e_z_V_per_cm: FloatArray
     weighting_potential: FloatArray
-    point_type: RegionArray
+    region: RegionArray
     temperature_K: float
     capacitance_pF: float
     depletion_V: float
@@ -396,7 +334,7 @@ def superposed_fields(
         e_r_V_per_cm=e_r,
         e_z_V_per_cm=e_z,
         weighting_potential=parts.point_contact,
-        point_type=point_types(grid),
+        region=grid.region,
         temperature_K=detector.temperature_K,
         capacitance_pF=parts.capacitance_pF,
         depletion_V=solution.depletion_V(*impurities) if depletion else np.nan,
@@ -420,13 +358,31 @@ def scaled_to_depletion(detector: Detector) -> Detector:
             f"detector {detector.name}: no measured_depletion_V to scale its impurities by; "
             "add it to the file, or give `settings` measured_depletion_V=VALUE"
         )
-    solution = solve(detector)
-    scale = solution.scale_of_depletion(measured, detector.impurity_tilt_1e10_per_cm4)
+    solution, tilt = solve(detector), detector.impurity_tilt_1e10_per_cm4
+
+    def pocket(scale: float) -> bool:
+        return has_pocket(solution.total_V(measured, scale, tilt), solution.grid.region)
+
+    low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
+    what = f"detector {detector.name}: {measured:g} V"
+    if pocket(low):
+        raise CpunetError(
+            f"{what} do not deplete it even with {low:g} of its impurities; correct "
+            "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
+        )
+    if not pocket(high):
+        raise CpunetError(
+            f"{what} deplete it even with {high:g} times its impurities; correct "
+            "measured_depletion_V or impurity_z0_1e10_per_cm3"
+        )
+    while high / low > 1 + _SCALE_RESOLUTION:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if pocket(middle) else (middle, high)
     log.info(
-        f"{detector.name}: impurities times {scale:.4g}, so that it depletes at the measured "
+        f"{detector.name}: impurities times {low:.4g}, so that it depletes at the measured "
         f"{measured:g} V"
     )
-    return detector.model_copy(update={"impurity_scale": scale})
+    return detector.model_copy(update={"impurity_scale": low})
 
 
 def electric_field(
@@ -489,10 +445,9 @@ def fields_in_words(detector: Detector, fields: FieldMaps) -> list[tuple[str, st
     """Names and texts: capacitance, depletion voltage, bias, extremes of the bulk's field."""
     strength = np.hypot(fields.e_r_V_per_cm, fields.e_z_V_per_cm)
     # next to contacts and the ditch the field is only a one-sided difference
-    bulk = fields.point_type > LI_CONTACT
-    bulk &= fields.point_type < DITCH_EDGE
-    bulk &= fields.point_type != CONTACT_EDGE
-    bulk &= detector.active(fields.r_mm[:, None], fields.z_mm[None, :])
+    germanium = fields.region == GERMANIUM
+    bulk = binary_erosion(germanium, border_value=1)
+    bulk[:, 0] = germanium[:, 0]
     measured, scale = detector.measured_depletion_V, detector.impurity_scale
     lines = [
         ("detector", detector.name),

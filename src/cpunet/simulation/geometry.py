@@ -9,15 +9,16 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import chain
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from cpunet.settings import Config, Millimetres
+from cpunet.simulation.outline import GERMANIUM, Outline, insides, regions
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -26,11 +27,6 @@ Angle = Annotated[float, Field(ge=0, lt=90)]
 _Size = Annotated[float, Field(gt=0, le=1000)]  # mm
 _Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # mm; of an exponential, either sign
 _Density = Annotated[float, Field(ge=-1e4, le=1e4)]
-
-POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
-
-# mm: surfaces that coincide with a grid line do so despite rounding
-_TOLERANCE = 1e-6
 
 
 class Detector(Config):
@@ -116,29 +112,28 @@ class Detector(Config):
 
     def _problems_of_shape(self) -> Iterable[str]:
         length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
-        outer, inner, bottom = map(math.tan, self.taper_angles_rad)
-        top_radius = radius - self.outer_taper_length * outer - self.narrower("top")
+        outer, inner, bottom = self.taper_slopes
+        top_step, bottom_step = self.steps
+        top_radius = radius - self.outer_taper_length * outer - top_step
         bore_mouth = self.bore_radius + self.inner_taper_length * inner
-        bore_mouth = max(bore_mouth, self.top_groove_radius)
-        bottom_radius = radius - self.bottom_taper_length * bottom - self.narrower("bottom")
+        if self.top_groove_depth:
+            bore_mouth = max(bore_mouth, self.top_groove_radius)
+        bottom_radius = radius - self.bottom_taper_length * bottom - bottom_step
         ditch_inner = self.wrap_around_radius - self.ditch_thickness
-        tapers = {"top": self.outer_taper_length, "bottom": self.bottom_taper_length}
-        for side, taper in tapers.items():
-            depth, bullet = self.narrower(side), getattr(self, f"{side}_bullet_radius")
+        ends = ("top", "outer", top_step), ("bottom", "bottom", bottom_step)
+        for side, which, depth in ends:
+            bullet = getattr(self, f"{side}_bullet_radius")
             if depth and bullet:
                 yield f"{side}_bullet_radius and {side}_cylinder_radius cannot both be given"
             if not 0 <= depth < radius:
                 yield f"{side}_cylinder_radius must be above 0 and at most crystal_radius"
-            if bullet and taper:
-                which = "outer" if side == "top" else side
+            if bullet and getattr(self, f"{which}_taper_length"):
                 yield f"{side}_bullet_radius and {which}_taper_length cannot both be given"
-        for one, other in (
-            ("bore_length", "bore_radius"),
-            ("ditch_depth", "ditch_thickness"),
-            ("top_groove_depth", "top_groove_radius"),
-        ):
+        for one, other in (("bore_length", "bore_radius"), ("ditch_depth", "ditch_thickness")):
             if (getattr(self, one) > 0) != (getattr(self, other) > 0):
                 yield f"{one} and {other} must both be given, or both be 0"
+        if self.top_groove_depth and not self.top_groove_radius:
+            yield "top_groove_depth and top_groove_radius must both be given"
         if 2 * li >= min(length, radius):
             yield "li_thickness leaves nothing of the crystal"
         if self.outer_taper_length + self.bottom_taper_length > length:
@@ -188,15 +183,20 @@ class Detector(Config):
             yield "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative"
 
     @property
-    def taper_angles_rad(self) -> tuple[float, float, float]:
-        """Angles of the outer, bore and bottom tapers in rad."""
+    def taper_slopes(self) -> tuple[float, float, float]:
+        """Tangents of the angles of the outer, bore and bottom tapers."""
         outer, inner = self.taper_angle_deg, self.inner_taper_angle_deg
-        inner = outer if inner is None else inner
-        return (
-            math.radians(outer),
-            math.radians(inner),
-            math.radians(self.bottom_taper_angle_deg),
-        )
+        angles = outer, outer if inner is None else inner, self.bottom_taper_angle_deg
+        outer, inner, bottom = (math.tan(math.radians(angle)) for angle in angles)
+        return outer, inner, bottom
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Radius of the crystal less those of its cylinders at top and bottom, in mm."""
+        bottom_length = self.bottom_cylinder_length + self.bottom_transition_length
+        top = self.crystal_radius - self.top_cylinder_radius
+        bottom = self.crystal_radius - self.bottom_cylinder_radius
+        return top if self.top_cylinder_length else 0.0, bottom if bottom_length else 0.0
 
     @property
     def ditch_walls(self) -> tuple[float, float, float]:
@@ -247,9 +247,7 @@ class Detector(Config):
         >>> read_detector("icpc").inside([0, 0, 12, 40], [10, 90, 1, 50])
         array([ True, False, False,  True])
         """
-        r, z = np.asarray(r, float), np.asarray(z, float)
-        germanium = self._within(r, z, -_TOLERANCE) & ~self._ditch(r, z, -_TOLERANCE)
-        return np.asarray(germanium)
+        return np.asarray(self._at(insides, r, z), np.bool_)
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
@@ -267,97 +265,14 @@ class Detector(Config):
 
         Surfaces belong to the contacts and to the ditch.
         """
-        r, z = np.asarray(r, float), np.asarray(z, float)
-        contact = (r <= self.point_contact_radius + _TOLERANCE) & (
-            z <= self.point_contact_length + _TOLERANCE
-        )
-        lithium = ~self._within(r, z, self.li_thickness + _TOLERANCE)
-        choices = np.where(self._ditch(r, z, _TOLERANCE), DITCH, GERMANIUM)
-        choices = np.where(lithium, LI_CONTACT, choices)
-        return np.where(contact, POINT_CONTACT, choices).astype(np.int8)
+        return np.asarray(self._at(regions, r, z), np.int8)
+
+    def _at(self, loop: Callable[..., Any], r: npt.ArrayLike, z: npt.ArrayLike) -> Any:
+        """What a loop of `cpunet.simulation.outline` finds at each place."""
+        r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
+        return loop(Outline.of(self), r.flatten(), z.flatten()).reshape(r.shape)
 
     def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
         """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""
         values = self.model_dump(mode="json", exclude=set(exclude))
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
-
-    def _ditch(self, r: FloatArray, z: FloatArray, margin: float) -> BoolArray:
-        """Whether a point lies in the ditch with its walls moved outwards by `margin`."""
-        inner, outer, depth = self.ditch_walls
-        radial = (r >= inner - margin) & (r <= outer + margin)
-        return (self.ditch_depth > 0) & radial & (z <= depth + margin)
-
-    def _within(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
-        """Whether a point lies in the crystal or ditch, lithium faces moved in by `shift`."""
-        bottom = np.where(r > (self.wrap_around_radius or np.inf), shift, -_TOLERANCE)
-        within = (z > bottom) & (z < self.crystal_length - shift)
-        within &= (r < self._outer_radius(z, shift)) & ~self._bore(r, z, shift)
-        for bullet, side in ((self.top_bullet_radius, 1), (self.bottom_bullet_radius, -1)):
-            if bullet > shift:
-                end = self.crystal_length if side > 0 else 0.0
-                across, along = r - (self.crystal_radius - bullet), side * (z - end) + bullet
-                corner = (across > 0) & (along > 0)
-                within &= ~corner | (np.hypot(across, along) < bullet - shift)
-        return np.asarray(within)
-
-    def _outer_radius(self, z: FloatArray, shift: float) -> FloatArray:
-        top, _, bottom = self.taper_angles_rad
-        into_top = z - (self.crystal_length - self.outer_taper_length)
-        into_bottom = self.bottom_taper_length - z
-        straight = np.full_like(z, self.crystal_radius - shift)
-        beyond = self.crystal_length - self.top_cylinder_length - z
-        straight -= self._step(self.narrower("top"), beyond, 0.0, shift)
-        beyond, widening = z - self.bottom_cylinder_length, self.bottom_transition_length
-        straight -= self._step(self.narrower("bottom"), beyond, widening, shift)
-        if self.outer_taper_length:
-            straight -= self._taper(into_top, top, shift)
-        if self.bottom_taper_length:
-            straight -= self._taper(into_bottom, bottom, shift)
-        return straight
-
-    def narrower(self, side: str) -> float:
-        """Radius of the crystal less that of the cylinder at an end, if there is one, in mm.
-
-        The end is ``"top"`` or ``"bottom"``.
-        """
-        length, radius = self.top_cylinder_length, self.top_cylinder_radius
-        if side == "bottom":
-            length = self.bottom_cylinder_length + self.bottom_transition_length
-            radius = self.bottom_cylinder_radius
-        return self.crystal_radius - radius if length > 0 else 0.0
-
-    @staticmethod
-    def _step(depth: float, beyond: FloatArray, length: float, shift: float) -> FloatArray:
-        """Reduction in radius by a narrower end, `beyond` it, of walls moved in by `shift`."""
-        if not length:  # its lithium, moved along the axis, lies in the wider part
-            return np.where(beyond > shift, 0.0, depth)
-        slope = depth / length
-        extra = shift * (math.hypot(1, slope) - 1)
-        return np.clip(depth - slope * beyond + extra, 0, depth)
-
-    def _taper(self, depth: FloatArray, angle: float, shift: float) -> FloatArray:
-        """Reduction in radius by a taper, at `depth` into it, of a wall moved by `shift`."""
-        if self.siggen_conventions:  # the taper's start is moved down with the top
-            extra = shift * math.tan(angle)
-        else:  # the taper itself is moved along its normal
-            extra = shift * (1 / math.cos(angle) - 1)
-        return np.maximum(depth * math.tan(angle) + extra, 0)
-
-    def _bore(self, r: FloatArray, z: FloatArray, shift: float) -> BoolArray:
-        """Whether a point lies in the bore with its walls moved outwards by `shift`."""
-        groove = (z >= self.crystal_length - self.top_groove_depth - shift) & (
-            r <= self.top_groove_radius + shift
-        )
-        groove &= self.top_groove_depth > 0
-        if not self.bore_length:
-            return np.asarray(groove)
-        end, bullet = self.crystal_length - self.bore_length, self.bore_bullet_radius
-        radius = np.full_like(z, self.bore_radius + shift)
-        if self.inner_taper_length:
-            into_taper = z - (self.crystal_length - self.inner_taper_length)
-            radius += self._taper(into_taper, self.taper_angles_rad[1], shift)
-        across, along = r - (self.bore_radius - bullet), end + bullet - z
-        corner = (across > 0) & (along > 0)
-        rounded = np.hypot(across, along) <= bullet + shift
-        bore = (z >= end - shift) & (r <= radius) & (~corner | rounded)
-        return np.asarray(bore | groove)

@@ -89,25 +89,21 @@ def detector_names() -> list[str]:
     return names(_FOLDER)
 
 
-def read_detector(
-    path: str | Path | Detector, overrides: Set = (), crystal: str | Path | None = None
-) -> Detector:
+def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
     """Read a detector and apply overrides.
 
     Parameters
     ----------
     path
         Name of a preset (see `detector_names`), a YAML or JSON file with the fields of
-        `Detector`, a LEGEND diode (YAML or JSON with a ``geometry``), or, with any other
+        `Detector`, a LEGEND diode (YAML or JSON with a ``geometry``; its impurities are those
+        of ``crystals/V99000.yaml`` next to the folder of ``V99000A.yaml``), or, with any other
         suffix, a siggen or fieldgen configuration. Or a detector, for overrides.
     overrides
         Values as ``"bias_V=3500"``. They also supply fields that a file lacks. LEGEND diodes,
         which tell no ``temperature_K``, are at that of liquid argon unless it is given.
         ``"impurity_scale=depletion"`` (or in the file) scales the impurities so that the
         detector depletes at its ``measured_depletion_V``.
-    crystal
-        LEGEND file of the crystal from which a diode was cut, with its impurities. By
-        default ``crystals/V99000.yaml`` next to the folder of ``V99000A.yaml``.
 
     Raises
     ------
@@ -132,15 +128,10 @@ def read_detector(
     else:
         values = {**siggen_values(read_text(path, _FOLDER), name)}
     if "geometry" in values:
-        values, hints = _legend(values, Path(path), crystal)
+        values, hints = _legend(values, Path(path))
         if "temperature_K" not in given:
             values["temperature_K"] = LIQUID_ARGON_K
             log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
-    elif crystal is not None:
-        raise CpunetError(
-            f"{name}: only LEGEND metadata take their impurities from another file; leave out "
-            "`crystal`"
-        )
     return _completed({"name": Path(name).stem} | values, given, name, hints)
 
 
@@ -174,9 +165,7 @@ def holds_detector(path: str | Path) -> bool:
         return b"xtal_length" in file.read(_SIGGEN_BYTES)
 
 
-def _legend(
-    diode: dict[str, Any], path: Path, crystal: str | Path | None
-) -> tuple[dict[str, Any], _Hints]:
+def _legend(diode: dict[str, Any], path: Path) -> tuple[dict[str, Any], _Hints]:
     """Values of a LEGEND diode and its crystal, and reasons why some are missing."""
     values = legend_values(diode, str(path))
     crystal_name, slice_name = crystal_and_slice(diode, path.stem)
@@ -185,20 +174,15 @@ def _legend(
         for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
         for suffix in _MAPPINGS
     ]
-    found = Path(crystal) if crystal else next(filter(Path.is_file, places), None)
+    found = next(filter(Path.is_file, places), None)
+    content = read_values(found) if found else {}
     hints = why_missing()
-    hints[_Z0] = f"production.impcc is empty or 0, and there is no {places[0]}"
-    if found is None:
-        return values, hints
-    content = read_values(found)
-    hints[_Z0] = f"production.impcc is empty or 0, and {found} has no impurity_curve"
-    if content.get("impurity_curve") is None and crystal is None:
-        return values, hints
+    if content.get("impurity_curve") is None:
+        lacking = f"{found} has no impurity_curve" if found else f"there is no {places[0]}"
+        return values, hints | {_Z0: lacking}
     length = values.get("crystal_length")
     if not isinstance(length, int | float):
         return values, hints  # refused together with the rest of the geometry
-    # the curve describes the whole crystal and replaces a line through a few points
-    values = {key: value for key, value in values.items() if not key.startswith("impurity_")}
     return values | impurity_values(content, str(found), slice_name, length), hints
 
 

@@ -1,57 +1,38 @@
-"""One entry point for all formats of hits, recognised by content, and what is in a file."""
+"""Hits of a detector from files of all formats, and what is in such a file."""
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened
 from cpunet.pulses.peaks import label_peaks
-from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.pulses.reading.source import whole_numbers
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_steps import (
-    Columns,
-    Steps,
-    choose,
-    in_memory,
-    require_physics,
-    require_some,
-    to_hits,
+from cpunet.simulation.hit_tables import Steps, StepTable, hit_format, step_tables
+from cpunet.simulation.hits import (
+    FARTHEST_MM,
+    LATE_NS,
+    MAX_KEV,
+    FloatArray,
+    HitOptions,
+    Hits,
+    IntArray,
 )
-from cpunet.simulation.hit_tables import (
-    NTUPLES,
-    STEPS,
-    Table,
-    csv_detectors,
-    detectors_of,
-    holds_tables,
-    parts_of,
-    read_csv,
-    read_table,
-    table_of,
-)
-from cpunet.simulation.hits import HitOptions, Hits
-from cpunet.tables import counted, span
+from cpunet.tables import Lines, counted, span
 
-HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
-_EVENTS = "geds/sim/event_number"
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_ZIP_MAGIC = b"PK"
-_CSV_MAGIC = b"#class tools::wcsv::ntuple"
 # More hits outside the crystal are those of another frame, or of another detector.
 _MISPLACED_PERCENT = 1.0
-# arrays of an NPZ beside the offsets, as columns of steps
-_ARRAYS = {f"{axis}_mm": (axis, "mm") for axis in "xyz"} | {"edep_keV": ("edep", "keV")}
+# Numbers in a row that rise, on average, in files of jobs
+_LONG_RISE = 3
+# the largest deposit of any source is above the first, the median event below the second
+_LEAST_KEV, _MOST_KEV = 5.0, 1e5
 
 
 def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
@@ -71,11 +52,11 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
     Parameters
     ----------
     path
-        Path of the file.
+        Path of the file. A step takes some 200 bytes of memory.
     options
-        How it is read; `hits_detector` is one of `hit_detectors`: the name of the table, or
-        the number or name in the column that tells detectors apart (``det_uid``, ``volID``,
-        ``detector``…). An unknown or missing unit is an error.
+        How it is read; `hits_detector` is the name of the table, or the number or name in the
+        column that tells detectors apart (``det_uid``, ``volID``, ``detector``…). An unknown
+        or missing unit is an error.
 
     Raises
     ------
@@ -84,43 +65,21 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
         detector, contains no energy deposit, or has energies of another unit.
     """
     file = Path(path)
-    hits = to_hits(file, _steps(file, options), options)
-    require_some(file, hits.n_events)
-    require_physics(file, hits.energy_kev)
+    with step_tables(file) as tables:
+        table, label = _chosen(file, tables, options.hits_detector)
+        steps = table.steps(options, label)
+        origin = table.origin_mm(label or table.name)
+    hits = _to_hits(file, replace(steps, position_mm=steps.position_mm - origin), options)
+    energy_kev = hits.energy_kev
+    if not len(hits):
+        raise CpunetError(f"{file}: no step deposits energy; check the detector's name")
+    if energy_kev.max() < _LEAST_KEV or np.median(energy_kev) > _MOST_KEV:
+        raise CpunetError(
+            f"{file}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
+            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
+            "give `energy_unit` if it names none"
+        )
     return hits
-
-
-def hit_parts(
-    path: Path | str, options: HitOptions = HitOptions()
-) -> Callable[[], Iterator[Hits]]:
-    """Like `read_hits`, but in parts if possible, so that memory does not grow with the file.
-
-    Tables in HDF5 are read in parts, unless the rows of an event are not adjacent or several
-    detectors share the table. All other files are read once and kept in memory.
-
-    Returns
-    -------
-    callable
-        Returns an iterator over the parts, from the first one, each time it is called.
-    """
-    file = Path(path)
-    table = table_of(file, options.hits_detector) if _kind(file) == "tables" else None
-    divided = parts_of(file, table) if table else None
-    if table is None or divided is None or len(divided[0]) < 2:
-        whole = read_hits(file, options)
-        return lambda: iter([whole])
-    parts, largest = divided
-
-    def read() -> Iterator[Hits]:
-        free, energies = largest + 1, []
-        for rows in parts:
-            hits = to_hits(file, read_table(file, table, options, rows), options, free)
-            free += int((hits.event_number >= free).sum())
-            energies.append(hits.energy_kev)
-            yield hits
-        require_physics(file, np.concatenate(energies))
-
-    return read
 
 
 def holds_hits(path: Path | str) -> bool:
@@ -128,70 +87,129 @@ def holds_hits(path: Path | str) -> bool:
 
     Files of simulated pulses that also contain their hits count as files of pulses.
     """
-    file = Path(path)
-    with suppress(CpunetError, zipfile.BadZipFile):  # the reader of pulses reports the error
-        kind = _kind(file)
-        if kind == "npz":
-            with zipfile.ZipFile(file) as archive:
-                return {"x_mm.npy", "offsets.npy"} <= set(archive.namelist())
-        return kind in ("tables", "csv")
+    with suppress(CpunetError):  # the reader of pulses reports the error
+        return hit_format(Path(path)) in ("tables", "csv", "npz")
     return False
 
 
-def hit_detectors(path: Path | str) -> list[str]:
-    """Names of the detectors of a file; empty if it names none."""
-    file = Path(path)
-    if (kind := _kind(file)) == "csv":
-        return csv_detectors(file)
-    return list(detectors_of(file)) if kind == "tables" else []
+def _by_detector(tables: list[StepTable]) -> dict[str, tuple[StepTable, str | None]]:
+    """Tables by the names of their detectors, with their labels where they share a table."""
+    found: dict[str, tuple[StepTable, str | None]] = {}
+    for table in tables:
+        labels = table.detectors()
+        if len(labels) > 1 or (labels and not table.name):
+            found |= {label: (table, label) for label in labels}
+        else:
+            found[table.name] = (table, None)
+    return found
 
 
-def _kind(path: Path) -> Literal["tables", "stored", "csv", "npz", "other"]:
-    """Format of a file by its content; `stored` are hits beside their pulses."""
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(len(_CSV_MAGIC))
-    except OSError as error:
-        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    if start.startswith(_HDF5_MAGIC):
-        with opened(path) as file:
-            return (
-                "tables" if holds_tables(file) else "stored" if HIT_TABLE in file else "other"
-            )
-    if start.startswith(_ZIP_MAGIC):
-        return "npz"
-    return "csv" if start == _CSV_MAGIC else "other"
-
-
-def _steps(path: Path, options: HitOptions) -> Steps:
-    detector, kind = options.hits_detector, _kind(path)
-    if kind == "csv":
-        return read_csv(path, options)
-    if kind == "tables":
-        return read_table(path, table_of(path, detector), options)
-    choose(path, [], detector)
-    if kind == "other":
+def _chosen(
+    path: Path, tables: list[StepTable], detector: str | None
+) -> tuple[StepTable, str | None]:
+    """The table and the label there of the detector wanted, or of the only one."""
+    there = _by_detector(tables)
+    names = ", ".join(there)
+    if detector is None and len(there) > 1:
+        raise CpunetError(f"{path}: holds detectors {names}; choose one with `hits_detector`")
+    if detector is not None and not names:
         raise CpunetError(
-            f"{path}: no known format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
-            f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
+            f"{path}: its hits name no detector to pick {detector} by; leave out "
+            "`hits_detector`"
         )
-    return _npz(path) if kind == "npz" else _stored(path)
+    if detector is not None and detector not in there:
+        raise CpunetError(f"{path}: no detector {detector}; it holds {names}")
+    return next(iter(there.values())) if detector is None else there[detector]
 
 
-def _npz(path: Path) -> Steps:
-    """Read the steps of an archive. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
-    arrays = read_arrays(path)
-    needed = [*_ARRAYS, "offsets"]
-    if missing := [name for name in needed if name not in arrays]:
-        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
-    offsets = whole_numbers(arrays["offsets"], f"{path}: offsets")
-    counts = np.diff(offsets)
-    if offsets.ndim != 1 or not len(offsets) or offsets[0] or np.any(counts < 0):
-        raise CpunetError(f"{path}: offsets do not divide the hits into events")
-    columns = {"event": in_memory(np.repeat(np.arange(len(counts)), counts))}
-    for name, (role, unit) in _ARRAYS.items():
-        columns[role] = in_memory(arrays[name], unit)
-    return Columns(path, columns).steps(HitOptions())
+def _to_hits(path: Path, steps: Steps, options: HitOptions) -> Hits:
+    """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
+
+    Positions are moved to the frame of the crystal. An event whose number an earlier one has
+    gets a new one, above the largest.
+
+    Raises
+    ------
+    CpunetError
+        If a step has no finite position, time or energy, or a negative energy.
+    """
+    # written so that NaN fails
+    placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
+    bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MAX_KEV))
+    if steps.time_ns is not None:
+        bad |= ~np.isfinite(steps.time_ns)
+    if bad.any():
+        event = steps.event[np.argmax(bad)]
+        raise CpunetError(
+            f"{path}: event {event}: a step has no finite position or time, or no energy of at "
+            f"least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
+            f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
+        )
+    kept = steps[steps.edep_kev > 0]
+    first = first_of_event(kept.event, kept.time_ns, options.time_window_us)
+    # steps of one event need not be adjacent, as in files merged from several threads
+    order = np.argsort(first, kind="stable")
+    starts, counts = np.unique(first, return_counts=True)
+    numbers = kept.event[starts]
+    again = np.ones(len(numbers), bool)
+    again[np.unique(numbers, return_index=True)[1]] = False
+    numbers[again] = steps.event.max(initial=-1) + 1 + np.arange(again.sum())
+    hits = Hits.of(
+        options.to_crystal(kept.position_mm[order]),
+        kept.edep_kev[order],
+        np.concatenate([[0], np.cumsum(counts)]),
+        numbers,
+    )
+    if kept.time_ns is None or not len(hits):
+        return hits
+    times, begins = kept.time_ns[order], hits.offsets[:-1]
+    spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
+    return replace(hits, n_late=int((spread > LATE_NS).sum()))
+
+
+def first_of_event(number: IntArray, time_ns: FloatArray | None, window_us: float) -> IntArray:
+    """Index of the first step of the event of each step.
+
+    Steps of a number are parted where none comes for `window_us` (the decays of a chain are
+    simulated as one event), and where the numbering starts anew (jobs joined in one file).
+
+    Examples
+    --------
+    >>> first_of_event(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]), 10)
+    array([0, 1, 2])
+    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), None, 10)
+    array([0, 1, 2, 3, 4, 5])
+    """
+    job = _job_of_step(number)
+    order = np.lexsort((job, number) if time_ns is None else (time_ns, job, number))
+    new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
+    if time_ns is not None:
+        new |= np.diff(time_ns[order]) > 1000 * window_us
+    starts = np.flatnonzero(np.append(True, new)[: len(number)])
+    first = np.empty(len(number), np.int64)
+    counts = np.diff(np.append(starts, len(number)))
+    first[order] = np.repeat(np.minimum.reduceat(order, starts), counts)
+    return first
+
+
+def _job_of_step(number: IntArray) -> IntArray:
+    """Index of the job of each step among those with its number.
+
+    The numbers of a job rise. An event that a thread wrote in two blocks ends one such rise and
+    begins another; where more come back otherwise, the numbering has started anew. Rows in
+    another order, as that of time, rise and fall all the time (by two on average).
+    """
+    starts = np.flatnonzero(np.append(True, np.diff(number) != 0)[: len(number)])
+    runs = number[starts]
+    falls = np.diff(runs) < 0
+    begins, ends = np.append(True, falls), np.append(falls, True)
+    order = np.argsort(runs, kind="stable")
+    again = np.diff(runs[order]) == 0
+    again &= ~(ends[order[:-1]] & begins[order[1:]])
+    job = np.zeros(len(runs), np.int64)
+    if again.sum() > 1 and len(runs) >= _LONG_RISE * begins.sum():
+        job[order[1:]] = np.cumsum(again)
+    return np.repeat(job, np.diff(np.append(starts, len(number))))
 
 
 def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
@@ -204,75 +222,11 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
     >>> list(columns), columns["event_number"][0]
     (['event_number', 'x', 'y', 'z', 'edep'], array([7, 7]))
     """
-    return {
-        "event_number": (np.repeat(hits.event_number, np.diff(hits.offsets)), ""),
-        "x": (hits.x_mm, "mm"),
-        "y": (hits.y_mm, "mm"),
-        "z": (hits.z_mm, "mm"),
-        "edep": (hits.edep_kev, "keV"),
+    number = hits.event_number[hits.event_of_hit]
+    places = {
+        axis: (values, "mm") for axis, values in zip("xyz", hits.position_mm.T, strict=True)
     }
-
-
-def _stored(path: Path) -> Steps:
-    """Steps beside their pulses, in the frame of the crystal in which they were written."""
-    steps = read_table(path, Table(HIT_TABLE, None), HitOptions())
-    with opened(path) as file:
-        events = np.asarray(file[_EVENTS][()]) if _EVENTS in file else np.empty(0, np.int64)
-    without = ~np.isin(events, steps.event)
-    if without.any():
-        raise CpunetError(
-            f"{path}: {HIT_TABLE} has no hit of event {events[without][0]}; simulate it again"
-        )
-    return steps
-
-
-@dataclass(frozen=True)
-class HitsInfo:
-    """What is known of the hits of one detector.
-
-    Parameters
-    ----------
-    events, hits
-        Their numbers.
-    energy_kev
-        Lowest and highest energy of an event in keV.
-    extents_mm
-        Lowest and highest x, y, z and r in the frame of the file less a known origin.
-    peaks
-        Number of events in each gamma line, by the energy deposited.
-    crystal
-        Crystal in which the hits should lie, if one was given.
-    outside_percent
-        Share of the hits outside it.
-    """
-
-    events: int
-    hits: int
-    energy_kev: list[float]
-    extents_mm: dict[str, list[float]]
-    peaks: dict[str, int]
-    crystal: Detector | None
-    outside_percent: float
-
-    @property
-    def lines(self) -> list[tuple[str, str]]:
-        """Names and texts."""
-        extents = ", ".join(f"{axis} {span(ends, 2)}" for axis, ends in self.extents_mm.items())
-        lines = [
-            ("hits", f"{self.hits} of {self.events} events"),
-            ("energy", f"{span(self.energy_kev)} keV an event"),
-            ("lines", counted(self.peaks)),
-            ("extents", f"{extents} mm"),
-        ]
-        if (crystal := self.crystal) is not None:
-            size = f"radius {crystal.crystal_radius:g} mm, z 0 to {crystal.crystal_length:g} mm"
-            misplaced = self.outside_percent > _MISPLACED_PERCENT
-            remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
-            lines += [
-                ("crystal", f"{crystal.name}, {size}"),
-                ("outside", f"{self.outside_percent:.2f} % of the hits{remedy}"),
-            ]
-        return lines
+    return {"event_number": (number, ""), **places, "edep": (hits.edep_kev, "keV")}
 
 
 def describe_hits(
@@ -280,7 +234,7 @@ def describe_hits(
     options: HitOptions,
     peaks: Mapping[str, PeakConfig],
     crystal: Detector | None = None,
-) -> dict[str, HitsInfo | str]:
+) -> dict[str, Lines]:
     """Describe the hits of a file, detector by detector.
 
     Parameters
@@ -297,36 +251,49 @@ def describe_hits(
     Returns
     -------
     dict
-        By name of the detector (``""`` if the file names none); or the reason why its hits
+        Topics and texts by name of the detector (``""`` if the file names none): hits, their
+        energies, gamma lines and extents in the frame of the crystal; or the reason why they
         cannot be read.
     """
-    found: dict[str, HitsInfo | str] = {}
+    found: dict[str, Lines] = {}
     names: list[str | None] = [options.hits_detector]
     if options.hits_detector is None:
-        names = [*hit_detectors(path)] or names
+        with step_tables(path) as tables:
+            names = [name or None for name in _by_detector(tables)]
     for name in names:
-        as_in_file = replace(options, hits_detector=name, origin=(0, 0, 0), flip_z=False)
         try:
-            hits = read_hits(path, as_in_file)
+            hits = read_hits(path, replace(options, hits_detector=name))
         except CpunetError as error:
-            found[name or ""] = str(error).removeprefix(f"{path}: ")
-            continue
-        places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm}
-        places["r"] = np.hypot(hits.x_mm, hits.y_mm)
-        lines = label_peaks(hits.energy_kev, peaks)
-        x, y, z = options.to_crystal(hits.position_mm).T
-        inside = np.ones(len(x), bool) if crystal is None else crystal.inside(np.hypot(x, y), z)
-        found[name or ""] = HitsInfo(
-            events=hits.n_events,
-            hits=len(x),
-            energy_kev=_ends(hits.energy_kev),
-            extents_mm={axis: _ends(values) for axis, values in places.items()},
-            peaks={peak: int((lines == peak).sum()) for peak in peaks},
-            crystal=crystal,
-            outside_percent=100 * float(np.mean(~inside)),
-        )
+            found[name or ""] = [("hits", str(error).removeprefix(f"{path}: "))]
+        else:
+            found[name or ""] = _in_words(hits, peaks, crystal)
     return found
 
 
-def _ends(values: npt.NDArray[np.float64]) -> list[float]:
+def _in_words(
+    hits: Hits, peaks: Mapping[str, PeakConfig], crystal: Detector | None
+) -> list[tuple[str, str]]:
+    energy_kev = hits.energy_kev
+    lines = label_peaks(energy_kev, peaks)
+    places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
+    extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
+    words = [
+        ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
+        ("energy", f"{span(_ends(energy_kev))} keV an event"),
+        ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
+        ("extents", f"{', '.join(extents)} mm"),
+    ]
+    if crystal is not None:
+        percent = 100 * float(np.mean(~crystal.inside(hits.r_mm, hits.z_mm)))
+        size = f"radius {crystal.crystal_radius:g} mm, z 0 to {crystal.crystal_length:g} mm"
+        misplaced = percent > _MISPLACED_PERCENT
+        remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
+        words += [
+            ("crystal", f"{crystal.name}, {size}"),
+            ("outside", f"{percent:.2f} % of the hits{remedy}"),
+        ]
+    return words
+
+
+def _ends(values: FloatArray) -> list[float]:
     return [float(values.min()), float(values.max())]

@@ -17,10 +17,9 @@ from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.gammas.sample import EnergyWindow, GammaStatistics, simulate_gammas
+from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import hit_parts
-from cpunet.simulation.hit_steps import require_some
+from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import LATE_NS, HitOptions, Hits
 
 log = logging.getLogger(__name__)
@@ -140,39 +139,30 @@ class HitFile:
             If the hits cannot be read, no event is in a window, or nearly all hits are outside
             the crystal.
         """
-        parts = hit_parts(self.path, self.options)
-
-        def chosen(hits: Hits) -> Hits:
-            return hits[_in_windows(hits.energy_kev, self.windows)] if self.windows else hits
-
-        n_events = n_late = n_hits = n_outside = 0
-        low_mm, high_mm = np.full((2, 3), [[np.inf], [-np.inf]])
-        for part in parts():
-            hits = chosen(part)
-            place = hits.position_mm
-            n_events, n_late = n_events + hits.n_events, n_late + part.n_late
-            n_hits += len(place)
-            n_outside += int((~detector.inside(np.hypot(*place.T[:2]), hits.z_mm)).sum())
-            low_mm = np.minimum(low_mm, place.min(axis=0, initial=np.inf))
-            high_mm = np.maximum(high_mm, place.max(axis=0, initial=-np.inf))
-        if n_late:
+        hits = read_hits(self.path, self.options)
+        if hits.n_late:
             log.warning(
-                f"{self.path}: {n_late} events have deposits more than {LATE_NS:g} ns after "
-                "their first, simulated as if at once; a shorter `time_window_us` parts them"
+                f"{self.path}: {hits.n_late} events have deposits more than {LATE_NS:g} ns "
+                "after their first, simulated as if at once; a shorter `time_window_us` parts "
+                "them"
             )
-        if not n_events and self.windows:
+        if self.windows:
+            hits = hits[_in_windows(hits.energy_kev, self.windows)]
+        if not len(hits):
             names = ", ".join(window.name for window in self.windows)
             raise CpunetError(f"{self.path}: no event in {names}; widen window_kev")
-        require_some(self.path, n_events)
-        if n_outside > _STRAY * n_hits and not self.placed:
-            self._astray(detector, n_outside, n_hits, low_mm, high_mm)
-        return OpenHits(n_events, _regrouped(map(chosen, parts()), BLOCK_EVENTS))
+        if not self.placed:
+            self._require_inside(hits, detector)
+        starts = range(0, len(hits), BLOCK_EVENTS)
+        return OpenHits(len(hits), (hits[i : i + BLOCK_EVENTS] for i in starts))
 
-    def _astray(
-        self, detector: Detector, n: int, total: int, low_mm: Any, high_mm: Any
-    ) -> None:
+    def _require_inside(self, hits: Hits, detector: Detector) -> None:
         """Warn of hits outside the crystal, or raise an error if these are nearly all."""
-        ends = zip("xyz", low_mm, high_mm, strict=True)
+        place, total = hits.position_mm, len(hits.edep_kev)
+        n = int((~detector.inside(hits.r_mm, hits.z_mm)).sum())
+        if n <= _STRAY * total:
+            return
+        ends = zip("xyz", place.min(axis=0), place.max(axis=0), strict=True)
         spans = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends)
         share = f"all {total}" if n == total else f"{n} of {total} ({n / total:.1%})"
         text = (
@@ -197,19 +187,6 @@ class HitFile:
             "time_window_us": self.options.time_window_us,
             "windows_kev": _by_name(self.windows),
         }
-
-
-def _regrouped(parts: Iterator[Hits], size: int) -> Iterator[Hits]:
-    """The same events in blocks of `size`; the last block can be shorter."""
-    left: Hits | None = None
-    for part in parts:
-        hits = part if left is None else Hits.concatenate([left, part])
-        whole = hits.n_events // size * size
-        for start in range(0, whole, size):
-            yield hits[start : start + size]
-        left = hits[whole:] if whole < hits.n_events else None
-    if left is not None:
-        yield left
 
 
 @dataclass(frozen=True)
@@ -256,7 +233,7 @@ class GammaSource:
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
         workers = min(usable_cores(), _MAX_WORKERS, rounds)
-        waiting: deque[Future[tuple[Hits, GammaStatistics]]] = deque()
+        waiting: deque[Future[tuple[Hits, int]]] = deque()
         pool = ThreadPoolExecutor(workers)
         primaries = 0
         try:
@@ -264,15 +241,13 @@ class GammaSource:
                 if i < rounds:
                     waiting.append(pool.submit(self._round, detector, i, rounds, int(seeds[i])))
                 if i >= workers:
-                    hits, statistics = waiting.popleft().result()
+                    hits, n_primaries = waiting.popleft().result()
                     yield replace(hits, event_number=hits.event_number + primaries)
-                    primaries += statistics.n_primaries
+                    primaries += n_primaries
         finally:
             pool.shutdown(cancel_futures=True)
 
-    def _round(
-        self, detector: Detector, i: int, rounds: int, seed: int
-    ) -> tuple[Hits, GammaStatistics]:
+    def _round(self, detector: Detector, i: int, rounds: int, seed: int) -> tuple[Hits, int]:
         wanted = {w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()}
         return simulate_gammas(
             detector,

@@ -1,243 +1,343 @@
-"""Tables of steps: remage's ``stp`` tables, and the ntuples of Geant4 and g4simple."""
+"""Tables of steps in files of remage, Geant4 and g4simple, in archives and in our own."""
 
 from __future__ import annotations
 
-import sys
-from dataclasses import replace
-from functools import partial
-from itertools import pairwise, takewhile
+import re
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
-from cpunet.simulation.hit_steps import (
-    NEEDED,
-    Columns,
-    Steps,
-    choose,
-    in_memory,
-    roles,
-    unit_factor,
-)
-from cpunet.simulation.hits import HitOptions
+from cpunet.hdf5_files import opened, text_attribute
+from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.source import whole_numbers
+from cpunet.simulation.hits import FloatArray, HitOptions, IntArray
 
+HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
 NTUPLES, STEPS = "default_ntuples", "stp"
-_G4SIMPLE, _G4SIMPLE_TITLE = f"{NTUPLES}/g4sntuple", "steps data"
-_ALL = slice(0, sys.maxsize)
-ROWS = 5_000  # rows per part: of the order of 10 MB of steps
+_G4SIMPLE, _G4SIMPLE_TITLE = "g4sntuple", "steps data"
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_CSV_MAGIC = b"#class tools::wcsv::ntuple"
+_MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
+_KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
+_NS = {"ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9, "ps": 1e-3}
+# what a column is, and its names in small letters: the first that is there is read
+_NAMES = {
+    "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
+    "x": ("xloc", "x"),
+    "y": ("yloc", "y"),
+    "z": ("zloc", "z"),
+    "edep": ("edep", "energydeposit"),
+    "time": ("time", "t", "globaltime", "t0"),
+    "detector": ("det_uid", "detector", "detector_id", "detectorid", "volid", "volume"),
+}
+_NEEDED = ("event", "x", "y", "z", "edep")
+_VECTORS = ("cumulative_length", "flattened_data")
+_WITH_UNIT = re.compile(r"(.+?)\s*(?:\[(.*)\]|_in_(.+))$")
+# arrays of an NPZ beside the offsets, and the columns that they are
+_ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep_in_keV"}
 
 
-class Table(NamedTuple):
-    """Path of the table of a detector, and its label there if others share the table."""
+@dataclass(frozen=True)
+class Steps:
+    """Steps relative to the detector's origin in the frame of a file; events in any order.
 
-    name: str
-    label: str | None
+    `time_ns` is None where the file tells no times.
+    """
+
+    event: IntArray
+    position_mm: FloatArray
+    edep_kev: FloatArray
+    time_ns: FloatArray | None = None
+
+    def __getitem__(self, kept: npt.NDArray[np.bool_]) -> Steps:
+        """Steps that are `kept`."""
+        time = None if self.time_ns is None else self.time_ns[kept]
+        return Steps(self.event[kept], self.position_mm[kept], self.edep_kev[kept], time)
 
 
-def table_of(path: Path, detector: str | None) -> Table:
-    """The table of a detector, or of the only one.
+@dataclass(frozen=True)
+class StepTable:
+    """A table of steps: its columns by name, arrays or items of an open HDF5 file.
+
+    Those of HDF5 are arrays with a value per row, or vectors with one per step of the row; the
+    vectors of deposits tell the steps of each row. The `name` is that of the detector, empty if
+    there is none. Units that neither column nor options tell are those of g4simple, MeV and
+    mm, if the table is `g4simple`'s. A `file` of remage tells where its detectors are.
+    """
+
+    path: Path
+    columns: Mapping[str, Any]
+    name: str = ""
+    g4simple: bool = False
+    file: h5py.File | None = None
+
+    @classmethod
+    def of_group(cls, path: Path, group: h5py.Group, name: str) -> StepTable:
+        """A table in HDF5. g4simple writes one for all detectors."""
+        # the values of a column of Geant4's HDF5 are its pages
+        pages = {n: item["pages"] if _has(item, "pages") else item for n, item in group.items()}
+        g4simple = name == _G4SIMPLE
+        return cls(path, pages, "" if g4simple else name, g4simple, group.file)
+
+    @cached_property
+    def roles(self) -> dict[str, tuple[str, str]]:
+        """What there is, see `roles`."""
+        return roles(self.columns)
+
+    def steps(self, options: HitOptions, label: str | None = None) -> Steps:
+        """Steps of all detectors, or of the one with a label.
+
+        Raises
+        ------
+        CpunetError
+            If a column is missing, is no number or names no known unit.
+        """
+        if self.g4simple:
+            length, energy = options.length_unit or "mm", options.energy_unit or "MeV"
+            options = replace(options, length_unit=length, energy_unit=energy)
+        if missing := [role for role in _NEEDED if role not in self.roles]:
+            raise CpunetError(
+                f"{self.path}: no column for {missing[0]}; "
+                f"the file holds {', '.join(self.columns)}"
+            )
+        values: dict[str, npt.NDArray[Any]] = {}
+        for role, (name, in_name) in self.roles.items():
+            if role == "detector":
+                continue
+            read, unit = self._read(name)
+            where = f"{self.path}: column {name}"
+            if read.ndim != 1 or read.dtype.kind not in "iuf":
+                raise CpunetError(
+                    f"{where} is of {read.dtype} and shape {read.shape}; give one number per "
+                    "step (g4simple: its option for steps)"
+                )
+            if role == "event":
+                values[role] = whole_numbers(read, where)
+            else:
+                values[role] = read * _unit_factor(options, role, where, unit or in_name)
+        position = np.stack([values[axis] for axis in "xyz"], axis=1)
+        steps = Steps(values["event"], position, values["edep"], values.get("time"))
+        return steps if label is None else steps[self._labels() == label]
+
+    def detectors(self) -> list[str]:
+        """Labels of detectors with deposits; those without are the world or a holder."""
+        labels = self._labels()
+        if not len(labels) or "edep" not in self.roles:
+            return []
+        edep = self._read(self.roles["edep"][0])[0]
+        return sorted(
+            map(str, np.unique(labels[edep > 0])),
+            key=lambda label: (len(label), label) if label.isdigit() else (99, label),
+        )
+
+    def origin_mm(self, detector: str) -> FloatArray:
+        """Origin of a detector in mm; zero if it is not in the file."""
+        origin = np.zeros(3)
+        for i, axis in enumerate("xyz"):
+            where = f"detector_origins/{detector}/{axis}loc"
+            if self.file is not None and where in self.file:
+                # an origin may lack a unit; all lengths of remage are in m
+                unit = text_attribute(self.file[where], "units") or "m"
+                factor = _unit_factor(HitOptions(), "x", f"{self.path}: column {where}", unit)
+                origin[i] = self.file[where][()].item() * factor
+        return origin
+
+    def _labels(self) -> npt.NDArray[np.str_]:
+        """Detector of each step as text; empty if no column tells it."""
+        if "detector" not in self.roles:
+            return np.empty(0, np.str_)
+        labels = self._read(self.roles["detector"][0])[0]
+        if labels.dtype.kind == "f" and np.array_equal(labels, np.rint(labels)):
+            labels = labels.astype(np.int64)
+        if labels.dtype.kind in "SO":
+            return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in labels])
+        return labels.astype(np.str_)
+
+    @cached_property
+    def _per_row(self) -> IntArray:
+        """Number of steps of each row."""
+        edep = self.columns[self.roles["edep"][0]]
+        return _lengths(edep) if _has(edep, *_VECTORS) else np.ones(len(edep), np.int64)
+
+    def _read(self, name: str) -> tuple[npt.NDArray[Any], str]:
+        """Values of a column for all steps, and the unit that belongs to them."""
+        item = self.columns[name]
+        if isinstance(item, np.ndarray):
+            return item, ""
+        per_row, vectors = self._per_row, _has(item, *_VECTORS)
+        where = f"{self.path}: column"
+        if not vectors and not (isinstance(item, h5py.Dataset) and item.ndim == 1):
+            raise CpunetError(f"{where} {name} is no array with a value per step or hit")
+        same = np.array_equal(_lengths(item), per_row) if vectors else len(item) == len(per_row)
+        if not same:
+            raise CpunetError(f"{where}s {name} and edep differ in length; truncated?")
+        unit = text_attribute(item, "units")
+        if not vectors:
+            return np.repeat(item[()], per_row), unit
+        flat = item["flattened_data"]
+        return np.asarray(flat[: per_row.sum()]), text_attribute(flat, "units") or unit
+
+
+def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """What there is among the `names` of columns: role → (name, unit in the name or ``""``).
+
+    Examples
+    --------
+    >>> roles(["evtid", "edep_in_keV", "X [mm]"])
+    {'event': ('evtid', ''), 'x': ('X [mm]', 'mm'), 'edep': ('edep_in_keV', 'keV')}
+    """
+    plain: dict[str, tuple[str, str]] = {}
+    for name in names:
+        match = _WITH_UNIT.match(name)
+        base, unit = (match[1], (match[2] or match[3] or "").strip()) if match else (name, "")
+        plain.setdefault(base.lower(), (name, unit))
+    found = {}
+    for role, known in _NAMES.items():
+        if there := [plain[name] for name in known if name in plain]:
+            found[role] = there[0]
+    return found
+
+
+def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> float:
+    """Conversion factor of a column with the unit `named` to keV, ns or mm.
+
+    `role` is ``"edep"``, ``"time"`` or an axis. Units of columns that name none are those of
+    the options; times without a unit are in ns, Geant4's own.
 
     Raises
     ------
     CpunetError
-        If it is not there, or several are and none was chosen.
+        If the unit is unknown, or nobody tells it.
     """
-    there = detectors_of(path)
-    if not there:
-        raise CpunetError(
-            f"{path}: no table of {STEPS} or {NTUPLES} has columns for {', '.join(NEEDED)}; "
-            "simulate again and write all steps"
-        )
-    return there[choose(path, list(there), detector) or ""]
+    known, option, given = _MM, "length_unit", options.length_unit
+    if role == "edep":
+        known, option, given = _KEV, "energy_unit", options.energy_unit
+    elif role == "time":
+        known, given = _NS, "ns"
+    if (unit := named or given) is None:
+        raise CpunetError(f"{where} names no unit; give `{option}`: {', '.join(known)}")
+    if unit not in known:
+        raise CpunetError(f"{where} is in {unit!r}; expected one of {', '.join(known)}")
+    return known[unit]
 
 
-def read_table(path: Path, table: Table, options: HitOptions, rows: slice = _ALL) -> Steps:
-    """Read the steps of one detector, relative to its origin if the file tells it.
+def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
+    """Format of a file of hits by its content; `stored` are hits beside their pulses."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(len(_CSV_MAGIC))
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+    if start.startswith(_HDF5_MAGIC):
+        with opened(path) as file:
+            if any(isinstance(file.get(folder), h5py.Group) for folder in (STEPS, NTUPLES)):
+                return "tables"
+            return "stored" if HIT_TABLE in file else ""
+    if zipfile.is_zipfile(path):
+        with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            return "npz" if {"x_mm.npy", "offsets.npy"} <= {*archive.namelist()} else ""
+    return "csv" if start == _CSV_MAGIC else ""
 
-    Columns are arrays with a row per step, or vectors with a row per hit. g4simple's are in
-    MeV, mm and ns, those of other tables in the units of their attributes or names.
+
+@contextmanager
+def step_tables(path: Path) -> Iterator[list[StepTable]]:
+    """Open a file of hits; its tables can be read until it is closed.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, is of no known format or has no table of steps.
     """
-    if table.name == _G4SIMPLE:
-        options = in_g4simples_units(options)
-    with opened(path) as file:
-        columns = _columns(path, file[table.name], rows)
-        shared = table.label is not None
-        steps = columns.steps_of(table.label, options) if shared else columns.steps(options)
-        origin = _origin(path, file, table.label or table.name.rpartition("/")[2])
-    return replace(steps, position_mm=steps.position_mm - origin)
-
-
-def parts_of(path: Path, table: Table) -> tuple[list[slice], int] | None:
-    """Divide the rows of a table into parts of at least `ROWS` rows that split no event.
-
-    Returns
-    -------
-    tuple or None
-        The parts and the largest event number; None if several detectors share the table, or
-        the rows of an event are not adjacent, as in files merged from several threads.
-    """
-    with opened(path) as file:
-        group = file[table.name]
-        numbers = None if table.label else _row_numbers(group[roles(group)["event"][0]])
-    if numbers is None:
-        return None
-    starts = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
-    if len(np.unique(numbers)) != len(starts):
-        return None
-    cuts = [0]
-    while cuts[-1] < len(numbers):
-        after = np.searchsorted(starts, cuts[-1] + ROWS)
-        cuts.append(int(starts[after]) if after < len(starts) else len(numbers))
-    return [slice(a, b) for a, b in pairwise(cuts)], int(numbers.max(initial=-1))
-
-
-def holds_tables(file: h5py.File) -> bool:
-    """Whether a file has tables of remage, Geant4 or g4simple."""
-    return any(isinstance(file.get(folder), h5py.Group) for folder in (STEPS, NTUPLES))
-
-
-def detectors_of(path: Path) -> dict[str, Table]:
-    """Detectors by name: that of the table, or the label where several share a table."""
-    found: dict[str, Table] = {}
-    with opened(path) as file:
-        for folder in (STEPS, NTUPLES):
-            for name, table in file[folder].items() if folder in file else ():
-                if not isinstance(table, h5py.Group) or not set(NEEDED) <= roles(table).keys():
-                    continue
-                place = f"{folder}/{name}"
-                labels = _columns(path, table, _ALL).detectors()
-                if len(labels) > 1 or (labels and folder == NTUPLES):
-                    found |= {label: Table(place, label) for label in labels}
-                else:
-                    found[str(name)] = Table(place, None)
-    return found
-
-
-def _columns(path: Path, table: h5py.Group, rows: slice) -> Columns:
-    """Columns of a table, not yet read. The vectors of deposits tell the steps of each row."""
-    edep = table[roles(table)["edep"][0]]
-    counts = np.diff(_ends(edep, rows)) if _is_vectors(edep) else None
-    read = {
-        str(name): partial(_read, path, str(name), item, rows, counts)
-        for name, item in table.items()
-    }
-    return Columns(path, read)
-
-
-def _is_vectors(item: Any) -> bool:
-    parts = ("cumulative_length", "flattened_data")
-    return isinstance(item, h5py.Group) and all(is_column(item.get(part)) for part in parts)
-
-
-def _ends(vectors: h5py.Group, rows: slice) -> npt.NDArray[np.int64]:
-    """Where the vectors of the rows begin and end among the values."""
-    ends = vectors["cumulative_length"]
-    first = [ends[rows.start - 1]] if rows.start else [0]
-    return np.append(first, ends[rows.start : rows.stop]).astype(np.int64)
-
-
-def _read(
-    path: Path, name: str, item: Any, rows: slice, counts: npt.NDArray[np.int64] | None
-) -> tuple[npt.NDArray[Any], str]:
-    """Values of a column for all steps of the rows, and its unit."""
-    if isinstance(item, h5py.Group) and "pages" in item:
-        item = item["pages"]
-    unit = text_attribute(item, "units")
-    if _is_vectors(item):
-        ends, flat = _ends(item, rows), item["flattened_data"]
-        same = counts is not None and np.array_equal(np.diff(ends), counts)
-        values = np.asarray(flat[ends[0] : ends[-1]])
-        unit = text_attribute(flat, "units") or unit
-    elif isinstance(item, h5py.Dataset) and item.ndim == 1:
-        values = np.asarray(item[rows.start : rows.stop])
-        same = counts is None or len(values) == len(counts)
-        values = np.repeat(values, counts) if same and counts is not None else values
+    kind = hit_format(path)
+    if kind == "csv":
+        yield [_csv_table(path)]
+    elif kind == "npz":
+        yield [_npz_table(path)]
+    elif kind:
+        with opened(path) as file:
+            groups = [g for folder in (STEPS, NTUPLES) for g in file.get(folder, {}).items()]
+            if kind == "stored":
+                groups = [("", file[HIT_TABLE])]
+            tables = [
+                StepTable.of_group(path, group, str(name))
+                for name, group in groups
+                if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys()
+            ]
+            if not tables:
+                raise CpunetError(
+                    f"{path}: no table of {STEPS} or {NTUPLES} has columns for "
+                    f"{', '.join(_NEEDED)}; simulate again and write all steps"
+                )
+            yield tables
     else:
-        raise CpunetError(f"{path}: column {name} is no array with a value per step or hit")
-    if not same:
-        raise CpunetError(f"{path}: columns {name} and edep differ in length; truncated?")
-    return values, unit
+        raise CpunetError(
+            f"{path}: no known format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
+            f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
+        )
 
 
-def _row_numbers(item: Any) -> npt.NDArray[Any] | None:
-    """Event number of each row of a table."""
-    if isinstance(item, h5py.Group) and "pages" in item:
-        item = item["pages"]
-    if _is_vectors(item):
-        ends = _ends(item, _ALL)
-        if np.any(np.diff(ends) <= 0):
-            return None
-        return np.asarray(item["flattened_data"][()])[ends[1:] - 1]
-    return np.asarray(item[()]) if is_column(item) and item.ndim == 1 else None
+def _has(item: Any, *parts: str) -> bool:
+    return isinstance(item, h5py.Group) and all(part in item for part in parts)
 
 
-def _origin(path: Path, file: h5py.File, name: str) -> npt.NDArray[np.float64]:
-    """Origin of a detector in mm; zero if it is not in the file."""
-    origin = np.zeros(3)
-    for i, axis in enumerate("xyz"):
-        where = f"detector_origins/{name}/{axis}loc"
-        if where in file:
-            # an origin may lack a unit; all lengths of remage are in m
-            unit = text_attribute(file[where], "units") or "m"
-            factor = unit_factor(HitOptions(), "x", path, where, unit)
-            origin[i] = file[where][()].item() * factor
-    return origin
+def _lengths(vectors: h5py.Group) -> IntArray:
+    ends = vectors["cumulative_length"][()].astype(np.int64)
+    return np.asarray(np.diff(ends, prepend=0), np.int64)
 
 
-def in_g4simples_units(options: HitOptions) -> HitOptions:
-    """Options for columns in g4simple's MeV and mm unless others are given."""
-    length, energy = options.length_unit or "mm", options.energy_unit or "MeV"
-    return replace(options, length_unit=length, energy_unit=energy)
+def _npz_table(path: Path) -> StepTable:
+    """Arrays with a value per hit. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
+    arrays = read_arrays(path)
+    needed = [*_ARRAYS, "offsets"]
+    if missing := [name for name in needed if name not in arrays]:
+        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
+    offsets = whole_numbers(arrays["offsets"], f"{path}: offsets")
+    counts = np.diff(offsets)
+    if offsets.ndim != 1 or not len(offsets) or offsets[0] or np.any(counts < 0):
+        raise CpunetError(f"{path}: offsets do not divide the hits into events")
+    columns = {"event": np.repeat(np.arange(len(counts)), counts)}
+    columns |= {column: arrays[name] for name, column in _ARRAYS.items()}
+    if len({len(values) for values in columns.values()}) > 1:
+        raise CpunetError(f"{path}: {', '.join(needed)} differ in length; truncated?")
+    return StepTable(path, columns)
 
 
-def read_csv(path: Path, options: HitOptions) -> Steps:
-    """Read the steps of a CSV ntuple.
-
-    A column name may end with a unit, in brackets or after ``_in_``. Without it, files of
-    g4simple (recognised by their title) are in MeV and mm. For all other files the unit must
-    be given. Times are in ns, Geant4's unit, unless their name tells another.
-    """
-    title, columns = _csv_columns(path)
-    if title == _G4SIMPLE_TITLE:
-        options = in_g4simples_units(options)
-    return columns.steps_of(options.hits_detector, options)
-
-
-def csv_detectors(path: Path) -> list[str]:
-    """Detectors with deposits, by their number or name; empty if no column tells them."""
-    return _csv_columns(path)[1].detectors()
-
-
-def _csv_columns(path: Path) -> tuple[str, Columns]:
-    """Title of the file, and its columns."""
+def _csv_table(path: Path) -> StepTable:
+    """A CSV ntuple of Geant4. That of g4simple is recognised by its title."""
     from pandas import DataFrame, read_csv  # half a second, which other formats do not need
 
     with path.open(encoding="utf-8", errors="replace") as lines:
         head = list(takewhile(lambda line: line.startswith("#"), lines))
-    title, names = "", []
+    title, names, separator = "", [], ","
     for line in head:
         key, _, value = line[1:].strip().partition(" ")
         if key == "title":
             title = value
         elif key == "column":
             names.append(value.partition(" ")[2])
-        elif key == "separator" and value != "44":
-            raise CpunetError(f"{path}: columns are not separated by commas; export again")
+        elif key == "separator":
+            separator = chr(int(value))
     try:
         # the columns of one file can be numbers, text or both
         cells: DataFrame = read_csv(
-            path, header=None, skiprows=len(head), low_memory=False, encoding_errors="replace"
-        )
+            path, sep=separator, header=None, skiprows=len(head), low_memory=False,
+            encoding_errors="replace",
+        )  # fmt: skip
     except ValueError as error:
         raise CpunetError(f"{path}: holds no steps ({error}); export again") from error
     if (n := cells.shape[1]) != len(names):
         raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
     if cells[n - 1].isna().any():
         raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
-    read = {name: in_memory(cells[at].to_numpy()) for at, name in enumerate(names)}
-    return title, Columns(path, read)
+    columns = {name: cells[at].to_numpy() for at, name in enumerate(names)}
+    return StepTable(path, columns, g4simple=title == _G4SIMPLE_TITLE)

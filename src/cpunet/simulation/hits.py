@@ -68,8 +68,8 @@ class Hits:
 
     Parameters
     ----------
-    x_mm, y_mm, z_mm
-        Position of each hit in mm.
+    position_mm
+        Positions of the hits in mm, shape ``(n_hits, 3)``.
     edep_kev
         Energy of each hit in keV.
     offsets
@@ -94,21 +94,18 @@ class Hits:
     array([1.])
     """
 
-    x_mm: FloatArray
-    y_mm: FloatArray
-    z_mm: FloatArray
+    position_mm: FloatArray
     edep_kev: FloatArray
     offsets: IntArray
     event_number: IntArray
     n_late: int = 0
 
     def __post_init__(self) -> None:
-        for values in (self.x_mm, self.y_mm, self.z_mm):
-            if np.any(np.abs(values) > FARTHEST_MM):
-                raise CpunetError(
-                    f"hits: one lies {np.nanmax(np.abs(values)):g} mm away; check the units "
-                    "and the origin"
-                )
+        farthest = np.abs(self.position_mm).max(initial=0)
+        if farthest > FARTHEST_MM:
+            raise CpunetError(
+                f"hits: one lies {farthest:g} mm away; check the units and the origin"
+            )
 
     @classmethod
     def of(
@@ -119,10 +116,30 @@ class Hits:
         event_number: npt.ArrayLike | None = None,
     ) -> Hits:
         """Build from array-like input; positions have shape ``(n_hits, 3)``."""
-        x, y, z = np.asarray(position_mm, float).reshape(-1, 3).T.copy()
+        place = np.array(position_mm, float, order="C").reshape(-1, 3)
         starts = np.asarray(offsets, np.int64)
         numbers = np.arange(len(starts) - 1) if event_number is None else event_number
-        return cls(x, y, z, np.asarray(edep_kev, float), starts, np.asarray(numbers, np.int64))
+        return cls(place, np.asarray(edep_kev, float), starts, np.asarray(numbers, np.int64))
+
+    @property
+    def x_mm(self) -> FloatArray:
+        """X of each hit in mm."""
+        return self.position_mm[:, 0]
+
+    @property
+    def y_mm(self) -> FloatArray:
+        """Y of each hit in mm."""
+        return self.position_mm[:, 1]
+
+    @property
+    def z_mm(self) -> FloatArray:
+        """Z of each hit in mm, from the face of the point contact."""
+        return self.position_mm[:, 2]
+
+    @property
+    def r_mm(self) -> FloatArray:
+        """Distance of each hit from the axis in mm."""
+        return np.asarray(np.hypot(self.x_mm, self.y_mm))
 
     @property
     def n_events(self) -> int:
@@ -144,15 +161,10 @@ class Hits:
             self.event_of_hit, weights=self.edep_kev, minlength=self.n_events
         ).astype(np.float64)
 
-    @property
-    def position_mm(self) -> FloatArray:
-        """Positions as one array of shape ``(n_hits, 3)``."""
-        return np.stack([self.x_mm, self.y_mm, self.z_mm], axis=1)
-
     def __getitem__(self, which: slice | npt.NDArray[np.bool_] | IntArray) -> Hits:
         """Select events by a slice, a mask or a list of rows."""
         rows = np.arange(self.n_events)[which]
-        counts = np.diff(self.offsets)[rows]
+        counts = self.offsets[rows + 1] - self.offsets[rows]
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         # hit j of the result is hit j - offsets[i] of its original event
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
@@ -169,12 +181,7 @@ class Hits:
         """Events with the given numbers, in their order.
 
         A number without an event yields an event without hits, so the result has one event for
-        each number.
-
-        Raises
-        ------
-        CpunetError
-            If several events share one of the numbers.
+        each number. Of several events with one number it is the first.
 
         Examples
         --------
@@ -186,11 +193,6 @@ class Hits:
         order = np.argsort(self.event_number, kind="stable")
         known = self.event_number[order]
         first, last = (np.searchsorted(known, wanted, side) for side in ("left", "right"))
-        if np.any(last - first > 1):
-            number = wanted[np.argmax(last - first > 1)]
-            raise CpunetError(
-                f"hits: several events have the number {number}; number them anew"
-            )
         found = last > first
         kept = self[order[first[found]]]
         counts = np.zeros(len(wanted), np.int64)

@@ -19,8 +19,6 @@ import reprlib
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from cpunet.errors import CpunetError
 from cpunet.settings import flat
 
@@ -69,24 +67,9 @@ _MEASURED = {
         "characterization.manufacturer.dl_thickness_in_mm",
     ),
 }
-# Shapes that change nothing where their radius is another one, or they have no size.
-_EXTRA = {
-    "top_groove_radius": ("bore_radius", ["top_groove_depth"]),
-    "top_cylinder_radius": ("crystal_radius", ["top_cylinder_length"]),
-    "bottom_cylinder_radius": (
-        "crystal_radius", ["bottom_cylinder_length", "bottom_transition_length"],
-    ),
-}  # fmt: skip
 # of the argon around LEGEND's detectors
 LIQUID_ARGON_K = 87.0
 _SIMULATED = ("icpc", "bege", "ppc")
-# closer points determine no slope
-_NEAREST_CM = 1e-6
-_IMPCC = (
-    "production.impcc.array needs equally long value_in_1e9e/cm3 and "
-    "dist_from_contact_in_mm at different distances; correct it, or remove it and put the "
-    "crystal's file into ../crystals"
-)
 # parameters of each model of the impurity curve
 MODELS = {
     "constant_boule": ("value",),
@@ -112,9 +95,8 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Fields of `Detector` from a LEGEND diode. Fields it does not contain are omitted.
 
     Bias, measured depletion voltage and lithium thickness (the full charge collection depth,
-    FCCD) come from ``characterization``, where 0 means unknown. Impurities come from
-    ``production.impcc`` (a straight line through its points, with net acceptors counted as
-    negative), unless all its values are 0.
+    FCCD) come from ``characterization``, where 0 means unknown. Impurities are those of the
+    crystal, see `impurity_values`.
 
     Raises
     ------
@@ -147,10 +129,6 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
             )
         if field := _GEOMETRY[key]:
             values[field] = value
-    for radius, (same, sizes) in _EXTRA.items():
-        if not any(map(values.get, sizes)) or values.get(radius) == values.get(same, 0):
-            for field in (radius, *sizes):
-                values.pop(field, None)
     outer, inner = (
         _number_at(diode, f"geometry.groove.radius_in_mm.{side}", f"detector {name}", 0.0)
         for side in ("outer", "inner")
@@ -161,36 +139,13 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
         for found in (_at(diode, place) for place in reversed(places)):
             if isinstance(found, int | float) and found > 0:
                 values[field] = found
-    return values | _impurities(diode, name)
+    return values
 
 
 def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
     """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
     diode_name = str(diode.get("name", name))
     return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
-
-
-def _impurities(diode: Mapping[str, Any], name: str) -> dict[str, float]:
-    table = _at(diode, "production.impcc.array")
-    if not isinstance(table, Mapping):
-        return {}
-    key = next((k for k in ("value_in_1e9e/cm3", "value_in_1e9e_cm3") if k in table), "")
-    try:
-        value = -np.abs(np.array(table[key], float)) / 10  # 1e9 to 1e10 / cm3
-        z_cm = np.array(table["dist_from_contact_in_mm"], float) / 10
-    except (KeyError, ValueError, TypeError) as error:
-        raise CpunetError(f"detector {name}: {_IMPCC}") from error
-    if not np.any(value):
-        return {}  # placeholders: recent files have the impurities in the crystal's file
-    alike = value.ndim == 1 and value.shape == z_cm.shape
-    finite = alike and np.isfinite([value, z_cm]).all()
-    if not finite or np.any(np.diff(np.sort(z_cm)) < _NEAREST_CM):
-        raise CpunetError(f"detector {name}: {_IMPCC}")
-    slope, offset = np.polyfit(z_cm, value, 1) if len(z_cm) > 1 else (0.0, value[0])
-    return {
-        "impurity_z0_1e10_per_cm3": float(offset),
-        "impurity_gradient_1e10_per_cm4": float(slope),
-    }
 
 
 def _at(values: Any, place: str) -> Any:

@@ -15,13 +15,7 @@ import numpy as np
 from cpunet.progress import Stage, stage
 from cpunet.simulation.field_lookup import DriftMaps, drift_maps
 from cpunet.simulation.fields import FieldMaps
-from cpunet.simulation.library_drift import (
-    MARGIN_NS,
-    IntArray,
-    bend,
-    compare,
-    drift_nodes,
-)
+from cpunet.simulation.library_drift import MARGIN_NS, IntArray, bend, compare, drift_nodes
 from cpunet.simulation.library_lookup import LATE, OUTSIDE, UNTRIED, PulseLibrary
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import EXACT, WHOLE_ON_AVERAGE, Task, drift_task

@@ -22,23 +22,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.constants import elementary_charge, epsilon_0
-from scipy.ndimage import binary_dilation
 from scipy.sparse.linalg import splu
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.geometry import (
-    DITCH,
-    GERMANIUM,
-    LI_CONTACT,
-    POINT_CONTACT,
-    Detector,
-    FloatArray,
-    RegionArray,
-)
+from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
+from cpunet.simulation.outline import GERMANIUM, LI_CONTACT, POINT_CONTACT
 
 MAX_NODES = 1_500_000
-PASSIVATED, DITCH_EDGE, CONTACT_EDGE = 3, 6, 7
-
 # minimum distance to a contact, as a fraction of a step
 _NEAREST = 1e-4
 _BISECTIONS = 14
@@ -122,21 +112,6 @@ def _steps(
 
 def _ends(values: npt.NDArray[Any], axis: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
-
-
-def point_types(grid: Grid) -> RegionArray:
-    """Type of each node (nr, nz), in fieldgen's numbering.
-
-    0 point contact, 1 lithium contact or outside, 2 germanium, 3 passivated face
-    (z = 0), 5 ditch, 6 germanium next to the ditch, 7 germanium next to a contact.
-    """
-    types = grid.region.copy()
-    germanium = grid.region == GERMANIUM
-    # a dilation adds the four neighbours of each node
-    types[germanium & binary_dilation(grid.region == DITCH)] = DITCH_EDGE
-    types[germanium & binary_dilation(~grid.free)] = CONTACT_EDGE
-    types[germanium[:, 0], 0] = PASSIVATED
-    return types
 
 
 EPSILON_GERMANIUM = 16.0

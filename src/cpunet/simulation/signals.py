@@ -131,7 +131,7 @@ def hit_signals(
     >>> planar = SimpleNamespace(
     ...     grid_mm=1.0, potential_V=100 * height, weighting_potential=1 - height / 10,
     ...     e_r_V_per_cm=0 * height, e_z_V_per_cm=0 * height - 1000,
-    ...     point_type=np.full((11, 11), 2, np.int8), temperature_K=90.0)
+    ...     region=np.full((11, 11), 2, np.int8), temperature_K=90.0)
     >>> point = SimulationSettings(dt_ns=1, length_ns=200, diffusion=False, cloud_fwhm_mm=0)
     >>> pulse = hit_signals(planar, 0.0, 0.0, [5.0], 100.0, point).waveforms[0]
     >>> v_e, v_h = (

@@ -25,10 +25,10 @@ from cpunet.settings import Set, require_seed
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
-from cpunet.simulation.gammas.sample import EnergyWindow, with_resolution
-from cpunet.simulation.geometry import LI_CONTACT, POINT_CONTACT, Detector, FloatArray
+from cpunet.simulation.gammas.sample import EnergyWindow
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
+from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import (
     GammaSource,
     HitFile,
@@ -36,8 +36,10 @@ from cpunet.simulation.hit_sources import (
     energy_windows,
     wanted_events,
 )
+from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
+from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings, split_overrides
 
 log = logging.getLogger(__name__)
@@ -46,23 +48,20 @@ log = logging.getLogger(__name__)
 # but its pulses deviate by up to `library_tolerance`.
 LIBRARY_FROM_HITS = 200_000
 
-Resolution = tuple[float, float]
-
 
 @dataclass(repr=False)
 class Simulation:
     """A file of simulated pulses, with counts over all of its events.
 
-    The energies are smeared by `resolution`. Hits are counted as merged, energies are in keV.
-    ``lines`` counts, by window, the pulses whose collected energy is still in it;
-    ``not_collected`` the hits whose charge was not all collected within the record.
+    Hits are counted as merged, energies are in keV. ``lines`` counts, by window, the pulses
+    whose collected energy is still in it; ``not_collected`` the hits whose charge was not all
+    collected within the record.
     """
 
     path: Path
     detector: Detector
     settings: SimulationSettings
     windows: list[EnergyWindow]
-    resolution: Resolution | None = None
     seed: int = 0
     mode: str = ""
     n_events: int = 0
@@ -90,9 +89,9 @@ class Simulation:
 
     def count(self, hits: Hits, events: EventPulses) -> None:
         """Count a block of events."""
-        r = np.hypot(hits.x_mm, hits.y_mm)
-        inside = self.detector.inside(r, hits.z_mm)
-        contacts = np.isin(self.detector.region(r, hits.z_mm), (POINT_CONTACT, LI_CONTACT))
+        place = hits.r_mm, hits.z_mm
+        inside = self.detector.inside(*place)
+        contacts = np.isin(self.detector.region(*place), (POINT_CONTACT, LI_CONTACT))
         collected = events.collected_kev
         self.n_events += len(hits)
         self.n_written += int((collected > 0).sum())
@@ -107,11 +106,6 @@ class Simulation:
         for window in self.windows:
             within = (collected >= window.low_kev) & (collected <= window.high_kev)
             self.lines[window.name] += int(within.sum())
-
-    def smeared(self, energy_kev: FloatArray, seed: int) -> FloatArray:
-        """Energies in keV as the resolution smears them."""
-        noise, fano = self.resolution or (0.0, 0.0)
-        return with_resolution(energy_kev, noise_kev2=noise, fano_kev=fano, seed=seed)
 
     def __repr__(self) -> str:
         return f"<Simulation {self.path}: {self.n_written} pulses of {self.detector.name}>"
@@ -143,7 +137,6 @@ def simulate(
     hits: str | Path | HitFile | None = None,
     frame: HitOptions = HitOptions(),
     settings: Set = (),
-    resolution: Resolution | None = None,
     seed: int = 0,
     force: bool = False,
 ) -> Simulation:
@@ -151,10 +144,9 @@ def simulate(
 
     The table ``geds/sim`` of the file holds ``waveform`` in units of the collected charge,
     collected ``energy`` (keV), ``event_number``, ``lost_energy`` (keV, deposited where it gives
-    no signal), ``n_hits``, with trapping ``trapped_energy`` (keV, deposited elsewhere but not
-    collected), and with a resolution ``true_energy``. Its attribute ``simulation`` is the
-    provenance in JSON. ``geds/hits`` contains the hits of the pulses in the frame of the
-    crystal.
+    no signal), ``n_hits`` and, with trapping, ``trapped_energy`` (keV, deposited elsewhere but
+    not collected). Its attribute ``simulation`` is the provenance in JSON. ``geds/hits``
+    contains the hits of the pulses in the frame of the crystal.
 
     Parameters
     ----------
@@ -172,8 +164,6 @@ def simulate(
     settings
         Override a value of the detector or of the settings, bias_V=3500, or all those in a
         YAML file (repeatable).
-    resolution
-        A and B: smear the energies written, FWHM² = A + B E in keV, as 0.5 0.0018.
     seed
         Seed of all random numbers.
     force
@@ -214,10 +204,9 @@ def simulate(
     else:
         raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
     found = read_detector(detector, of_detector)
-    simulation = Simulation(out, found, physics, windows, resolution, seed)
+    simulation = Simulation(out, found, physics, windows, seed)
     attrs = {MADE_BY: f"cpunet simulate {cpunet.__version__}"}
     writer = PulseWriter(out, attrs=attrs, force=force)
-    simulation.smeared(np.zeros(0), seed)  # a wrong resolution is told before any work
     _simulate(simulation, source, writer)
     return simulation
 
@@ -247,7 +236,15 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
         for block in chain([first], blocks):
             events = simulate_events(fields, block, settings, library)
             simulation.count(block, events)
-            _append(simulation, writer, block, events)
+            kept = events.collected_kev > 0
+            columns: dict[str, tuple[Any, str]] = {
+                "lost_energy": (events.lost_kev[kept], "keV"),
+                "n_hits": (np.diff(block.offsets)[kept], ""),
+            }
+            if any(settings.trapping_per_ns):
+                columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
+            writer.append(events.pulses(), columns)
+            writer.append_rows(HIT_TABLE, hit_columns(block[kept]))
             bar.update(len(block))
         if not writer.n_pulses:
             raise CpunetError(
@@ -260,31 +257,9 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
             "settings": settings.model_dump(mode="json"),
             "hits": source.provenance(),
             "mode": mode,
-            "resolution": simulation.resolution,
             "seed": simulation.seed,
             "events": simulation.n_events,
             "events_without_signal": simulation.without_signal,
             "depletion_V": fields.depletion_V,
         }
         writer.annotate(SIMULATION, json.dumps(made))
-
-
-def _append(
-    simulation: Simulation, writer: PulseWriter, hits: Hits, events: EventPulses
-) -> None:
-    kept = events.collected_kev > 0
-    pulses = events.pulses()
-    columns: dict[str, tuple[Any, str]] = {
-        "lost_energy": (events.lost_kev[kept], "keV"),
-        "n_hits": (np.diff(hits.offsets)[kept], ""),
-    }
-    if any(simulation.settings.trapping_per_ns):
-        columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
-    if simulation.resolution is not None:
-        columns["true_energy"] = (pulses.energy_kev, "keV")
-        # each block has its own seed, from the number of pulses before it in the file
-        sequence = np.random.SeedSequence((simulation.seed, writer.n_pulses))
-        smeared = simulation.smeared(pulses.energy_kev, int(sequence.generate_state(1)[0]))
-        pulses = replace(pulses, energy_kev=smeared)
-    writer.append(pulses, columns)
-    writer.append_rows(HIT_TABLE, hit_columns(hits[kept]))

@@ -150,12 +150,7 @@ def _running_mean(field: FloatArray, values: FloatArray) -> FloatArray:
 
 @kernel(inline="always")
 def carrier_velocity(
-    coefficients: FloatArray,
-    per_field: float,
-    carrier: int,
-    ex: float,
-    ey: float,
-    ez: float,
+    coefficients: FloatArray, per_field: float, carrier: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float, float, float, float]:
     r"""Velocity (mm/ns), field strength (V/cm), <100> speed and its slope of one charge.
 

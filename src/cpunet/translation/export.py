@@ -1,4 +1,4 @@
-"""Export a run as ONNX: its graph for other software, its noise, and a card on both.
+"""Export a run as ONNX: its graph for other software, and its noise.
 
 Noise is not part of the graph: a network takes its latent draw as a second input, and the
 electronic noise of a readout chain is added to its records.  The preparation is not part of
@@ -11,7 +11,7 @@ import copy
 import importlib
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,14 +21,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+import cpunet
 from cpunet.errors import CpunetError
-from cpunet.html_pages import rendered
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.networks.response_layer import PADDING_AFTER, PADDING_BEFORE, DriftClock
+from cpunet.networks.response_layer import DriftClock
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
-from cpunet.training.chain_description import describe_chain
 from cpunet.training.run import RunLike, as_run
 from cpunet.translation.translator import IREN, REN, Translator
 
@@ -45,13 +44,12 @@ class Export:
     """Exported files, and the largest difference of a sample from the run."""
 
     graph: Path
-    card: Path
     noise: Path | None
     difference: float
 
     def __str__(self) -> str:
-        files = [self.graph, self.card, *([self.noise] if self.noise else [])]
-        return f"{', '.join(map(str, files))}: within {self.difference:.1e} of the run"
+        files = f"{self.graph}, {self.noise}" if self.noise else self.graph
+        return f"{files}: within {self.difference:.1e} of the run"
 
 
 def export_onnx(
@@ -63,20 +61,20 @@ def export_onnx(
 ) -> Export:
     """Export the deterministic part of a run as ONNX, and check it against the run.
 
-    Beside ``NAME.onnx`` (or another name of `out`) it writes ``NAME.card.md``, which describes
-    the training, inputs and outputs, and how to add noise.  If the run adds electronic noise,
-    ``NAME.noise.npz`` contains its spectrum.
+    If the run adds electronic noise, ``NAME.noise.npz`` beside ``NAME.onnx`` (or another name
+    of `out`) contains its spectrum.  Recipe, line, seed and sampling period are metadata of the
+    graph.
 
     Parameters
     ----------
     run
         A trained run or its folder.
     out
-        File to write, its card beside it.
+        File to write.
     inverse
         Export IREN instead of REN.
     force
-        Replace existing files; those of noise are removed if there is none.
+        Replace existing files; that of noise is removed if there is none.
 
     Returns
     -------
@@ -94,35 +92,16 @@ def export_onnx(
     cpunet export onnx run --out ren.onnx
     """
     out = Path(out)
-    card, noise_file = out.with_suffix(".card.md"), out.with_suffix(".noise.npz")
-    run = as_run(run)
-    for path in (out, card, noise_file):
+    noise_file, run = out.with_suffix(".noise.npz"), as_run(run)
+    for path in (out, noise_file):
         refuse_existing(path, run.folder, force=force)
     kind: type[Translator] = IREN if inverse else REN
     translator = kind.of(run)
     noise = translator.backend.noise
     graph = graph_of(translator.backend.network, run.recipe.preparation.length)
-    with (
-        stage("Exporting"),
-        written_aside(out) as aside,
-        written_aside(card) as text,
-    ):
-        difference = write_onnx(graph, aside)
-        done = Export(out, card, None if noise is None else noise_file, difference)
-        network, weights = run.recipe.generator.name != "response", translator.backend.network
-        described = rendered(
-            "card.md",
-            run=run,
-            config=run.recipe.preparation,
-            forward=not inverse,
-            graph=graph,
-            done=done,
-            chain=None if network else describe_chain(run),
-            channels=weights.state_dict()["latent_mean.bias"].shape[0] if network else None,
-            **{"opset": OPSET, "format": FORMAT, "checked": CHECKED, "tolerance": TOLERANCE},
-            **{"before": PADDING_BEFORE, "after": PADDING_AFTER},
-        )
-        text.write_text(described.lstrip(), encoding="utf-8")
+    told = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed, "dt_ns": run.dt_ns}
+    with stage("Exporting"), written_aside(out) as aside:
+        difference = write_onnx(graph, aside, {"cpunet": cpunet.__version__, **told})
         if noise is not None:
             spectra: Any = {"continua": noise.kinds, "lines": noise.lines}
             spectra |= {"shares": noise.shares, "samples": noise.samples, "dt_ns": noise.dt_ns}
@@ -130,7 +109,7 @@ def export_onnx(
                 np.savez(stream, **spectra)
     if noise is None:
         noise_file.unlink(missing_ok=True)  # of an export that this one replaces
-    return done
+    return Export(out, None if noise is None else noise_file, difference)
 
 
 class NetworkGraph(PositionalUNet):
@@ -230,7 +209,7 @@ def _seeded(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def write_onnx(graph: Graph, path: Path) -> float:
+def write_onnx(graph: Graph, path: Path, told: Mapping[str, object] = {}) -> float:
     """Write a graph of any batch size, and compare the file's output with that of the run.
 
     Parameters
@@ -239,6 +218,8 @@ def write_onnx(graph: Graph, path: Path) -> float:
         Result of `graph_of`.
     path
         File to write.
+    told
+        Metadata of the file.
 
     Returns
     -------
@@ -253,7 +234,7 @@ def write_onnx(graph: Graph, path: Path) -> float:
     with torch.no_grad(), warnings.catch_warnings():
         # exporters warn of their own deprecations
         warnings.simplefilter("ignore")
-        path.write_bytes(_program(graph))
+        path.write_bytes(_program(graph, told))
         providers = ["CPUExecutionProvider"]
         session = _needed("onnxruntime").InferenceSession(str(path), providers=providers)
         worst = 0.0
@@ -267,7 +248,7 @@ def write_onnx(graph: Graph, path: Path) -> float:
     return worst
 
 
-def _program(graph: Graph) -> bytes:
+def _program(graph: Graph, told: Mapping[str, object]) -> bytes:
     for package in ("onnx", "onnxscript"):
         _needed(package)
     batch = torch.export.Dim("batch", min=1)
@@ -290,6 +271,8 @@ def _program(graph: Graph) -> bytes:
         logger.setLevel(level)
     model = cast(Any, program).model_proto
     model.ir_version = FORMAT
+    for name, value in told.items():
+        model.metadata_props.add(key=name, value=str(value))
     _needed("onnx").checker.check_model(model)
     content: bytes = model.SerializeToString()
     return content

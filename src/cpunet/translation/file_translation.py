@@ -20,17 +20,21 @@ from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import Stage, stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, recorded_side, require_side
+from cpunet.pulses.provenance import (
+    TRANSLATED_BY,
+    TRANSLATION,
+    recorded_attributes,
+    require_side,
+)
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
-from cpunet.pulses.row_columns import RowColumns
+from cpunet.pulses.row_columns import other_columns
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import (
     AdcTraces,
     Windows,
     adc_scale,
-    interleaved,
     wanted_pile_up,
     wanted_tails,
 )
@@ -43,7 +47,7 @@ BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
 NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 OWN_COLUMNS = frozenset(
-    {"waveform", "energy", "event_number", "rejection", "realisation", "tails_kev"}
+    {"waveform", "energy", "event_number", "rejection", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
 )
 
@@ -156,14 +160,15 @@ class FileTranslation:
             return replace(finished(out, provenance), skipped=1)
         refuse_existing(out, force=force)
         pulses = self.opened(source)
-        others = _other_columns(pulses)
-        counts, times = Counts(), self.options.realisations
+        read_others, left_out = other_columns(pulses, OWN_COLUMNS)
+        for column, reason in left_out.items():
+            log.warning(f"{source.path.name}: column {column} is left out: {reason}")
+        counts = Counts()
         give_back_large_arrays()
         with self.writer(out, force=force) as writer:
             for block in self._blocks(pulses, noise_key):
-                first, given = counts.read // times, len(block.codes) // times
-                columns = {**block.columns, **others.read(first, given, times)}
-                writer.append(block.pulses, columns)
+                beside = read_others(counts.read, len(block.codes))
+                writer.append(block.pulses, {**block.columns, **beside})
                 counts += Counts.of(block)
             self._require_some(source, counts)
             if source_print(source) != before:
@@ -200,8 +205,7 @@ class FileTranslation:
         pulses = source.open()
         self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
         remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
-        found = recorded_side(pulses)
-        if found is not None and "translated" in found.why:
+        if TRANSLATED_BY in recorded_attributes(pulses):
             remedy = f"translate the {self.kind.takes} ones that they were made of"
         require_side(pulses, self.kind.takes, remedy, insist=source.insist)
         return pulses
@@ -239,15 +243,9 @@ class FileTranslation:
         """Translate block by block; the noise depends only on the order of the pulses."""
         with stage("Translating", pulses.n_pulses) as bar:
             for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
-                seeds = (
-                    noise_seed(self.options.seed, noise_key, number, realisation)
-                    for realisation in range(self.options.realisations)
-                )
-                generators = map(self.translator.seeded, seeds)
-                noise = self.options.noise
-                yield interleaved(
-                    [self.form(block, noise=noise, generator=one) for one in generators]
-                )
+                seed = noise_seed(self.options.seed, noise_key, number)
+                generator = self.translator.seeded(seed)
+                yield self.form(block, noise=self.options.noise, generator=generator)
 
 
 def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
@@ -255,18 +253,6 @@ def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
     for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
         yield block
         bar.update(len(block))
-
-
-def _other_columns(pulses: PulseSource) -> RowColumns:
-    """Find the columns to be copied to the output, and report those left out."""
-    if pulses.layout.format in ("LH5", "HDF5"):
-        n_pulses, table = pulses.n_pulses or 0, pulses.layout.table
-        others = RowColumns.of_hdf5(pulses.path, table, n_pulses, OWN_COLUMNS)
-    else:
-        others = RowColumns.of_columns(pulses.path, pulses.columns, OWN_COLUMNS)
-    for column, reason in others.left_out.items():
-        log.warning(f"{pulses.path.name}: column {column} is left out: {reason}")
-    return others
 
 
 def source_print(source: PulseFile) -> str:
@@ -294,7 +280,7 @@ def source_print(source: PulseFile) -> str:
     return hashlib.sha256(repr(known).encode(errors="surrogateescape")).hexdigest()
 
 
-def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> int:
+def noise_seed(seed: int, key: str | None, block: int) -> int:
     """Seed of the noise of a block of a file.
 
     Parameters
@@ -306,14 +292,12 @@ def noise_seed(seed: int, key: str | None, block: int, realisation: int = 0) -> 
         `seed` itself, as in `cpunet.translation.translator.Translator.translate`.
     block
         Number of the block in the file.
-    realisation
-        Number of times that its noise was drawn before.
     """
-    if key is None and block == realisation == 0:
+    if key is None and block == 0:
         return int(seed)
     # names of files need not be UTF-8
     digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
-    words = [seed, block, realisation, int.from_bytes(digest[:16])]
+    words = [seed, block, 0, int.from_bytes(digest[:16])]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 

@@ -9,8 +9,8 @@ baseline before them and with the decay fitted to their end after them, both wit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,11 @@ from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import PADDING_BEFORE, record_length
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Codes, Rejection, prepare
+from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.training.run import Run
 from cpunet.translation.backends import Drawn
 from cpunet.translation.options import LEARNED, NONE, Adc
-from cpunet.translation.translator import BATCH, TranslatedPulses, Translator
+from cpunet.translation.translator import TranslatedPulses, Translator
 
 HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_SAMPLES = 20  # of the pulse whose height defines the gain
@@ -151,13 +151,15 @@ class AdcTraces(Windows):
     def _translated(self, pulses: Pulses, known: Drawn) -> TranslatedPulses:
         """Traces of all pulses; those without energy are rejected."""
         if self.translator.backend.chain is not None:
-            windows, codes = self._of_chain(pulses, known)
+            act = partial(self._of_chain, rng_of(known.generator))
+            done = self.translator.translate_drawn(pulses, known, act, self.length)
+            windows = done.pulses.waveforms
         else:
             done = self.translator.translate_drawn(pulses, replace(known, tails_kev=None))
-            codes = done.codes.copy()
             windows = extended(
                 done.pulses.waveforms, self.config, pulses.dt_ns, self.length, self.n_pre
             )
+        codes = done.codes
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
         if known.tails_kev is not None and self.tails is not None:
@@ -172,45 +174,22 @@ class AdcTraces(Windows):
         whole = pulses.with_waveforms(traces.astype(np.float32))
         return TranslatedPulses(whole, codes, saturated)
 
-    def _of_chain(self, pulses: Pulses, known: Drawn) -> tuple[FloatArray, Codes]:
+    def _of_chain(
+        self, rng: np.random.Generator, windows: FloatArray, known: Drawn
+    ) -> tuple[FloatArray, Codes]:
         """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
-        prepared = prepare(pulses, self.config, "simulated")
-        traces = np.full((len(pulses), self.length), np.nan, np.float32)
-        codes = prepared.codes.copy()
-        usable = np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0)
-        kept = usable[prepared.index]
-        index = prepared.index[kept]
-        windows = prepared.pulses.waveforms[kept]
-        backend, piled = self.translator.backend, known.piled
-        dt_ns, rng = pulses.dt_ns, rng_of(known.generator)
-        for first in range(0, len(windows), BATCH):
-            rows = index[first : first + BATCH]
-            batch = windows[first : first + BATCH]
-            levels, codes[rows] = backend.levels(batch, self.n_pre, self.length)
-            energies = pulses.energy_kev[rows]
-            if known.noise and backend.noise is not None:
-                levels += backend.noise.draw(energies, self.length, rng)
-            if piled is not None and len((other := piled.of_rows(rows)).row):
-                # early piled-up pulses need longer traces
-                reached = self.length + other.reach(dt_ns)
-                shapes, _ = backend.levels(batch[other.partner], self.n_pre, reached)
-                shapes = np.nan_to_num(shapes)
-                levels += other.added(shapes, energies, dt_ns, self.length)
-            traces[rows] = levels
-        return traces, codes
-
-
-def interleaved(realisations: Sequence[TranslatedPulses]) -> TranslatedPulses:
-    """Realisations of the same pulses as numbered rows: all of a pulse, then of the next."""
-    if len(realisations) == 1:
-        return realisations[0]
-    number, given = len(realisations), len(realisations[0].codes)
-    rows = np.arange(number * given).reshape(number, given).T.ravel()
-    whole = TranslatedPulses.joined(realisations)
-    truth = {name: (values[rows], units) for name, (values, units) in whole.truth.items()}
-    truth["realisation"] = (np.tile(np.arange(number), given), "")
-    saturated = None if whole.saturated is None else whole.saturated[rows]
-    return TranslatedPulses(whole.pulses[rows], whole.codes[rows], saturated, truth)
+        backend, piled, dt_ns = self.translator.backend, known.piled, self.translator.dt_ns
+        energies = known.energy_kev
+        assert energies is not None  # those of the pulses
+        levels, codes = backend.levels(windows, self.n_pre, self.length)
+        if known.noise and backend.noise is not None:
+            levels += backend.noise.draw(energies, self.length, rng)
+        if piled is not None and len(piled.row):
+            # early piled-up pulses need longer traces
+            reached = self.length + piled.reach(dt_ns)
+            shapes, _ = backend.levels(windows[piled.partner], self.n_pre, reached)
+            levels += piled.added(np.nan_to_num(shapes), energies, dt_ns, self.length)
+        return levels, codes
 
 
 def to_adc(

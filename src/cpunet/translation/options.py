@@ -45,7 +45,6 @@ class TranslateOptions:
     noise: bool = True
     seed: int = 0
     table: str | None = None
-    realisations: int = 1
     adc: Adc | None = None
     tails: str | float = NONE
     pile_up_khz: float = 0.0
@@ -53,10 +52,6 @@ class TranslateOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**64:
             raise CpunetError(f"`seed` {self.seed}: expected a whole number from 0 to 2^64 - 1")
-        if self.realisations < 1:
-            raise CpunetError(f"`realisations` is {self.realisations}; expected 1 or more")
-        if self.realisations > 1 and not self.noise:
-            raise CpunetError("`realisations` without noise are all the same; give one of both")
         if self.table is not None and not self.table.strip("/ "):
             raise CpunetError("`out_table` is empty; leave it out, or give a name as geds/ren")
         asked = {

@@ -43,7 +43,6 @@ def translate(
     noise: bool = True,
     tails: str | float = NONE,
     pile_up_khz: float = 0.0,
-    realisations: int = 1,
     adc: bool = False,
     scale: Adc = Adc(),
     out_table: str | None = None,
@@ -74,8 +73,6 @@ def translate(
         Pile-up tails: ``learned``, ``none``, or a rate in kHz.
     pile_up_khz
         Rate in kHz of piled-up pulses within a trace.
-    realisations
-        Number of noise draws for each pulse: rows are repeated and numbered.
     adc
         Make raw traces in ADC counts, as a digitiser's, instead of normalised windows.
     scale
@@ -124,7 +121,6 @@ def translate(
         noise,
         seed,
         out_table,
-        realisations,
         scale if adc else None,
         tails,
         pile_up_khz,

@@ -8,10 +8,10 @@ of any length are accepted.  Preparation leaves prepared pulses unchanged.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Self, TypeVar
+from typing import ClassVar, Self, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ from cpunet.training.run import Run
 from cpunet.translation.backends import Backend, Drawn, Energies, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
+
+Act: TypeAlias = Callable[[FloatArray, Drawn], tuple[FloatArray, Codes]]
 
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
@@ -52,7 +54,7 @@ class TranslatedPulses:
     truth
         What is known of each pulse, arrays of shape (n,) with their units: ``tails_kev``
         with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
-        pulses, see `InTracePileUp.largest`; ``realisation`` with several.
+        pulses, see `InTracePileUp.largest`.
     """
 
     pulses: Pulses
@@ -245,11 +247,13 @@ class Translator:
         drawn = Drawn(pulses.energy_kev, noise, generator, tails_kev)
         return self.translate_drawn(pulses, drawn)
 
-    def translate_drawn(self, pulses: Pulses, drawn: Drawn) -> TranslatedPulses:
-        """Like `translate_pulses`, with all that is drawn."""
+    def translate_drawn(
+        self, pulses: Pulses, drawn: Drawn, act: Act | None = None, length: int | None = None
+    ) -> TranslatedPulses:
+        """Like `translate_pulses`, with all that is drawn; see `apply_with_codes`."""
         self.require_sampling("pulses", pulses.dt_ns)
         prepared = prepare(pulses, self.recipe.preparation, self.takes)
-        length = self.recipe.preparation.length
+        length = length or self.recipe.preparation.length
         codes = prepared.codes.copy()
         if drawn.noise and self.needs_energies:
             unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
@@ -258,7 +262,7 @@ class Translator:
         waveforms = np.full((len(pulses), length), np.nan, np.float32)
         index = prepared.index[rows]
         waveforms[index], codes[index] = self.apply_with_codes(
-            prepared.pulses.waveforms[rows], drawn.of_rows(index)
+            prepared.pulses.waveforms[rows], drawn.of_rows(index), act, length
         )
         return TranslatedPulses(pulses.with_waveforms(waveforms), codes)
 
@@ -287,8 +291,21 @@ class Translator:
         self,
         windows: FloatArray,
         drawn: Drawn,
+        act: Act | None = None,
+        length: int | None = None,
     ) -> tuple[FloatArray, Codes]:
         """Like `apply`, with a `Rejection` for each row.
+
+        Parameters
+        ----------
+        windows
+            Prepared windows, shape ``(n, window)``.
+        drawn
+            What is added to them.
+        act
+            What translates a batch; the backend by default.
+        length
+            Samples of its results; those of a window by default.
 
         Raises
         ------
@@ -303,12 +320,13 @@ class Translator:
             )
         if drawn.tails_kev is not None and self.tails is None:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
-        result = np.empty_like(windows)
+        result = np.empty((len(windows), length or windows.shape[1]), np.float32)
         codes = np.zeros(len(windows), np.uint8)
         with torch.inference_mode():
             for first in range(0, len(windows), BATCH):
                 rows = np.arange(first, min(first + BATCH, len(windows)))
-                result[rows], codes[rows] = self.backend(windows[rows], drawn.of_rows(rows))
+                some = windows[rows], drawn.of_rows(rows)
+                result[rows], codes[rows] = (act or self.backend)(*some)
         return result, codes
 
     def seeded(self, seed: int | None) -> torch.Generator:

@@ -187,11 +187,7 @@ class Comparison:
         from cpunet.html_pages import rendered
 
         path, folders = Path(path), self.folders or {}
-        if path.is_dir():
-            raise CpunetError(
-                f"{path}: is a folder", "give the name of a page, as compare.html"
-            )
-        refuse_existing(path, *folders.values(), force=force)
+        _refuse(path, folders.values(), force=force)
         links = {
             name: quote(os.path.relpath(folder / PAGE, path.parent))
             for name, folder in folders.items()
@@ -266,11 +262,20 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
+    if out is not None:
+        files = [report for report in reports if not isinstance(report, Report)]
+        _refuse(Path(out), files, force=force)
     comparison = compared(reports, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)
     return replace(comparison, path=Path(out))
+
+
+def _refuse(out: Path, reports: Iterable[str | Path | None], *, force: bool) -> None:
+    if out.is_dir():
+        raise CpunetError(f"{out}: is a folder", "give the name of a page, as compare.html")
+    refuse_existing(out, *reports, force=force)
 
 
 def compared(

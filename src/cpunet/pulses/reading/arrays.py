@@ -1,11 +1,13 @@
-"""Read NumPy files: ``.npz`` with columns of values per event, ``.npy`` without."""
+"""Arrays of pulses: in memory, in NumPy's ``.npz`` and ``.npy``, and in siggen's ``.spe``."""
 
 from __future__ import annotations
 
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,19 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.energies import MemoryColumn
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 from cpunet.tables import shortened
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
 
+# Radware's spectrum, written by siggen's `stester`: one Fortran record of 24 bytes
+# (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
+_SPE = struct.Struct("<i8siiiiii")
+
 Arrays = dict[str, npt.NDArray[Any]]
-Columns = dict[str, MemoryColumn]
+Columns = dict[str, Column]
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -57,11 +63,17 @@ class ArraySource(PulseSource):
     """An array of shape ``(events, samples)``, with columns of values per event."""
 
     def __init__(
-        self, options: PulseFile, format: str, name: str, waveforms: Any, columns: Columns
+        self,
+        options: PulseFile,
+        format: str,
+        name: str,
+        waveforms: Any,
+        columns: Columns,
+        period_hint: str = "",
     ) -> None:
         self._waveforms = waveforms
         layout = Layout.of_array(options.path, format, name, waveforms.shape, columns)
-        super().__init__(options, layout)
+        super().__init__(options, replace(layout, period_hint=period_hint))
 
     def _traces(self, size: int) -> Iterator[Traces]:
         for start in range(0, len(self._waveforms), size):
@@ -71,9 +83,9 @@ class ArraySource(PulseSource):
 def open_memory(options: PulseFile, pulses: Pulses) -> ArraySource:
     """Pulses in memory as a source."""
     columns = {
-        "energy_kev": MemoryColumn(pulses.energy_kev),
-        "event_number": MemoryColumn(pulses.event_number),
-        "dt_ns": MemoryColumn(np.array(pulses.dt_ns)),
+        "energy_kev": Column.of(pulses.energy_kev),
+        "event_number": Column.of(pulses.event_number),
+        "dt_ns": Column.of(np.array(pulses.dt_ns)),
     }
     return ArraySource(options, "memory", "", pulses.waveforms, columns)
 
@@ -99,8 +111,24 @@ def open_arrays(options: PulseFile) -> ArraySource:
             f"{options.path}: array {name or 'in it'} is of {kind}; save plain numbers"
         )
     columns = {
-        name: MemoryColumn(values)
+        name: Column.of(values)
         for name, values in arrays.items()
         if values.ndim <= 1 and values.dtype.kind in "iufb"
     }
     return ArraySource(options, "NumPy", name, arrays[name], columns)
+
+
+def open_spectrum(options: PulseFile) -> ArraySource:
+    """Open a ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
+    path, size = options.path, options.path.stat().st_size
+    with path.open("rb") as file:
+        _, _, length, n_rows, _, _, _, n_bytes = _SPE.unpack(file.read(_SPE.size))
+    if length < 1 or n_rows < 1 or n_bytes != 4 * length * n_rows:
+        raise CpunetError(f"{path}: its header is damaged; write it again")
+    if size < _SPE.size + n_bytes:
+        raise CpunetError(
+            f"{path}: is cut off after {max(size - _SPE.size, 0) // 4} of "
+            f"{length * n_rows} samples; write it again"
+        )
+    values = np.memmap(path, "<f4", "r", _SPE.size, (n_rows, length))
+    return ArraySource(options, "siggen spectrum", "", values, {})

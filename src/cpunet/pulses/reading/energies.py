@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -27,46 +27,43 @@ ENERGY_UNITS = {"eV": 1e-3, "keV": 1.0, "MeV": 1e3}
 TIME_UNITS = {"ps": 1e-3, "ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9}
 
 
-class Column(Protocol):
-    """One value per event, or a single value that applies to all events."""
-
-    @property
-    def units(self) -> str:
-        """Units in the file, ``""`` if there are none."""
-        ...
-
-    @property
-    def constant(self) -> bool:
-        """Whether a single value applies to all events."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events `start` to `stop` - 1."""
-        ...
-
-
 @dataclass(frozen=True)
-class MemoryColumn:
-    """A column in memory; a scalar applies to all events."""
+class Column:
+    """One value per event, or a single value that applies to all events.
 
-    values: npt.NDArray[Any]
+    Parameters
+    ----------
+    read
+        Gives the values of the events from a first one to the one before a last.
+    size
+        Number of values.
+    units
+        Units in the file, ``""`` if there are none.
+    constant
+        Whether a single value applies to all events.
+    """
+
+    read: Callable[[int, int], npt.NDArray[Any]]
+    size: int
     units: str = ""
+    constant: bool = False
 
-    @property
-    def constant(self) -> bool:
-        """Whether a single value applies to all events."""
-        return self.values.ndim == 0
+    @classmethod
+    def of(cls, values: npt.NDArray[Any], units: str = "") -> Self:
+        """A column in memory; a scalar applies to all events."""
+        if values.ndim == 0:
+            return cls(lambda start, stop: np.full(stop - start, values), 1, units, True)
+        return cls(lambda start, stop: values[start:stop], len(values), units)
 
     def __len__(self) -> int:
-        return self.values.size
+        return self.size
 
-    def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events `start` to `stop` - 1."""
+    def part(self, first: int, size: int) -> Self:
+        """The rows of some events."""
         if self.constant:
-            return np.full(stop - start, self.values)
-        return self.values[start:stop]
+            return self
+        read = lambda start, stop: self.read(first + start, first + stop)  # noqa: E731
+        return replace(self, read=read, size=size)
 
 
 def require_length(path: Path, name: str, column: Column, n_pulses: int | None) -> None:
@@ -194,7 +191,7 @@ def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Col
             f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
         )
     # Imported late: the LH5 library takes seconds to load, and most files do not need it.
-    from cpunet.hdf5_files import column_of
+    from cpunet.pulses.reading.hdf5 import column_of
 
     return _joined(path, columns, energy, *column_of(Path(file), inner))
 
@@ -227,7 +224,7 @@ def _joined(
         f"{(~found).sum()} of {len(ours)} pulses have no energy there"
     )
     values = np.where(found, np.asarray(column.read(0, len(column)), float)[at], np.nan)
-    return MemoryColumn(values, column.units)
+    return Column.of(values, column.units)
 
 
 @dataclass(frozen=True)

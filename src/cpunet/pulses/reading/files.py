@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import struct
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -171,16 +170,12 @@ class Format(NamedTuple):
 HDF5 = Format("HDF5", (".lh5", ".h5", ".hdf5", ".hdf"), "hdf5", "open_hdf5")
 FLASHCAM = Format("FlashCam", (".fcio",), "flashcam", "FlashCamSource")
 NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "open_arrays")
-PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "PickleSource")
-SPECTRUM = Format("spectrum", (".spe",), "siggen", "SpectrumSource")
-TEXT = Format("text", (), "siggen", "TextSource")
+PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "open_pickles")
+SPECTRUM = Format("spectrum", (".spe",), "arrays", "open_spectrum")
 
 _HEAD_BYTES = 520
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _PICKLE_MAGIC, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
-_TEXT_BYTES = set(range(0x20, 0x7F)) | set(b"\t\r\n\f")
-# signs of any encoding, but no control characters
-_COMMENT = re.compile(rb"#[^\x00-\x1f\x7f]*")
 
 
 def open_pulses(
@@ -194,8 +189,8 @@ def open_pulses(
     """Open a file of pulses; the format is recognised by its content.
 
     Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, FlashCam
-    ``.fcio``, NumPy ``.npz`` and ``.npy``, siggen's ``.spe`` and text, the Majorana
-    Demonstrator's data release for machine learning, and CPU-Net's pickled pulses.
+    ``.fcio``, NumPy ``.npz`` and ``.npy``, siggen's ``.spe``, the Majorana Demonstrator's data
+    release for machine learning, and CPU-Net's pickled pulses.
 
     Parameters
     ----------
@@ -270,16 +265,14 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         from cpunet.pulses.reading.flashcam import channel_sizes
 
         return channel_sizes(path)
-    return dict.fromkeys(_hdf5_tables(path)) if found is HDF5 else {}
-
-
-def _hdf5_tables(path: Path) -> list[str]:
+    if found is not HDF5:
+        return {}
     from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import waveform_tables
     from cpunet.pulses.reading.published import detectors, is_majorana
 
     with opened(path) as file:
-        return detectors(file) if is_majorana(file) else waveform_tables(file)
+        return dict.fromkeys(detectors(file) if is_majorana(file) else waveform_tables(file))
 
 
 def recognise(path: Path) -> Format:
@@ -293,22 +286,17 @@ def recognise(path: Path) -> Format:
     """
     head = _head(path)
     found = _by_content(head, path)
-    formats = (HDF5, FLASHCAM, NUMPY, PICKLE, SPECTRUM)
-    claimed = next((one for one in formats if path.suffix.lower() in one.suffixes), None)
-    # any text is accepted, unless its suffix is that of another format; pickles of protocol 0
-    # are text
-    if found is TEXT and claimed is not None:
-        found = PICKLE if claimed is PICKLE else None
     if found is not None:
         return found
-    if claimed is not None:
+    formats = (HDF5, FLASHCAM, NUMPY, PICKLE, SPECTRUM)
+    if claimed := next((one for one in formats if path.suffix.lower() in one.suffixes), None):
         raise CpunetError(
             f"{path}: not a {claimed.name} file, despite its name; "
             "give a file of pulses or correct its suffix"
         )
     raise CpunetError(
         f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
-        "pickled pulses, or siggen's .spe or text"
+        "pickled pulses, or siggen's .spe"
     )
 
 
@@ -341,4 +329,4 @@ def _by_content(head: bytes, path: Path) -> Format | None:
         return SPECTRUM
     if head[0] == _PICKLE_MAGIC and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
         return PICKLE
-    return TEXT if set(_COMMENT.sub(b"", head)) <= _TEXT_BYTES else None
+    return None

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from fcio import FCIO, Tags, fcio_open
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.energies import MemoryColumn
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
 
@@ -40,7 +40,7 @@ class FlashCamSource(PulseSource):
             n_pulses=None,
             length=length,
             period_name="sampling period",
-            period=MemoryColumn(period_ns, "ns") if period_ns > 0 else None,
+            period=Column.of(period_ns, "ns") if period_ns > 0 else None,
         )
         super().__init__(options, layout)
 

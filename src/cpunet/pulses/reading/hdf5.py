@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import Hdf5Column, columns_of, lh5_rows, opened, text_attribute
+from cpunet.hdf5_files import StoredRows, is_column, lh5_rows, opened, text_attribute
+from cpunet.pulses.reading.arrays import ArraySource
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.published import MajoranaSource, is_majorana
+from cpunet.pulses.reading.published import is_majorana, open_majorana
 from cpunet.pulses.reading.source import Layout, PulseSource, Traces
 from cpunet.tables import shortened
 
@@ -31,12 +33,14 @@ def open_hdf5(options: PulseFile) -> PulseSource:
     """Open the waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
     with opened(options.path) as file:
         if is_majorana(file):
-            return MajoranaSource(options)
+            return open_majorana(options, file)
         table, _, contact = (options.table or "").partition(f"{_CONTACT}=")
         chosen = choose_waveforms(options.path, file, table)
-    if chosen.is_lh5:
-        return Lh5Source(options, chosen, contact)
-    return Hdf5Source(options, chosen)
+        if chosen.is_lh5:
+            return Lh5Source(options, chosen, contact)
+        values = StoredRows(options.path, chosen.path, file[chosen.path].shape)
+        columns = columns_of(options.path, file[chosen.table or "/"])
+    return ArraySource(options, "HDF5", chosen.path, values, columns)
 
 
 class Lh5Source(PulseSource):
@@ -117,7 +121,7 @@ def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
 
 
 def _rows_of_contact(
-    path: Path, columns: dict[str, Hdf5Column], contact: str
+    path: Path, columns: dict[str, Column], contact: str
 ) -> tuple[int, int] | None:
     """First row and number of rows of a contact, where a table holds several one by one."""
     column = columns.get(_CONTACT)
@@ -140,24 +144,6 @@ def _rows_of_contact(
             "write those of a contact one after another",
         )
     return int(rows[0]), len(rows)
-
-
-class Hdf5Source(PulseSource):
-    """A dataset of shape ``(events, samples)``, and the columns beside it."""
-
-    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
-        self._values = chosen.path
-        with opened(options.path) as file:
-            dataset = file[chosen.path]
-            columns = columns_of(options.path, file[chosen.table or "/"])
-            layout = Layout.of_array(options.path, "HDF5", chosen.path, dataset.shape, columns)
-        super().__init__(options, layout)
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        with opened(self.path) as file:
-            dataset = file[self._values]
-            for start in range(0, self.n_pulses or 0, size):
-                yield Traces(dataset[start : start + size])
 
 
 def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
@@ -312,3 +298,39 @@ def _tables(group: h5py.Group) -> list[str]:
 
     group.visititems(note)
     return tables or list(group)
+
+
+def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
+    """Columns of a group: its numeric datasets of one dimension, and its scalars."""
+    members = {name: group.get(name) for name in group}
+    return {name: _stored(path, m) for name, m in members.items() if is_column(m)}
+
+
+def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
+    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
+
+    Raises
+    ------
+    CpunetError
+        If there is no such file or column; the message lists the other columns of the group.
+    """
+    with opened(path) as file:
+        found = file.get(name)
+        if is_column(found):
+            return _stored(path, found), columns_of(path, found.parent)
+        parent = file.get(name.strip("/").rpartition("/")[0] or "/")
+        known = list(columns_of(path, parent)) if isinstance(parent, h5py.Group) else list(file)
+    raise CpunetError(f"{path}: no column {name}; there are {shortened(known)}")
+
+
+def _stored(path: Path, dataset: h5py.Dataset) -> Column:
+    """A dataset as a column; the file is open only while reading."""
+    name, is_constant = dataset.name, dataset.ndim == 0
+
+    def read(start: int, stop: int) -> npt.NDArray[Any]:
+        with opened(path) as file:
+            if is_constant:
+                return np.full(stop - start, file[name][()])
+            return np.asarray(file[name][start:stop])
+
+    return Column(read, dataset.size, text_attribute(dataset, "units"), is_constant)

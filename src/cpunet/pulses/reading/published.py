@@ -20,8 +20,6 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +28,15 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened
-from cpunet.pulses.reading.energies import MemoryColumn
+from cpunet.hdf5_files import StoredRows, is_column
+from cpunet.pulses.reading.arrays import ArraySource
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
+from cpunet.pulses.reading.source import choose_table
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
 _RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
-_SLAB_BYTES = 1 << 25  # of traces read at a time
 
 
 def is_majorana(file: h5py.File) -> bool:
@@ -54,64 +52,24 @@ def detectors(file: h5py.File) -> list[str]:
     return [str(number) for number in np.unique(file[DETECTOR][()])]
 
 
-class MajoranaSource(PulseSource):
-    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
-
-    def __init__(self, options: PulseFile) -> None:
-        path = options.path
-        with opened(path) as file:
-            dataset = file[WAVEFORMS]
-            self._rows = _rows(options, file, dataset.shape[0])
-            columns = {
-                name: MemoryColumn(values[self._rows], units)
-                for name, values, units in _columns(file)
-            }
-            layout = Layout(
-                format="Majorana release",
-                table=options.table or WAVEFORMS,
-                n_pulses=len(self._rows),
-                length=dataset.shape[1],
-                columns=columns,
-                period_hint="the Majorana Demonstrator's digitisers ran at 100 MHz: 10",
-            )
-        super().__init__(options, layout)
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        rows = self._single()
-        while some := list(islice(rows, size)):
-            yield Traces(np.stack(some))
-
-    def _single(self) -> Iterator[npt.NDArray[np.float32]]:
-        # whole slabs: row by row, the chunks of a compressed file would be unpacked repeatedly
-        with opened(self.path) as file:
-            dataset = file[WAVEFORMS]
-            slab = max(1, _SLAB_BYTES // (dataset.dtype.itemsize * self.length))
-            for start in range(0, dataset.shape[0], slab):
-                chosen = self._rows[np.searchsorted(self._rows, start) :]
-                chosen = chosen[chosen < start + slab] - start
-                if len(chosen):
-                    with np.errstate(over="ignore"):  # overflows become infinite
-                        found = dataset[start : start + slab][chosen].astype(np.float32)
-                    yield from found
-
-
-def _rows(options: PulseFile, file: h5py.File, n: int) -> npt.NDArray[np.int64]:
-    """Rows of the chosen detector, in order."""
-    if options.table == WAVEFORMS:
-        return np.arange(n)
-    remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
-    chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
-    return np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
-
-
-def _columns(file: h5py.File) -> Iterator[tuple[str, npt.NDArray[np.generic], str]]:
-    """Yield name, values and units of each column beside the traces (a few bytes per event)."""
+def open_majorana(options: PulseFile, file: h5py.File) -> ArraySource:
+    """Open the traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
+    number, length = file[WAVEFORMS].shape
+    rows = np.arange(number)
+    if options.table != WAVEFORMS:
+        remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
+        chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
+        rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
+    columns = {}
     for name in file:
-        column = file.get(name)
-        if not is_column(column) or column.ndim == 0:
-            continue
-        shown, units = _RENAMED.get(name, (name, ""))
-        yield shown, np.asarray(column[()]), units
+        item = file.get(name)
+        if is_column(item) and item.ndim:
+            shown, units = _RENAMED.get(name, (name, ""))
+            columns[shown] = Column.of(item[()][rows], units)
+    values = StoredRows(options.path, WAVEFORMS, (len(rows), length), rows)
+    hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
+    table = options.table or WAVEFORMS
+    return ArraySource(options, "Majorana release", table, values, columns, hint)
 
 
 # NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
@@ -127,19 +85,6 @@ _ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
 _OTHERS = "write the pulses of one length without other entries"
 
 
-@dataclass(frozen=True)
-class PickledPulse:
-    """One entry: its samples, the numbers beside them by name, and its event number."""
-
-    samples: npt.NDArray[np.float32]
-    numbers: dict[str, float]
-    event: int
-
-
-class TruncatedError(Exception):
-    """The pickle is truncated or damaged."""
-
-
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
@@ -150,148 +95,61 @@ class _Unpickler(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def entries(path: Path) -> Iterator[Any]:
-    """Yield the objects pickled one after the other in a file, and the items of lists.
+def open_pickles(options: PulseFile) -> ArraySource:
+    """Open pickled dictionaries, one after the other or in lists; all are held in memory.
 
     Raises
     ------
     CpunetError
-        If the file cannot be read or asks for more than arrays and plain containers.
-    TruncatedError
-        If it is truncated or damaged; the objects before that are yielded first.
+        If the file is damaged, asks for more than arrays and plain containers, or holds more
+        than pulses of one length.
     """
-    try:
-        stream = path.open("rb")
-    except OSError as error:
-        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    with stream:
+    path = options.path
+    if options.table is not None:
+        raise CpunetError(f"{path}: a file of pickled pulses has no tables; leave out `table`")
+    traces: list[npt.NDArray[np.float32]] = []
+    events: list[int] = []
+    numbers: list[dict[str, float]] = []
+    for place, entry in enumerate(_entries(path)):
+        try:
+            with np.errstate(over="ignore"):  # values beyond single precision are counted later
+                trace = np.asarray(entry["wf"], np.float32)
+            events.append(int(entry.get("event", place)))
+            beside = entry.keys() & {"tp0", "energy", "dc_label"}
+            numbers.append({name: float(entry[name]) for name in beside})
+        except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
+            raise CpunetError(
+                f"{path}: entry {place} is no pulse (a dictionary of wf and numbers); {_OTHERS}"
+            ) from error
+        length = len(traces[0]) if traces else trace.size
+        if trace.shape != (length,):
+            raise CpunetError(
+                f"{path}: entry {place}: {trace.size} samples, before it {length}; {_OTHERS}"
+            )
+        traces.append(trace)
+    columns = {"event_number": Column.of(np.array(events, np.int64))}
+    for name in sorted(set().union(*numbers)):
+        values = np.array([row.get(name, np.nan) for row in numbers])
+        columns[name] = Column.of(values, "keV" if name == "energy" else "")
+    hint = "CPU-Net's pulses are sampled every 16 ns"
+    waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
+    return ArraySource(options, "pickled pulses", "", waveforms, columns, hint)
+
+
+def _entries(path: Path) -> Iterator[Any]:
+    """Yield the objects pickled one after the other in a file, and the items of lists."""
+    n_read = 0
+    with path.open("rb") as stream:
         while stream.peek(1):
             try:
                 value = _Unpickler(stream).load()
             except CpunetError as error:
                 raise CpunetError(f"{path}: {error}") from error
             except Exception as error:  # a damaged pickle can raise anything
-                raise TruncatedError(str(error) or type(error).__name__) from error
-            if isinstance(value, list | tuple):
-                yield from value
-            else:
-                yield value
-
-
-def as_pulse(entry: Any, number: int) -> PickledPulse | str:
-    """Convert an entry to a pulse; the reason, if it is not one.
-
-    Parameters
-    ----------
-    entry
-        Any unpickled object.
-    number
-        Its index in the file, which replaces a missing event number.
-    """
-    if not isinstance(entry, dict) or "wf" not in entry:
-        return "no dictionary with wf"
-    try:
-        with np.errstate(over="ignore"):  # values beyond single precision are counted later
-            samples = np.asarray(entry["wf"], np.float32)
-        event = int(entry.get("event", number))
-        numbers = dict.fromkeys(("tp0", "energy"), float("nan"))
-        for name, value in entry.items():
-            if name in numbers or name == "dc_label":
-                numbers[name] = float(value)
-    except (TypeError, ValueError, OverflowError):
-        return "holds something other than numbers"
-    if samples.ndim != 1 or not len(samples):
-        return "its wf is no trace"
-    return PickledPulse(samples, numbers, event)
-
-
-@dataclass
-class _Seen:
-    """Numbers of the pulses read so far (a few bytes each), since columns are read by rows."""
-
-    path: Path
-    numbers: list[dict[str, float]] = field(default_factory=list)
-    complete: bool = False
-
-    def pulses(self) -> Iterator[PickledPulse]:
-        """Yield all pulses of the file in order and keep their numbers."""
-        length, place = 0, -1
-        try:
-            for place, entry in enumerate(entries(self.path)):
-                pulse = as_pulse(entry, place)
-                if isinstance(pulse, str):
-                    raise CpunetError(
-                        f"{self.path}: entry {place} is no pulse ({pulse}); {_OTHERS}"
-                    )
-                length = length or len(pulse.samples)
-                if len(pulse.samples) != length:
-                    raise CpunetError(
-                        f"{self.path}: entry {place}: {len(pulse.samples)} samples, before it "
-                        f"{length}; {_OTHERS}"
-                    )
-                if place == len(self.numbers):
-                    self.numbers.append(pulse.numbers)
-                yield pulse
-        except TruncatedError as error:
-            said = " ".join(str(error).split())
-            raise CpunetError(
-                f"{self.path}: breaks off after {place + 1} entries ({said}); download it again"
-            ) from error
-        self.complete = True
-
-    def until(self, stop: float) -> list[dict[str, float]]:
-        """Numbers of at least the first `stop` pulses, or of all if there are fewer."""
-        if len(self.numbers) < stop and not self.complete:
-            for met, _ in enumerate(self.pulses(), start=1):
-                if met >= stop:
-                    break
-        return self.numbers
-
-
-@dataclass(frozen=True)
-class _PickledColumn:
-    """One number per pulse; parts of the file that were not read yet are read when needed."""
-
-    seen: _Seen
-    name: str
-    units: str = ""
-    constant: bool = False
-
-    def __len__(self) -> int:
-        return len(self.seen.until(np.inf))
-
-    def read(self, start: int, stop: int) -> npt.NDArray[Any]:
-        """Values of the events `start` to `stop` - 1."""
-        rows = self.seen.until(stop)[start:stop]
-        return np.array([row.get(self.name, np.nan) for row in rows], float)
-
-
-class PickleSource(PulseSource):
-    """Pickled dictionaries, one after the other (streamed) or in lists (held one at a time)."""
-
-    def __init__(self, options: PulseFile) -> None:
-        if options.table is not None:
-            raise CpunetError(
-                f"{options.path}: a file of pickled pulses has no tables; leave out `table`"
-            )
-        self._seen = _Seen(options.path)
-        first = next(self._seen.pulses(), None)
-        known = {} if first is None else first.numbers
-        layout = Layout(
-            format="pickled pulses",
-            table="",
-            n_pulses=0 if first is None else None,
-            length=0 if first is None else len(first.samples),
-            columns={
-                name: _PickledColumn(self._seen, name, "keV" if name == "energy" else "")
-                for name in known
-            },
-            period_hint="CPU-Net's pulses are sampled every 16 ns",
-        )
-        super().__init__(options, layout)
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        pulses = self._seen.pulses()
-        while some := list(islice(pulses, size)):
-            numbers = np.array([pulse.event for pulse in some], np.int64)
-            yield Traces(np.stack([pulse.samples for pulse in some]), numbers)
+                said = " ".join(str(error).split())
+                raise CpunetError(
+                    f"{path}: breaks off after {n_read} entries ({said}); download it again"
+                ) from error
+            some = value if isinstance(value, list | tuple) else [value]
+            n_read += len(some)
+            yield from some

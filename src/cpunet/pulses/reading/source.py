@@ -138,7 +138,8 @@ class PulseSource(ABC):
     """A file of pulses: iterate over its `blocks`, or `read` it as a whole.
 
     The file is open only during an iteration, so a source need not be closed, and the memory
-    in use does not grow with the file, except for ``.npz``, which is read as a whole.
+    in use does not grow with the file, except for ``.npz`` and pickles, which are read as a
+    whole.
 
     Attributes
     ----------

@@ -13,7 +13,7 @@ import numpy as np
 
 from cpunet.kernels import kernel
 from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, Array, ElectronTable
-from cpunet.simulation.gammas.shape import CrystalShape, in_germanium
+from cpunet.simulation.outline import Outline, in_germanium
 
 
 class UnitVector(NamedTuple):
@@ -134,13 +134,7 @@ def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> 
 
 @kernel(error_model="numpy")
 def put_photon(
-    stack: Array,
-    n: int,
-    x: float,
-    y: float,
-    z: float,
-    direction: UnitVector,
-    energy: float,
+    stack: Array, n: int, x: float, y: float, z: float, direction: UnitVector, energy: float
 ) -> int:
     """Push a photon onto the stack of pending photons; return the new height."""
     row = stack[n]
@@ -148,31 +142,6 @@ def put_photon(
     row[3], row[4], row[5] = direction.x, direction.y, direction.z
     row[6] = energy
     return n + 1
-
-
-@kernel(error_model="numpy")
-def deep_inside(shape: CrystalShape, x: float, y: float, z: float, reach: float) -> bool:
-    """Whether all points within `reach` (mm) are certainly germanium."""
-    r = math.sqrt(x * x + y * y)
-    if z - reach < shape.ditch_depth or z + reach > shape.length:
-        return False
-    narrowing = max(z + reach - shape.outer_taper_start, 0.0) * shape.outer_taper_slope
-    if z + reach > shape.length - shape.top_bullet:
-        narrowing = max(narrowing, shape.top_bullet)
-    if z - reach < shape.bottom_bullet:
-        narrowing = max(narrowing, shape.bottom_bullet)
-    below = max(shape.bottom_taper_end - z + reach, 0.0) * shape.bottom_taper_slope
-    if z + reach > shape.top_step_start:
-        narrowing += shape.top_step
-    if z - reach < shape.bottom_step_end + shape.bottom_transition:
-        below += shape.bottom_step
-    if r + reach > shape.radius - narrowing - below:
-        return False
-    widest = shape.bore_radius
-    widest += (shape.length - shape.inner_taper_start) * shape.inner_taper_slope
-    if z + reach > shape.groove_start:
-        widest = max(widest, shape.groove_radius)
-    return z + reach < min(shape.bore_end, shape.groove_start) or r - reach > widest
 
 
 @kernel(error_model="numpy")
@@ -186,7 +155,7 @@ def row_of(table: ElectronTable, kinetic: float) -> int:
 
 @kernel(error_model="numpy")
 def slow_down(
-    shape: CrystalShape,
+    outline: Outline,
     table: ElectronTable,
     position: tuple[float, float, float],
     direction: UnitVector,
@@ -206,8 +175,6 @@ def slow_down(
     """
     x, y, z = position
     row = row_of(table, kinetic)
-    # checked once per track: most tracks start deep inside, few get there later
-    safe = kinetic > ELECTRON_CUT and deep_inside(shape, x, y, z, table.range[row])
     part = (kinetic - table.energy[row + 1]) / (table.energy[row] - table.energy[row + 1])
     while kinetic > ELECTRON_CUT:
         lower = table.energy[row + 1]
@@ -216,7 +183,7 @@ def slow_down(
         x += hinge * direction.x
         y += hinge * direction.y
         z += hinge * direction.z
-        if not safe and not in_germanium(shape, x, y, z):
+        if not in_germanium(outline, x, y, z):
             return n_hits, n_stack
         n_hits = record(hits, n_hits, x, y, z, kinetic - lower)
         kinetic = lower
@@ -227,7 +194,7 @@ def slow_down(
         x += rest * direction.x
         y += rest * direction.y
         z += rest * direction.z
-        if not safe and not in_germanium(shape, x, y, z):
+        if not in_germanium(outline, x, y, z):
             return n_hits, n_stack
         chance = rng.random()
         if chance < part * table.brems[row]:

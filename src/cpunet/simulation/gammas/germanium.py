@@ -65,7 +65,6 @@ class ElectronTable(NamedTuple):
     log_ratio: float
     energy: Array
     step: Array
-    range: Array
     scattering: Array
     scattering_cut: Array
     brems: Array
@@ -109,8 +108,6 @@ def electron_table() -> ElectronTable:
     middle = energy * np.sqrt(ratio)
     stopping = _collision_loss(middle) + np.array([_soft_radiation(t) for t in middle])
     step = energy * _LOSS_PER_STEP / stopping
-    # the range below the last row is a few micrometres
-    to_go = np.cumsum(step[::-1])[::-1] + energy[-1] * ratio / stopping[-1]
     hard, quantiles = zip(*map(_hard_photons, middle), strict=True)
     turned = 1 - np.exp(-step * _transport_per_mm(middle))
     scale = np.array([_scale_of(mean) for mean in turned])
@@ -119,7 +116,6 @@ def electron_table() -> ElectronTable:
         log_ratio=float(np.log(ratio)),
         energy=energy,
         step=step,
-        range=to_go,
         scattering=scale,
         scattering_cut=1 - np.exp(-2 / scale),
         brems=1 - np.exp(-step * np.array(hard)),

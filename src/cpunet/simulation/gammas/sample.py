@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -37,9 +36,9 @@ from cpunet.simulation.gammas.germanium import (
     electron_table,
     photon_table,
 )
-from cpunet.simulation.gammas.shape import CrystalShape, in_germanium, way_to_cylinder
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.outline import Outline, in_germanium
 
 Integers = npt.NDArray[np.int64]
 
@@ -59,7 +58,7 @@ class SourceDisc(NamedTuple):
 
 @kernel(error_model="numpy")
 def follow_photons(
-    shape: CrystalShape,
+    outline: Outline,
     photons: PhotonTable,
     electrons: ElectronTable,
     hits: Array,
@@ -75,6 +74,7 @@ def follow_photons(
     """
     # numba compiles a function anew for each constant that it is called with
     n_hits, electron = int(np.int64(0)), bool(np.bool_(False))
+    length = outline.crystal_length
     while n_stack > 0:
         n_stack -= 1
         x, y, z = stack[n_stack, 0], stack[n_stack, 1], stack[n_stack, 2]
@@ -82,7 +82,7 @@ def follow_photons(
         energy = stack[n_stack, 6]
         while True:
             if energy < PHOTON_CUT:
-                if in_germanium(shape, x, y, z):
+                if in_germanium(outline, x, y, z):
                     n_hits = record(hits, n_hits, x, y, z, energy)
                 break
             at = (math.log(energy) - photons.log_first) * photons.per_log
@@ -94,9 +94,9 @@ def follow_photons(
             x += path * direction.x
             y += path * direction.y
             z += path * direction.z
-            if z < 0.0 or z > shape.length or x * x + y * y > shape.radius**2:
+            if not 0.0 <= z <= length or x * x + y * y > outline.crystal_radius**2:
                 break
-            if not in_germanium(shape, x, y, z):
+            if not in_germanium(outline, x, y, z):
                 continue
             chance = rng.random()
             if chance < photons.photoelectric[node]:
@@ -105,7 +105,7 @@ def follow_photons(
                 kinetic = energy - bound
                 away = forward(direction, kinetic, rng)
                 n_hits, n_stack = slow_down(
-                    shape, electrons, (x, y, z), away, kinetic, electron,
+                    outline, electrons, (x, y, z), away, kinetic, electron,
                     hits, n_hits, stack, n_stack, rng,
                 )  # fmt: skip
                 break
@@ -115,7 +115,7 @@ def follow_photons(
                 scattered = turned(direction, cosine, 2.0 * math.pi * rng.random())
                 recoil = remainder(energy, direction, left_over, scattered)
                 n_hits, n_stack = slow_down(
-                    shape, electrons, (x, y, z), recoil, energy - left_over, electron,
+                    outline, electrons, (x, y, z), recoil, energy - left_over, electron,
                     hits, n_hits, stack, n_stack, rng,
                 )  # fmt: skip
                 energy, direction = left_over, scattered
@@ -124,8 +124,9 @@ def follow_photons(
             mine = pair_share(rng) * kinetic
             for positron in (False, True):
                 part = kinetic - mine if positron else mine
+                away = forward(direction, part, rng)
                 n_hits, n_stack = slow_down(
-                    shape, electrons, (x, y, z), forward(direction, part, rng), part, positron,
+                    outline, electrons, (x, y, z), away, part, positron,
                     hits, n_hits, stack, n_stack, rng,
                 )  # fmt: skip
             break
@@ -133,16 +134,37 @@ def follow_photons(
 
 
 @kernel(error_model="numpy")
-def emit(
-    shape: CrystalShape, source: SourceDisc, stack: Array, rng: np.random.Generator
-) -> int:
+def way_to_cylinder(
+    outline: Outline, x: float, y: float, z: float, direction: UnitVector
+) -> float:
+    """Distance in mm from a point above the crystal to its enclosing cylinder; -1 if missed."""
+    radius, length = outline.crystal_radius, outline.crystal_length
+    u, v, w = direction
+    if w >= 0.0:
+        return -1.0
+    t = (length - z) / w
+    if (x + t * u) ** 2 + (y + t * v) ** 2 <= radius**2:
+        return t
+    a = u * u + v * v
+    b = x * u + y * v
+    c = x * x + y * y - radius**2
+    inside_root = b * b - a * c
+    if a == 0.0 or inside_root <= 0.0:
+        return -1.0
+    t = (-b - math.sqrt(inside_root)) / a
+    height = z + t * w
+    return t if t > 0.0 and 0.0 <= height <= length else -1.0
+
+
+@kernel(error_model="numpy")
+def emit(outline: Outline, source: SourceDisc, stack: Array, rng: np.random.Generator) -> int:
     """Place a photon where it meets the cylinder of the crystal; return 0 if it misses."""
     r = source.radius * math.sqrt(rng.random())
     around = 2.0 * math.pi * rng.random()
-    x, y, z = r * math.cos(around), r * math.sin(around), shape.length + source.height
+    x, y, z = r * math.cos(around), r * math.sin(around), outline.crystal_length + source.height
     cosine = source.least_cosine + (1.0 - source.least_cosine) * rng.random()
     down = turned(UnitVector(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
-    way = way_to_cylinder(shape.radius, shape.length, x, y, z, down.x, down.y, down.z)
+    way = way_to_cylinder(outline, x, y, z, down)
     if way < 0.0:
         return 0
     # rounding must not leave it just outside, where it would count as lost
@@ -154,7 +176,7 @@ def emit(
 
 @kernel(error_model="numpy")
 def simulate_block(
-    shape: CrystalShape,
+    outline: Outline,
     source: SourceDisc,
     photons: PhotonTable,
     electrons: ElectronTable,
@@ -162,7 +184,6 @@ def simulate_block(
     low: Array,
     high: Array,
     wanted: Integers,
-    spectrum: Integers,
     rng: np.random.Generator,
     hits: Array,
     offsets: Integers,
@@ -171,9 +192,8 @@ def simulate_block(
     """Simulate until the primaries, the space for hits or the requested events run out.
 
     Energies are in MeV. An event is kept if it lies in a window (low to high) that still
-    needs events, or always if there are no windows. `wanted` is counted down. `spectrum`
-    (1 keV bins) counts every event with a deposit. Returns the numbers of primaries done and
-    of events kept.
+    needs events, or always if there are no windows. `wanted` is counted down. Returns the
+    numbers of primaries done and of events kept.
     """
     stack = np.empty((STACK_HEIGHT, 7))
     n_kept = 0
@@ -183,17 +203,16 @@ def simulate_block(
         full = len(hits) - start < MAX_HITS or n_kept == len(primaries)
         if full or (len(wanted) > 0 and wanted.sum() == 0):
             return primary, n_kept
-        n_stack = emit(shape, source, stack, rng)
+        n_stack = emit(outline, source, stack, rng)
         if n_stack == 0:
             continue
         mine = hits[start : start + MAX_HITS]
-        n_hits = follow_photons(shape, photons, electrons, mine, stack, n_stack, rng)
+        n_hits = follow_photons(outline, photons, electrons, mine, stack, n_stack, rng)
         energy = 0.0
         for i in range(n_hits):
             energy += mine[i, 3]
         if energy == 0.0:
             continue
-        spectrum[min(int(energy * 1e3), len(spectrum) - 1)] += 1
         keep = len(wanted) == 0
         for line in range(len(wanted)):
             if wanted[line] > 0 and low[line] <= energy <= high[line]:
@@ -222,17 +241,6 @@ class EnergyWindow(NamedTuple):
     high_kev: float
 
 
-@dataclass(frozen=True, eq=False)
-class GammaStatistics:
-    """Counts over all primaries, including events that were not kept.
-
-    ``spectrum`` is the histogram of events with a deposit, in bins of 1 keV from 0.
-    """
-
-    n_primaries: int
-    spectrum: npt.NDArray[np.int64]
-
-
 def simulate_gammas(
     detector: Detector,
     *,
@@ -242,7 +250,7 @@ def simulate_gammas(
     seed: int,
     wanted: Mapping[EnergyWindow, int] = MappingProxyType({}),
     energy_kev: float = TL208_KEV,
-) -> tuple[Hits, GammaStatistics]:
+) -> tuple[Hits, int]:
     r"""Simulate gammas from a disc above the crystal, in vacuum.
 
     Gammas are emitted isotropically into the cone around the axis that is as wide as crystal
@@ -276,8 +284,8 @@ def simulate_gammas(
     -------
     Hits
         Events with a deposit. ``event_number`` is the number of the primary.
-    GammaStatistics
-        Counts over all primaries, including events that were not kept.
+    int
+        Number of gammas in the cone, including those of events that were not kept.
 
     Raises
     ------
@@ -291,8 +299,8 @@ def simulate_gammas(
                 f"{line.name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
                 f"the {energy_kev} keV line; give another"
             )
-    shape = CrystalShape.of(detector)
-    reach = shape.radius + source_radius_mm
+    outline = Outline.of(detector)
+    reach = outline.crystal_radius + source_radius_mm
     cosine = source_height_mm / math.hypot(source_height_mm, reach)
     source = SourceDisc(
         energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine
@@ -301,7 +309,6 @@ def simulate_gammas(
     low = np.array([line.low_kev / 1e3 - 1e-9 for line in wanted])
     high = np.array([line.high_kev / 1e3 + 1e-9 for line in wanted])
     missing = np.array(list(wanted.values()), np.int64)
-    spectrum = np.zeros(math.ceil(energy_kev) + 1, np.int64)
     rng = np.random.default_rng(seed)
     hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
     offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
@@ -310,8 +317,8 @@ def simulate_gammas(
     done = 0
     while done < n_primaries and not (wanted and missing.sum() == 0):
         tried, kept = simulate_block(
-            shape, source, photon_table(), electron_table(), n_primaries - done,
-            low, high, missing, spectrum, rng, hits, offsets, primaries,
+            outline, source, photon_table(), electron_table(), n_primaries - done,
+            low, high, missing, rng, hits, offsets, primaries,
         )  # fmt: skip
         ends = offsets[: kept + 1].copy()
         deposits = hits[: ends[-1]]
@@ -322,41 +329,4 @@ def simulate_gammas(
     if missing.any():
         short = ", ".join(f"{n} of {w.name}" for w, n in zip(wanted, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
-    return Hits.concatenate(blocks), GammaStatistics(done, spectrum)
-
-
-def with_resolution(
-    energy_kev: npt.ArrayLike, *, noise_kev2: float, fano_kev: float, seed: int
-) -> npt.NDArray[np.float64]:
-    r"""Smear energies with the Gaussian resolution of a detector.
-
-    .. math:: \mathrm{FWHM}^2 = a + b E
-
-    with :math:`a` in keV² and :math:`b` in keV. The hits are not changed.
-
-    Parameters
-    ----------
-    energy_kev
-        True energies in keV.
-    noise_kev2, fano_kev
-        Coefficients :math:`a` of the electronic noise and :math:`b` of the Fano statistics.
-    seed
-        Seed of the random generator.
-
-    Raises
-    ------
-    CpunetError
-        If a coefficient is negative or not finite.
-
-    Examples
-    --------
-    >>> energies = with_resolution([1592.5] * 4000, noise_kev2=4.0, fano_kev=0.0, seed=1)
-    >>> bool(abs(energies.std() * 2.3548 - 2.0) < 0.1)
-    True
-    """
-    if not (noise_kev2 >= 0 and fano_kev >= 0 and math.isfinite(noise_kev2 + fano_kev)):
-        raise CpunetError(f"FWHM² = {noise_kev2} + {fano_kev} E; give numbers from 0 up")
-    energy = np.asarray(energy_kev, float)
-    fwhm = np.sqrt(noise_kev2 + fano_kev * energy)
-    sigma = fwhm / math.sqrt(8 * math.log(2))
-    return np.random.default_rng(seed).normal(energy, sigma)
+    return Hits.concatenate(blocks), done

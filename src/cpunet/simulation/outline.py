@@ -1,0 +1,182 @@
+"""The outline of a crystal in (r, z): germanium, contacts, ditch, and what lies outside."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.kernels import kernel
+
+Array = npt.NDArray[np.float64]
+
+POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
+
+_TOLERANCE = 1e-6
+"""Surfaces that coincide with a grid line do so despite rounding; in mm."""
+
+
+class Outline(NamedTuple):
+    """Values of a `Detector` that make its outline, as compiled loops take them; in mm."""
+
+    crystal_length: float
+    crystal_radius: float
+    top_bullet_radius: float
+    bottom_bullet_radius: float
+    point_contact_length: float
+    point_contact_radius: float
+    wrap_around_radius: float
+    bore_length: float
+    bore_radius: float
+    bore_bullet_radius: float
+    outer_taper_length: float
+    inner_taper_length: float
+    bottom_taper_length: float
+    top_cylinder_length: float
+    bottom_cylinder_length: float
+    bottom_transition_length: float
+    top_groove_depth: float
+    top_groove_radius: float
+    li_thickness: float
+    siggen_conventions: bool
+    taper_slopes: tuple[float, float, float]
+    ditch_walls: tuple[float, float, float]
+    steps: tuple[float, float]
+
+    @classmethod
+    def of(cls, detector: Any) -> Outline:
+        """Outline of a `Detector`."""
+        return cls(*(getattr(detector, name) for name in cls._fields))
+
+
+@kernel(error_model="numpy")
+def regions(outline: Outline, r: Array, z: Array) -> npt.NDArray[np.int8]:
+    """See `Detector.region`."""
+    found = np.empty(len(r), np.int8)
+    radius, length = outline.point_contact_radius, outline.point_contact_length
+    for i in range(len(r)):
+        if r[i] <= radius + _TOLERANCE and z[i] <= length + _TOLERANCE:
+            found[i] = POINT_CONTACT
+        elif not _within(outline, r[i], z[i], outline.li_thickness + _TOLERANCE, -_TOLERANCE):
+            found[i] = LI_CONTACT
+        else:
+            found[i] = DITCH if _in_ditch(outline, r[i], z[i], _TOLERANCE) else GERMANIUM
+    return found
+
+
+@kernel(error_model="numpy")
+def insides(outline: Outline, r: Array, z: Array) -> npt.NDArray[np.bool_]:
+    """See `Detector.inside`."""
+    found = np.empty(len(r), np.bool_)
+    for i in range(len(r)):
+        found[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
+    return found
+
+
+@kernel(error_model="numpy")
+def in_germanium(outline: Outline, x: float, y: float, z: float) -> bool:
+    """Whether a point lies in germanium, including the lithium layer."""
+    return _is_germanium(outline, math.sqrt(x * x + y * y), z, 0.0)
+
+
+@kernel(error_model="numpy")
+def _is_germanium(outline: Outline, r: float, z: float, shift: float) -> bool:
+    return _within(outline, r, z, shift, shift) and not _in_ditch(outline, r, z, shift)
+
+
+@kernel(error_model="numpy")
+def _in_ditch(outline: Outline, r: float, z: float, margin: float) -> bool:
+    """Whether a point lies in the ditch with its walls moved outwards by `margin`."""
+    inner, outer, depth = outline.ditch_walls
+    return depth > 0.0 and inner - margin <= r <= outer + margin and z <= depth + margin
+
+
+@kernel(error_model="numpy")
+def _within(outline: Outline, r: float, z: float, shift: float, face: float) -> bool:
+    """Whether a point lies in the crystal or ditch, lithium faces moved in by `shift`.
+
+    `face` is the height of the passivated face.
+    """
+    wrapped = 0.0 < outline.wrap_around_radius < r
+    if not (shift if wrapped else face) < z < outline.crystal_length - shift:
+        return False
+    if not r < _outer_wall(outline, z, shift) or _in_bore(outline, r, z, shift):
+        return False
+    top = z - outline.crystal_length + outline.top_bullet_radius
+    bottom = outline.bottom_bullet_radius - z
+    return not (
+        _beyond_bullet(outline, outline.top_bullet_radius, r, top, shift)
+        or _beyond_bullet(outline, outline.bottom_bullet_radius, r, bottom, shift)
+    )
+
+
+@kernel(error_model="numpy")
+def _beyond_bullet(
+    outline: Outline, bullet: float, r: float, along: float, shift: float
+) -> bool:
+    """Whether a point lies beyond the rounded edge of an end, `along` the axis into it."""
+    across = r - (outline.crystal_radius - bullet)
+    if bullet <= shift or across <= 0.0 or along <= 0.0:
+        return False
+    return math.sqrt(across * across + along * along) >= bullet - shift
+
+
+@kernel(error_model="numpy")
+def _outer_wall(outline: Outline, z: float, shift: float) -> float:
+    """Radius of the outer wall, moved in by `shift`, at a height."""
+    top, _, bottom = outline.taper_slopes
+    into_top = z - (outline.crystal_length - outline.outer_taper_length)
+    into_bottom = outline.bottom_taper_length - z
+    wall = outline.crystal_radius - shift
+    beyond = outline.crystal_length - outline.top_cylinder_length - z
+    wall -= _step(outline.steps[0], beyond, 0.0, shift)
+    beyond = z - outline.bottom_cylinder_length
+    wall -= _step(outline.steps[1], beyond, outline.bottom_transition_length, shift)
+    if outline.outer_taper_length > 0.0:
+        wall -= _taper(outline, into_top, top, shift)
+    if outline.bottom_taper_length > 0.0:
+        wall -= _taper(outline, into_bottom, bottom, shift)
+    return wall
+
+
+@kernel(error_model="numpy")
+def _step(depth: float, beyond: float, length: float, shift: float) -> float:
+    """Reduction in radius by a narrower end, `beyond` it, of walls moved in by `shift`."""
+    if length == 0.0:  # its lithium, moved along the axis, lies in the wider part
+        return 0.0 if beyond > shift else depth
+    slope = depth / length
+    extra = shift * (math.sqrt(1.0 + slope * slope) - 1.0)
+    return min(max(depth - slope * beyond + extra, 0.0), depth)
+
+
+@kernel(error_model="numpy")
+def _taper(outline: Outline, into: float, slope: float, shift: float) -> float:
+    """Reduction in radius by a taper, `into` it, of a wall moved in by `shift`."""
+    if outline.siggen_conventions:  # the taper's start is moved down with the top
+        extra = shift * slope
+    else:  # the taper itself is moved along its normal
+        extra = shift * (math.sqrt(1.0 + slope * slope) - 1.0)
+    return max(into * slope + extra, 0.0)
+
+
+@kernel(error_model="numpy")
+def _in_bore(outline: Outline, r: float, z: float, shift: float) -> bool:
+    """Whether a point lies in bore or groove with their walls moved outwards by `shift`."""
+    below_top = outline.crystal_length - z
+    depth, radius = outline.top_groove_depth, outline.top_groove_radius
+    if depth > 0.0 and below_top <= depth + shift and r <= radius + shift:
+        return True
+    if outline.bore_length == 0.0 or below_top > outline.bore_length + shift:
+        return False
+    radius, bullet = outline.bore_radius + shift, outline.bore_bullet_radius
+    if outline.inner_taper_length > 0.0:
+        into = outline.inner_taper_length - below_top
+        radius += _taper(outline, into, outline.taper_slopes[1], shift)
+    if r > radius:
+        return False
+    across = r - (outline.bore_radius - bullet)
+    along = below_top - outline.bore_length + bullet
+    corner = across > 0.0 and along > 0.0
+    return not corner or math.sqrt(across * across + along * along) <= bullet + shift
