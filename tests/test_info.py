@@ -142,7 +142,7 @@ def test_files_of_hits_are_described(tmp_path):
     )
     assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
     assert "names no unit" in str(info(csv))
-    units = HitOptions(length_unit="cm", energy_unit="keV")
+    units = HitOptions(units="cm,keV")
     assert "x 30 … 30" in str(info(csv, frame=units))
 
 

@@ -245,7 +245,7 @@ def test_units_and_windows_of_a_file(command, tmp_path):
     words = ["--detector", "ppc", "--set", "grid_mm=0.5", "--hits", path]
     words += ["--out", tmp_path / "sim.lh5"]
     assert "names no unit; give " in command("simulate", *words).err
-    units = ["--length-unit", "mm", "--energy-unit", "keV", "--events", "800-1200"]
+    units = ["--units", "mm,keV", "--events", "800-1200"]
     outcome = command("simulate", *words, *units)
     assert "1 of 2 events written (1 800-1200 by" in outcome.out
     assert "check --origin, --flip-z and --hits-detector" in outcome.err

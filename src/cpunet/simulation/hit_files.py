@@ -77,7 +77,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
         raise CpunetError(
             f"{file}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
             "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
-            "give `energy_unit` if it names none"
+            "give `units` if it names none"
         )
     return hits
 

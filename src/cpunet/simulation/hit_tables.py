@@ -103,8 +103,7 @@ class StepTable:
             If a column is missing, is no number or names no known unit.
         """
         if self.g4simple:
-            length, energy = options.length_unit or "mm", options.energy_unit or "MeV"
-            options = replace(options, length_unit=length, energy_unit=energy)
+            options = replace(options, units=f"{options.units},mm,MeV")
         if missing := [role for role in _NEEDED if role not in self.roles]:
             raise CpunetError(
                 f"{self.path}: no column for {missing[0]}; "
@@ -219,13 +218,10 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
     CpunetError
         If the unit is unknown, or nobody tells it.
     """
-    known, option, given = _MM, "length_unit", options.length_unit
-    if role == "edep":
-        known, option, given = _KEV, "energy_unit", options.energy_unit
-    elif role == "time":
-        known, given = _NS, "ns"
-    if (unit := named or given) is None:
-        raise CpunetError(f"{where} names no unit; give `{option}`: {', '.join(known)}")
+    known = {"edep": _KEV, "time": _NS}.get(role, _MM)
+    given = [unit for unit in (*options.units.split(","), "ns") if unit in known]
+    if not (unit := named or next(iter(given), "")):
+        raise CpunetError(f"{where} names no unit; give `units`, one of {', '.join(known)}")
     if unit not in known:
         raise CpunetError(f"{where} is in {unit!r}; expected one of {', '.join(known)}")
     return known[unit]

@@ -32,10 +32,8 @@ class HitOptions:
         X, Y and Z in mm: the point contact's centre in the file's frame.
     flip_z
         The file's point contact is on top.
-    length_unit
-        Unit of lengths, if the file names none: mm, cm, m or um.
-    energy_unit
-        Unit of energies, if the file names none: keV, MeV, eV or GeV.
+    units
+        Units of lengths and energies that the file does not name, as ``cm,keV``.
     time_window_us
         Hits of an event number that come later than this are another event; remage's interval
         by default.
@@ -44,8 +42,7 @@ class HitOptions:
     hits_detector: str | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     flip_z: bool = False
-    length_unit: str | None = None
-    energy_unit: str | None = None
+    units: str = ""
     time_window_us: float = 10.0
 
     def to_crystal(self, position_mm: FloatArray) -> FloatArray:

@@ -14,7 +14,6 @@ from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.loading import SideInfo
-from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PunetConfig
 from cpunet.training.run import Run, differing, versions
@@ -40,7 +39,6 @@ def import_weights(
     ren: str | Path | None = None,
     iren: str | Path | None = None,
     dt_ns: float = 16.0,
-    peak: str = "FEP",
     force: bool = False,
 ) -> Run:
     """Make a run of the published state dicts; nothing of the files is executed.
@@ -55,8 +53,6 @@ def import_weights(
         Data → simulation: ``fep_IREN.pt``.
     dt_ns
         Sampling period in ns of the pulses of the training.
-    peak
-        What the weights were trained on.
     force
         Replace existing output.
 
@@ -68,7 +64,7 @@ def import_weights(
     Raises
     ------
     CpunetError
-        If no generator is given, `peak` cannot be understood, a file is not a plain state
+        If no generator is given, a file is not a plain state
         dict or has another architecture, the two generators differ in width, or `out` cannot
         be written.
 
@@ -92,11 +88,10 @@ def import_weights(
             f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
         )
     recipe = load_recipe("paper", {"generator.width": widths.pop()})
-    parse_selection(peak, recipe.peaks)
     run = Run.of(
         nn.ModuleDict(networks),
         recipe,
-        peak=peak,
+        peak="FEP",
         seed=None,
         dt_ns=dt_ns,
         seconds=0.0,
