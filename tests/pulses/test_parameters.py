@@ -180,19 +180,6 @@ def test_times_and_effective_drift_time_of_noisy_pulses():
         assert found["effective_drift_time"][i] == pytest.approx(area * DT_NS, abs=0.05)
 
 
-@pytest.mark.parametrize("noise", [0.0, 7.5e-4, 0.01])
-def test_current_width_is_that_of_dspeeds_own_chain(noise):
-    waveforms = multi_site(100, noise, seed=3)
-    found = parameters_of(waveforms)["current_width"]
-    for current, width in zip(smoothed_current(waveforms).astype(float), found, strict=True):
-        top, half = int(current.argmax()), current.max() / 2
-        left = np.flatnonzero(current[:top] <= half)[-1]
-        right = top + np.flatnonzero(current[top:] <= half)[0]
-        begin = np.interp(half, current[left : left + 2], [left, left + 1])
-        end = np.interp(half, current[[right, right - 1]], [right, right - 1])
-        assert width == pytest.approx((end - begin) * DT_NS / 16, abs=0.05)
-
-
 def test_baseline_rms_is_that_about_a_line():
     waveforms = multi_site(20, 3e-3, seed=6) + np.float32(1e-4) * TIME.astype(np.float32)
     found = parameters_of(waveforms)["baseline_rms"]

@@ -44,7 +44,7 @@ def pulses(n: int, centre: float = 350.0) -> np.ndarray:
 
 def test_further_parameters_are_drawn_each():
     rng = np.random.default_rng(0)
-    names = ("rise_10_90", "t50", "tail_slope", "current_width", "baseline_rms")
+    names = ("rise_10_90", "t50", "tail_slope", "rise_90_99", "baseline_rms")
     values = {
         name: {method: rng.normal(100, 5, 300) for method in ("data", "ren")} for name in names
     }

@@ -129,15 +129,6 @@ def maxima_elsewhere(current, first, samples):  # type: ignore[no-untyped-def]
     return highest
 
 
-# Half a sample from its maximum, the smoothed current is still within 6 % of it: the
-# averages alone smear it with a sigma of 1.5 samples.
-_NEAR_MAXIMUM = 0.8
-# For sums over finite values, which the compiler can then reorder and vectorise.
-_compiled_sum: Any = kernel(
-    error_model="numpy", fastmath={"nnan", "nsz", "reassoc", "contract"}
-)
-
-
 @_compiled
 def _missing(pulse, start, stop, height):  # type: ignore[no-untyped-def]
     """Area between `height` and the pulse from time `start` to sample `stop`, over `height`."""
@@ -192,72 +183,3 @@ def missing_areas(waveforms, starts, stops):  # type: ignore[no-untyped-def]
             stop = int(stops[i])
             areas[i] = _missing(waveforms[i], starts[i], stop, np.float64(waveforms[i, stop]))
     return areas
-
-
-@_compiled_sum
-def _smoothed(current, weights, step):  # type: ignore[no-untyped-def]
-    """The smoothed current at a step of the fine grid."""
-    steps, taps = weights.shape
-    first, phase = step // steps - taps // 2, step % steps
-    total = 0.0
-    for i in range(taps):
-        total += weights[phase, i] * current[first + i]
-    return total
-
-
-@_compiled
-def _current_maximum(current, weights, samples):  # type: ignore[no-untyped-def]
-    """Step and value of the smoothed current's maximum; `samples` is a buffer."""
-    steps, reach = len(weights), weights.shape[1] // 2
-    stop = len(current) - reach
-    rough = -math.inf
-    for i in range(reach, stop):
-        samples[i] = _smoothed(current, weights, i * steps)
-        rough = max(rough, samples[i])
-    best, highest = -1, 0.0
-    if not rough > 0:
-        return best, highest
-    for i in range(reach, stop):
-        if max(samples[i], samples[min(i + 1, stop - 1)]) >= _NEAR_MAXIMUM * rough:
-            for step in range(i * steps, (i + 1) * steps):
-                value = _smoothed(current, weights, step)
-                if value > highest:
-                    best, highest = step, value
-    return best, highest
-
-
-@_compiled
-def _half_width(current, weights, top, highest, direction):  # type: ignore[no-untyped-def]
-    """Steps from the maximum to half of it, on the left (-1) or right (+1)."""
-    steps, reach = len(weights), weights.shape[1] // 2
-    first, last = reach * steps, (len(current) - reach) * steps - 1
-    step, before = top, highest
-    while first <= step + direction <= last:
-        step += direction
-        value = _smoothed(current, weights, step)
-        if value <= 0.5 * highest:
-            return abs(step - top) - 1 + (before - 0.5 * highest) / (before - value)
-        before = value
-    return math.nan
-
-
-@_compiled
-def current_widths(waveforms, weights):  # type: ignore[no-untyped-def]
-    """Full width at half maximum of the smoothed current of ``(n, length)``, in samples.
-
-    The weights are those of `cpunet.pulses.parameters.current_amplitude_kernel`, in float64
-    and without rounding errors below 0, which would make the current of a falling pulse > 0.
-    """
-    widths = np.empty(len(waveforms))
-    current, samples = np.empty(waveforms.shape[1] - 1), np.empty(waveforms.shape[1] - 1)
-    for i in range(len(waveforms)):
-        widths[i] = math.nan
-        for j in range(len(current)):
-            current[j] = waveforms[i, j + 1] - waveforms[i, j]
-        if math.isfinite(current.sum()):  # a current with a NaN has no maximum
-            top, highest = _current_maximum(current, weights, samples)
-            if top >= 0:
-                left = _half_width(current, weights, top, highest, -1)
-                right = _half_width(current, weights, top, highest, 1)
-                widths[i] = (left + right) / len(weights)
-    return widths

@@ -18,7 +18,6 @@ from cpunet.pulses.parameters import (
     Parameter,
     Values,
     current_amplitude,
-    current_amplitude_kernel,
     drift_time,
     tail_slope,
 )
@@ -39,7 +38,6 @@ RISE_TIMES = {
 # Definitions and sources are in docs/parameters.md.
 SHAPE_PARAMETERS: dict[str, Parameter] = {
     "current_amplitude": PARAMETERS["current_amplitude"],
-    "current_width": Parameter("Current width", "ns"),
     "drift_time": PARAMETERS["drift_time"],
     **{
         name: Parameter(rf"$t_{{{100 * fraction:g}\,\%}}$", "ns")
@@ -123,10 +121,8 @@ def _of_block(
     scores: ScoreConfig,
     amplitudes: Values | None,
 ) -> dict[str, Values]:
-    weights = np.clip(current_amplitude_kernel().astype(float), 0, None)
     return {
         "current_amplitude": current_amplitude(block) if amplitudes is None else amplitudes,
-        "current_width": kernels.current_widths(block, weights) * dt_ns,
         "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
         **_times(block, dt_ns, preparation.samples_before),
         "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
