@@ -213,7 +213,11 @@ def test_a_dry_run_of_libraries_and_events(place):
 def test_a_dry_run_with_calibrations(place):
     with_steps(place)
     config = whole_chain()
-    config["calibrate"] = {"fix": "tilt", "prior": ["depletion_voltage=2100±50"], "events": 500}
+    config["calibrate"] = {
+        "free": "temperature",
+        "prior": ["depletion_voltage=2100±50"],
+        "events": 500,
+    }
     place.configure(config)
     done = place.run("--dry-run", "--printshellcmds")
     assert done.returncode == 0, done.stdout
@@ -222,7 +226,7 @@ def test_a_dry_run_with_calibrations(place):
     assert jobs["calibrate"] == jobs["ideal_library"] == 3  # physics are those of a period
     assert jobs["event_pulses"] == 3 * 2
     told = " ".join(done.stdout.split())
-    words = "--fix=tilt '--prior=depletion_voltage=2100±50' --events=500"
+    words = "--free=temperature '--prior=depletion_voltage=2100±50' --events=500"
     assert words in told.replace("--prior='depletion", "'--prior=depletion")
     run = "'all results/V01/p03/run/"
     assert f"--detector={run}detector.yaml' --set={run}settings.yaml' --hits" in told
