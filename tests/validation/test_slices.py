@@ -19,7 +19,6 @@ from cpunet.validation.slices import (
     BEFORE,
     Slices,
     slice_edges,
-    slice_table,
     sliced,
 )
 from synthetic import paired_scores, require_drawn
@@ -60,9 +59,6 @@ def test_superpulses_are_those_of_a_plain_loop():
     times[3] = 1500.0  # the last edge is included
     windows[4], times[4] = 0.0, 600.0
     found = superpulses(windows, times, edges)
-    assert found.left_out["no_time"] == 1
-    assert found.left_out["outside"] == 1 + sum((times < 400) | (times > 1500)) - 1
-    assert found.left_out["unaligned"] == 1
     for pulse, (low, high) in zip(found.pulses, ((400, 900), (900, 1500.01)), strict=True):
         rows = [i for i in range(90) if low <= times[i] < high and i != 4]
         aligned = align_half_maximum(windows[rows], BEFORE, AFTER).astype(float)
@@ -70,23 +66,6 @@ def test_superpulses_are_those_of_a_plain_loop():
         np.testing.assert_allclose(pulse.mean, aligned.mean(axis=0), atol=1e-6)
         expected = aligned.std(axis=0, ddof=1) / np.sqrt(len(rows))
         np.testing.assert_allclose(pulse.error, expected, atol=1e-6)
-    assert sum(p.n for p in found.pulses) + sum(found.left_out.values()) == 90
-
-
-def test_without_a_difference_z_is_that_of_chance():
-    rng = np.random.default_rng(2)
-    edges = np.linspace(20, 120, 4) * DT
-    sets = [
-        slice_table({"data": drawn(rng, 150, edges), "ren": drawn(rng, 200, edges)}, DT).slices[
-            "ren"
-        ]
-        for _ in range(60)
-    ]
-    rows = [row for found in sets for row in found]
-    assert np.mean([row.rms_z**2 for row in rows]) == pytest.approx(1, abs=0.12)
-    assert np.mean([row.mean_abs_z for row in rows]) == pytest.approx(0.80, abs=0.06)
-    ratio = np.mean([row.rms**2 for row in rows]) / np.mean([row.rms_error**2 for row in rows])
-    assert ratio == pytest.approx(1, abs=0.2)
 
 
 def test_a_known_difference_is_found_where_it_is():
@@ -98,25 +77,14 @@ def test_a_known_difference_is_found_where_it_is():
     # a step of 1 % of the height after the edge, in the slowest slice only
     other[long, 180:] += 0.01
     found = superpulses(other, times, edges)
-    table = slice_table({"data": data, "ren": found}, DT)
-    rows = table.slices["ren"]
-    assert [row.rms for row in rows[:3]] == [0, 0, 0]
-    assert rows[3].largest == pytest.approx(1.0, abs=0.15)
-    assert rows[3].largest_at_ns > 20 * DT
+    *same, off = (
+        own.mean - measured.mean
+        for own, measured in zip(found.pulses, data.pulses, strict=True)
+    )
+    assert np.nanmax(np.abs(same)) == 0
     # the crossing lies at sample 150-152, and the higher maximum moves it a little
-    assert rows[3].rms == pytest.approx(100 * 0.01 * np.sqrt(72 / 201), rel=0.2)
-
-
-def test_few_pulses_are_missing_with_the_reason():
-    windows, times = pulses(np.random.default_rng(4), 60)
-    edges = slice_edges(times, 2)
-    data = superpulses(windows, times, edges)
-    early, late = np.flatnonzero(times < edges[1]), np.flatnonzero(times > edges[1])
-    few = np.concatenate([early[:9], late])
-    method = superpulses(windows[few], times[few], edges)
-    rows = slice_table({"data": data, "raw": method}, DT).slices["raw"]
-    assert rows[0].missing == "9 pulses beside 30 measured ones (at least 10 are needed)"
-    assert rows[1].missing is None
+    assert np.nanmax(off) == pytest.approx(0.01, rel=0.15)
+    assert np.nanargmax(np.abs(off)) > BEFORE + 20
 
 
 def test_nothing_in_a_slice_is_no_failure():
@@ -124,9 +92,7 @@ def test_nothing_in_a_slice_is_no_failure():
     edges = slice_edges(times, 2)
     data = superpulses(windows, times, edges)
     none = superpulses(windows, times + 1e6, edges)
-    table = slice_table({"data": data, "raw": none}, DT)
-    assert table.left_out["raw"]["outside"] == 40
-    assert all(row.n == 0 and row.missing for row in table.slices["raw"])
+    assert all(pulse.n == 0 for pulse in none.pulses)
     slices = zip(data.pulses, none.pulses, strict=True)
     columns = {str(i): {"data": one, "raw": other} for i, (one, other) in enumerate(slices)}
     require_drawn(shape_figure(columns, DT, "SEP"))

@@ -36,7 +36,7 @@ from cpunet.validation.methods import (
 )
 from cpunet.validation.peaks import ByMethod, PeakScores, PeakSets, score_peak
 from cpunet.validation.report import as_stored
-from cpunet.validation.slices import Slices, aligned_means, slice_table
+from cpunet.validation.slices import Slices, aligned_means
 from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
@@ -143,9 +143,6 @@ def evaluate(
             "survival by energy range": _range_survivals(translations, kept, recipe)
         },
         "ae_energy": ae_energy,
-        "drift_slices": {
-            name: slice_table(of_peak, data_set.dt_ns) for name, of_peak in slices.items()
-        },
         "baseline_methods": {
             "fits": {
                 name: method.describe() for name, method in baseline_methods.methods.items()

@@ -16,7 +16,7 @@ counts against it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -26,8 +26,6 @@ from cpunet.pulses.parameters import Values, align_half_maximum
 
 BEFORE, AFTER = 100, 150  # samples of a mean pulse before and after half maximum
 SLICES = 4
-MIN_PULSES = 10  # minimum pulses of a slice for an error of its mean
-EDGE_SAMPLES = 100  # about half maximum, in which differences are evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,7 @@ class MeanPulse:
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """The mean pulses of a dataset by rise time, and the number of pulses left out.
+    """The mean pulses of a dataset by rise time.
 
     Attributes
     ----------
@@ -71,63 +69,11 @@ class Slices:
         Mean of all pulses.
     pulses, edges
         Mean pulse of each slice, and the edges of the slices in ns.
-    left_out
-        Number of pulses left out by reason: ``no_time``, ``outside`` the edges, ``unaligned``
-        (no crossing).
     """
 
     whole: MeanPulse
     pulses: tuple[MeanPulse, ...]
     edges: Values
-    left_out: dict[str, int]
-
-
-@dataclass(frozen=True)
-class SliceScore:
-    """Deviation of a method's mean pulse from that of the data in one slice.
-
-    Attributes
-    ----------
-    n, n_data
-        Numbers of pulses.
-    rms, rms_error
-        RMS of the residual and its expectation by chance, both in percent of full charge.
-    largest, largest_at_ns
-        Largest residual in percent, and its time from the crossing.
-    mean_abs_z, rms_z
-        Mean absolute pull and RMS pull (0.80 and 1 if there is no difference).
-    missing
-        Reason why there are none.
-    """
-
-    n: int
-    n_data: int
-    rms: float | None = None
-    rms_error: float | None = None
-    largest: float | None = None
-    largest_at_ns: float | None = None
-    mean_abs_z: float | None = None
-    rms_z: float | None = None
-    missing: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class SliceTable:
-    """Deviations of each method's mean pulses from those of the data.
-
-    Attributes
-    ----------
-    edges_ns
-        Edges of the slices.
-    left_out
-        Number of pulses in no slice, by method and reason.
-    slices
-        Scores of the slices, by method.
-    """
-
-    edges_ns: Values
-    left_out: dict[str, dict[str, int]]
-    slices: dict[str, list[SliceScore]]
 
 
 def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
@@ -180,64 +126,7 @@ def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
     edges
         Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
     """
-    timed = np.isfinite(rise_time)
-    inside = timed & (rise_time >= edges[0]) & (rise_time <= edges[-1])
+    inside = (rise_time >= edges[0]) & (rise_time <= edges[-1])  # not those that are NaN
     place = np.searchsorted(edges[1:-1], rise_time, side="right")
     found = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
-    left_out = {
-        "no_time": int((~timed).sum()),
-        "outside": int((timed & ~inside).sum()),
-        "unaligned": int(inside.sum()) - sum(pulse.n for pulse in found),
-    }
-    return Slices(MeanPulse.of(aligned), found, edges, left_out)
-
-
-def slice_table(sets: Mapping[str, Slices], dt_ns: float) -> SliceTable:
-    """Compare each method's mean pulses with those of the data.
-
-    Parameters
-    ----------
-    sets
-        Mean pulses by method, the measured ones under ``"data"``.
-    dt_ns
-        Sampling period in ns.
-    """
-    data = sets["data"]
-    others = {method: slices for method, slices in sets.items() if method != "data"}
-    return SliceTable(
-        data.edges,
-        {method: slices.left_out for method, slices in sets.items()},
-        {method: _scores(data, slices, dt_ns) for method, slices in others.items()},
-    )
-
-
-def _scores(data: Slices, method: Slices, dt_ns: float) -> list[SliceScore]:
-    scores = []
-    near = slice(BEFORE - EDGE_SAMPLES, BEFORE + EDGE_SAMPLES + 1)
-    for own, measured in zip(method.pulses, data.pulses, strict=True):
-        score = SliceScore(own.n, measured.n)
-        if min(own.n, measured.n) < MIN_PULSES:
-            few = f"{own.n} pulses beside {measured.n} measured ones"
-            missing = f"{few} (at least {MIN_PULSES} are needed)"
-            scores.append(replace(score, missing=missing))
-            continue
-        difference = (own.mean - measured.mean)[near]
-        error = np.hypot(own.error, measured.error)[near]
-        known = np.isfinite(difference)
-        pulls = difference[known & (error > 0)] / error[known & (error > 0)]
-        worst = int(np.nanargmax(np.abs(difference)))
-        found = replace(
-            score,
-            rms=100 * _rms(difference[known]),
-            rms_error=100 * _rms(error[known]),
-            largest=100 * float(difference[worst]),
-            largest_at_ns=float((worst + near.start - BEFORE) * dt_ns),
-            mean_abs_z=float(np.abs(pulls).mean()) if pulls.size else np.nan,
-            rms_z=_rms(pulls) if pulls.size else np.nan,
-        )
-        scores.append(found)
-    return scores
-
-
-def _rms(values: Values) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return Slices(MeanPulse.of(aligned), found, edges)
