@@ -17,7 +17,12 @@ from torch import nn
 from cpunet.errors import CpunetError
 from cpunet.training import loop
 from cpunet.training.cyclegan import Step
-from cpunet.training.loop import EpochSampler, judges_noted, refresh_batch_statistics, train
+from cpunet.training.loop import (
+    EpochSampler,
+    discriminators_noted,
+    refresh_batch_statistics,
+    train,
+)
 from synthetic import LOSS_NAMES, interrupted_in
 
 
@@ -154,18 +159,20 @@ def records(*of_data: float) -> list:
     ("early", "late", "told"), [(0.7, 0.99, "won"), (0.7, 0.4, "lost"), (0.99, 0.7, None)]
 )
 def test_what_counts_is_the_end(early, late, told):
-    lines = judges_noted(records(*[early] * 300, *[late] * 100))
+    lines = discriminators_noted(records(*[early] * 300, *[late] * 100))
     if told is None:
         assert lines == []
     else:
         (line,) = lines
-        assert line.startswith(f"the judge of data has {told}: it is right {100 * late:.0f} %")
+        assert line.startswith(
+            f"the discriminator of data has {told}: it is right {100 * late:.0f} %"
+        )
         assert "\n" not in line
 
 
 def test_few_updates_tell_nothing():
-    assert judges_noted(records(*[1.0] * 10)) == []
-    assert judges_noted([{"iteration": 0, "rate": 1.0, "losses": {}}]) == []
+    assert discriminators_noted(records(*[1.0] * 10)) == []
+    assert discriminators_noted([{"iteration": 0, "rate": 1.0, "losses": {}}]) == []
 
 
 def numbered(n: int, samples: int = 3) -> torch.Tensor:

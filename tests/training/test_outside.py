@@ -1,4 +1,4 @@
-"""Noise outside the generators: what judges see is what a preparation of noisy traces gives."""
+"""Noise outside the generators: discriminators see what a preparation of traces gives."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_gradients_of_a_view_are_finite_differences(held, moved):
     direction = torch.randn(16, 1, 800, generator=torch.Generator().manual_seed(0))
     recipe = load_recipe("paper", TINY)  # whose discriminators scale a pulse to 0…1
     torch.manual_seed(0)
-    judge = CycleGan(recipe).double().eval().discriminator_data
+    discriminator = CycleGan(recipe).double().eval().discriminator_data
 
     def views() -> Values:
         early = numbers["shift"]
@@ -132,7 +132,7 @@ def test_gradients_of_a_view_are_finite_differences(held, moved):
         tail = seen[..., -CONFIG.decay_fit_samples :].mean()
         return {
             "windows": (seen * direction).sum(),
-            "judged": judge(seen).mean(),
+            "judged": discriminator(seen).mean(),
             "tail": tail,
             "half": time.mean(),
         }

@@ -79,11 +79,11 @@ def test_the_adversarial_loss_alone_reaches_every_generator_parameter(tiny, batc
 
 def test_every_discriminator_parameter_learns(tiny, batches):
     step = make_step(tiny())
-    judges = nn.ModuleList(step.model.judges().values())
-    before = parameters(judges)
+    discriminators = nn.ModuleList(step.model.discriminators().values())
+    before = parameters(discriminators)
     step(0, *batches)
-    assert all(p.grad.any() for p in judges.parameters())
-    assert all(changed(before, judges))
+    assert all(p.grad.any() for p in discriminators.parameters())
+    assert all(changed(before, discriminators))
 
 
 def test_discriminators_change_at_their_interval_only(tiny, batches):
@@ -91,13 +91,15 @@ def test_discriminators_change_at_their_interval_only(tiny, batches):
     model = step.model
     for iteration in range(7):
         generators = parameters(model.ren) + parameters(model.iren)
-        judges = model.judges().values()
-        before = copy.deepcopy([judge.state_dict() for judge in judges])
+        discriminators = model.discriminators().values()
+        before = copy.deepcopy([discriminator.state_dict() for discriminator in discriminators])
         losses = step(iteration, *batches)
         assert all(changed(generators, nn.ModuleList([model.ren, model.iren])))
-        for judge, old in zip(judges, before, strict=True):
-            # running statistics too: a generator's step leaves no trace in its judge
-            same = all(torch.equal(old[name], v) for name, v in judge.state_dict().items())
+        for discriminator, old in zip(discriminators, before, strict=True):
+            # running statistics too: a generator's step leaves no trace in its discriminator
+            same = all(
+                torch.equal(old[name], v) for name, v in discriminator.state_dict().items()
+            )
             assert same == (iteration % 3 != 0)
         assert set(losses) == set(GENERATOR_LOSSES if iteration % 3 else LOSS_NAMES)
 
@@ -106,9 +108,9 @@ def test_while_judging_only_the_norm_is_in_evaluation(tiny, batches):
     # cuDNN's GRU has a backward pass in training mode only
     step = make_step(tiny("training.discriminator_interval=2"))
     modes: list[tuple[bool, bool]] = []
-    judge = step.model.discriminator_data
-    judge.norm.register_forward_hook(
-        lambda *_: modes.append((judge.gru.training, judge.norm.training))
+    discriminator = step.model.discriminator_data
+    discriminator.norm.register_forward_hook(
+        lambda *_: modes.append((discriminator.gru.training, discriminator.norm.training))
     )
     step(0, *batches)
     step(1, *batches)
@@ -149,9 +151,9 @@ def test_all_losses_of_a_step_by_hand(tiny, batches):
     }
     sides = {"data": ("ren", data, fake_data), "sim": ("iren", sim, fake_sim)}
     for side, (generator, real, fake) in sides.items():
-        judge = getattr(model, f"discriminator_{side}")
-        expected[f"adversarial_{generator}"] = cross_entropy(judge.eval()(fake), 1)
-        logits = judge.train()(torch.cat([real, fake]))
+        discriminator = getattr(model, f"discriminator_{side}")
+        expected[f"adversarial_{generator}"] = cross_entropy(discriminator.eval()(fake), 1)
+        logits = discriminator.train()(torch.cat([real, fake]))
         expected[f"discriminator_{side}"] = cross_entropy(logits[:4], 1) + cross_entropy(
             logits[4:], 0
         )

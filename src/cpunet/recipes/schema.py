@@ -339,8 +339,8 @@ class Recipe(Config):
             If the recipe does not train a CycleGAN.
         """
         match self.generator, self.discriminator, self.training:
-            case PunetConfig() as generator, GruConfig() as judge, TrainingConfig() as training:
-                return CycleGanSettings(generator, judge, training)
+            case PunetConfig() as generator, GruConfig() as other, TrainingConfig() as training:
+                return CycleGanSettings(generator, other, training)
         raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
 
     @property

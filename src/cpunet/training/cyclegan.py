@@ -148,7 +148,7 @@ class CycleGan(nn.Module):
         """Parameters of REN and IREN."""
         return [*self.ren.parameters(), *self.iren.parameters()]
 
-    def judges(self) -> dict[str, GruDiscriminator]:
+    def discriminators(self) -> dict[str, GruDiscriminator]:
         """The discriminators by side."""
         return {"data": self.discriminator_data, "sim": self.discriminator_sim}
 
@@ -245,8 +245,8 @@ class Step:
         rate = config.rate_discriminators
         self.generators = adamw(model.generator_parameters(), config.rate_generators)
         self.discriminators = {
-            side: adamw(list(judge.parameters()), rate)
-            for side, judge in model.judges().items()
+            side: adamw(list(network.parameters()), rate)
+            for side, network in model.discriminators().items()
         }
         self.optimisers = [self.generators, *self.discriminators.values()]
         # of the discriminators, too, the rates follow the iterations, not their own updates
@@ -260,20 +260,20 @@ class Step:
         With noise outside the generators, `rows` are the indices of the simulated pulses.
         """
         model, limit = self.model, self.config.max_grad_norm
-        for judge in model.judges().values():  # they are fixed here
-            judge.requires_grad_(False)
-            judge.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
+        for network in model.discriminators().values():  # they are fixed here
+            network.requires_grad_(False)
+            network.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
         losses, fakes = self.generator_losses(sim, data, rows)
         self.generators.zero_grad(set_to_none=True)
         self.total(losses).backward()  # type: ignore[no-untyped-call]
         clip_grad_norm_(model.generator_parameters(), limit)
         self.generators.step()
-        for judge in model.judges().values():
-            judge.requires_grad_(True).train()
+        for network in model.discriminators().values():
+            network.requires_grad_(True).train()
         self.accuracy = {}
         if iteration % self.config.discriminator_interval == 0:
             for side, real in (("data", data), ("sim", sim)):
-                losses[f"discriminator_{side}"] = self._judge(side, real, fakes[side].detach())
+                losses[f"discriminator_{side}"] = self._update(side, real, fakes[side].detach())
         for schedule in self.schedules:
             schedule.step()
         return {name: loss.detach() for name, loss in losses.items()}
@@ -318,9 +318,9 @@ class Step:
             + c.adversarial_weight * (losses["adversarial_ren"] + losses["adversarial_iren"])
         )
 
-    def _judge(self, side: str, real: Tensor, fake: Tensor) -> Tensor:
+    def _update(self, side: str, real: Tensor, fake: Tensor) -> Tensor:
         """Update the discriminator of a side; return its loss."""
-        network, optimiser = self.model.judges()[side], self.discriminators[side]
+        network, optimiser = self.model.discriminators()[side], self.discriminators[side]
         # in one batch: the batch norm must see both kinds together
         logits = network(torch.cat([real, fake]))  # (2 batch,)
         of_real, of_fake = logits[: len(real)], logits[len(real) :]

@@ -166,7 +166,7 @@ def refresh_batch_statistics(network: nn.Module, sampler: EpochSampler, batches:
         layer.p = fraction
 
 
-def judges_noted(records: Sequence[Record]) -> list[str]:
+def discriminators_noted(records: Sequence[Record]) -> list[str]:
     """One line for each discriminator that has won or lost in the last part of a training."""
     told = [a for record in records if isinstance(a := record.get("accuracy"), dict)]
     last = told[-max(1, round(LAST * len(told))) :]
@@ -177,14 +177,14 @@ def judges_noted(records: Sequence[Record]) -> list[str]:
         mean = float(np.mean([accuracy[side] for accuracy in last]))
         if mean > WON:
             lines.append(
-                f"the judge of {side} has won: it is right {100 * mean:.0f} % of the time, so "
-                "translations are still easily distinguished; train longer or lower "
+                f"the discriminator of {side} has won: it is right {100 * mean:.0f} % of the "
+                "time, so translations are still easily distinguished; train longer or lower "
                 "training.rate_discriminators"
             )
         elif mean < LOST:
             lines.append(
-                f"the judge of {side} has lost: it is right {100 * mean:.0f} % of the time, so "
-                "it finds nothing to teach; see the scores whether there is nothing left"
+                f"the discriminator of {side} has lost: it is right {100 * mean:.0f} % of the "
+                "time, so it finds nothing to teach; the scores tell whether anything is left"
             )
     return lines
 

@@ -47,7 +47,7 @@ from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import flat
 from cpunet.training.cyclegan import CycleGan, Outside
-from cpunet.training.loop import Record, State, judges_noted, train
+from cpunet.training.loop import Record, State, discriminators_noted, train
 from cpunet.training.run import LOSSES, RUN, FitInfo, Run, read_losses
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def train_networks(job: TrainingJob) -> Run:
             start=state,
         )
     run.finish()
-    for line in judges_noted(read_losses(job.folder)):
+    for line in discriminators_noted(read_losses(job.folder)):
         log.warning(line)
     resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
     more: dict[str, Any] = resumed | ({} if fit is None else {"fit": fit})
