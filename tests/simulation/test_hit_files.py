@@ -302,7 +302,7 @@ def test_geant4_csv_needs_units(reference_data: Path) -> None:
     path = reference_data / "geant4" / "single-invcoax-th228-geant4.csv"
     with pytest.raises(CpunetError, match="column X names no unit; give `units`, one of mm"):
         read_hits(path)
-    hits = read_hits(path, HitOptions(units="mm,keV"))
+    hits = read_hits(path, HitOptions(units="keV, mm"))
     assert (hits.n_events, len(hits.edep_kev)) == (124, 1411)
     assert hits.event_number[0] == 2
     assert 2500 < hits.energy_kev.max() < 2615

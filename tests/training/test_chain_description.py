@@ -289,7 +289,7 @@ def test_a_network_has_no_closed_form(tmp_path):
     write_run(tmp_path, nn.Linear(1, 1), load_recipe("paper"), FACTS)
     one_line(
         lambda: response(tmp_path),
-        f"{tmp_path}: recipe paper trains a punet",
+        f"{tmp_path}: recipe paper trains a network",
         "cpunet validate",
     )
 

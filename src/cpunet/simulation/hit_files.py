@@ -52,7 +52,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
     Parameters
     ----------
     path
-        Path of the file. A step takes some 200 bytes of memory.
+        Path of the file. A step takes some 240 bytes of memory.
     options
         How it is read; `hits_detector` is the name of the table, or the number or name in the
         column that tells detectors apart (``det_uid``, ``volID``, ``detector``…). An unknown

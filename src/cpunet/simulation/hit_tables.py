@@ -219,7 +219,7 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
         If the unit is unknown, or nobody tells it.
     """
     known = {"edep": _KEV, "time": _NS}.get(role, _MM)
-    given = [unit for unit in (*options.units.split(","), "ns") if unit in known]
+    given = [unit for unit in (*re.split(r"[\s,]+", options.units), "ns") if unit in known]
     if not (unit := named or next(iter(given), "")):
         raise CpunetError(f"{where} names no unit; give `units`, one of {', '.join(known)}")
     if unit not in known:

@@ -81,7 +81,7 @@ def describe_chain(run: Run) -> DescribedChain:
     recipe, fit = run.recipe, run.fit or FitInfo()
     if not isinstance(recipe.generator, ResponseConfig):
         raise CpunetError(
-            f"{run.name}: recipe {recipe.name} trains a {recipe.generator.name}, which has no "
+            f"{run.name}: recipe {recipe.name} trains a network (or imports one), which has no "
             "response in closed form; give a run of the recipe fast, or score this one with "
             "`cpunet validate`"
         )

@@ -57,31 +57,30 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
         }
         drawn["A over E survival"] = partial(roc_figure, ae, DEP)
     fullest = max(found.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values()))
-    drawn |= _of_networks(fullest, found.run.iren)
+    if any(name.startswith(f"{IREN.part}.") for name in found.run.weights):
+        drawn |= _cycles(fullest, found.run.iren)
+    for module in fullest.translations.ren.backend.network.modules():
+        if isinstance(module, DriftUNet):
+            effect = module.effect(torch.from_numpy(fullest.windows("raw")[:IN_DRIFT]))
+            drawn["clock and blur of the U-Net"] = partial(drift_figure, *map(np.array, effect))
     if found.run.records:
         drawn["losses"] = partial(loss_curves, found.run.records)
     return drawn
 
 
-def _of_networks(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
-    """Cycles of both networks, and what a U-Net before a readout does."""
+def _cycles(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
+    """Pulses of both sides through both networks and back."""
     ren = peak.translations.ren
     drawn: dict[str, Drawing] = {}
-    simulated = peak.windows("raw")
-    for there, back, start, names in (
-        (ren, iren, simulated, ("Simulation", "REN", "IREN of REN")),
-        (iren, ren, peak.windows("data"), ("Data", "IREN", "REN of IREN")),
+    for there, back, side, names in (
+        (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
+        (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
     ):
-        middle = there.apply(start[:SHOWN], noise=False)
-        stages = start[:SHOWN], middle, back.apply(middle, noise=False)
-        drawn[f"{peak.name} cycle of {names[0].lower()}"] = partial(
-            cycle_figure, dict(zip(names, stages, strict=True)), ren.dt_ns
-        )
-    drift = getattr(getattr(ren.backend.network, "response", None), "drift", None)
-    if isinstance(drift, DriftUNet):
-        effect = drift.effect(torch.from_numpy(simulated[:IN_DRIFT]))
-        of_pulses = (values.numpy() for values in effect)
-        drawn["clock and blur of the U-Net"] = partial(drift_figure, *of_pulses)
+        start = peak.windows(side)[:SHOWN]
+        middle = there.apply(start, noise=False)
+        stages = zip(names, (start, middle, back.apply(middle, noise=False)), strict=True)
+        draw = partial(cycle_figure, dict(stages), ren.dt_ns)
+        drawn[f"{peak.name} cycle of {names[0].lower()}"] = draw
     return drawn
 
 
