@@ -61,8 +61,9 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
         drawn |= _cycles(fullest, found.run.iren)
     for module in fullest.translations.ren.backend.network.modules():
         if isinstance(module, DriftUNet):
-            effect = module.effect(torch.from_numpy(fullest.windows("raw")[:IN_DRIFT]))
-            drawn["clock and blur of the U-Net"] = partial(drift_figure, *map(np.array, effect))
+            pulses = torch.from_numpy(fullest.windows("raw")[:IN_DRIFT])
+            effect = map(torch.Tensor.numpy, module.effect(pulses))
+            drawn["clock and blur of the U-Net"] = partial(drift_figure, *effect)
     if found.run.records:
         drawn["losses"] = partial(loss_curves, found.run.records)
     return drawn
