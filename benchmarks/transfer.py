@@ -67,14 +67,8 @@ def main() -> None:
             run = folder / title.replace(" ", "_").replace(",", "")
             recipe = load_recipe("fast")
             made = train(sim, measured, run, recipe=recipe, init=start, device="cpu")
-            scored = evaluate(
-                made,
-                sim,
-                data,
-                truth=arguments.stand / "truth.npz",
-                baselines=False,
-                device="cpu",
-            )
+            truth = arguments.stand / "truth.npz"
+            scored = evaluate(made, sim, data, truth=truth, baselines=False)
             rows[title] = (made.seconds, scored.metrics)
     show(rows)
 

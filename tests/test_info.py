@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from torch import nn
 
-from cpunet import CpunetError, FileOptions, HitOptions, PulseFile, info, load
+from cpunet import CpunetError, FileOptions, PulseFile, info, load
 from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -131,7 +131,7 @@ def test_files_of_hits_are_described(tmp_path):
     path = tmp_path / "hits.npz"
     place = {"x_mm": [3.0, 0.0, 1.0], "y_mm": [4.0, 0.0, 1.0], "z_mm": [10.0, 20.0, 30.0]}
     np.savez(path, **place, edep_keV=[2000.0, 614.5, 50.0], offsets=np.array([0, 2, 3]))
-    told = dict(describe_hits(path, HitOptions(), RECIPE.peaks)[""])
+    told = dict(describe_hits(path, RECIPE.peaks)[""])
     assert told["hits"] == "3 of 2 events"
     assert told["energy"] == "50 … 2614.5 keV an event"
     assert told["lines"] == "1 FEP"
@@ -142,8 +142,7 @@ def test_files_of_hits_are_described(tmp_path):
     )
     assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
     assert "names no unit" in str(info(csv))
-    units = HitOptions(units="cm,keV")
-    assert "x 30 … 30" in str(info(csv, frame=units))
+    assert "x 30 … 30" in str(info(csv, units="cm,keV"))
 
 
 def test_the_properties_are_those_that_were_made():
@@ -188,23 +187,6 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(np.tile(np.arange(300.0), (3, 1)), dt_ns=16), attrs=attrs)
     return path
-
-
-def test_hits_are_compared_with_a_crystal(reference_data: Path, tmp_path):
-    """Hits of a crystal without the taper, and the same where it stands turned over."""
-    path = reference_data / "geant4" / "g4_h20mm.npz"
-    crystal = read_detector("icpc")
-    right = dict(describe_hits(path, HitOptions(), RECIPE.peaks, crystal)[""])["outside"]
-    assert float(right.split()[0]) == pytest.approx(10.5, abs=0.3)
-    with np.load(path) as file:
-        arrays = {name: file[name] for name in ("x_mm", "edep_keV", "offsets")}
-        arrays |= {"y_mm": -file["y_mm"] - 10, "z_mm": 200 - file["z_mm"]}
-    np.savez(tmp_path / "moved.npz", **arrays)
-    moved = info(tmp_path / "moved.npz", detector=crystal)
-    assert "100.00 % of the hits; check `origin`, `flip_z`" in str(moved)
-    given = HitOptions(origin=(0, -10, 200), flip_z=True)
-    told = describe_hits(tmp_path / "moved.npz", given, RECIPE.peaks, crystal)[""]
-    assert dict(told)["outside"] == right
 
 
 def test_traces_that_are_no_numbers(tmp_path):
@@ -265,12 +247,6 @@ def test_the_command_line(tmp_path, capsys):
     assert "bias               2600 V" in told(
         "ppc", "--set", "grid_mm=0.5", "--set=bias_V=2600"
     )
-    hits = tmp_path / "hits.npz"
-    place = {"x_mm": [100.0, 101.0], "y_mm": [100.0, 101.0], "z_mm": [-20.0, -21.0]}
-    np.savez(hits, **place, edep_keV=[100.0, 200.0], offsets=np.array([0, 2]))
-    assert "100.00 % of the hits; check --origin, --flip-z" in told(hits, "--detector", "icpc")
-    words = ("--origin", 100, 100, "-1.5", "--flip-z")
-    assert "outside  0.00 %" in told(hits, "--detector", "icpc", *words)
     table = tmp_path / "channels.h5"
     with h5py.File(table, "w") as made:
         for name in ("ch3", "ch7"):

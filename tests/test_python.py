@@ -245,7 +245,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert run.ren.translate(sim.waveforms[:2], noise=False).shape == (2, 800)
     assert run.iren.translate(data.waveforms[:2]).shape == (2, 800)
 
-    report = run.validate(sim, data, baselines=False, device="cpu")
+    report = run.validate(sim, data, baselines=False)
     assert report.folder is None
     assert report.scores.loc["FEP", "drift_time", "ren"].iou > 0
     assert report["FEP"].loc["drift_time", "ren"].ceiling > 0

@@ -17,7 +17,7 @@ QUICK_LOOK = (
 
 
 def demo(
-    out: str | Path = "demo", *, quick: bool = False, seed: int = 0, force: bool = False
+    out: str | Path = "demo", *, quick: bool = False, force: bool = False
 ) -> cpunet.Report:
     """Simulate, digitise, train, translate and validate on a stand with a known answer.
 
@@ -27,8 +27,6 @@ def demo(
         Folder of stand, run and report.
     quick
         Few events, the scores and three figures.
-    seed
-        Seed of all random numbers.
     force
         Replace an existing demonstration.
 
@@ -47,10 +45,10 @@ def demo(
     for part in parts:
         refuse_existing(part, force=force)
     in_stand, in_run, in_report = parts
-    stand = cpunet.make_stand(in_stand, events=FEW if quick else EVENTS, seed=seed, force=force)
-    run = cpunet.train(stand.sim, stand.data, in_run, seed=seed, force=force)
+    stand = cpunet.make_stand(in_stand, events=FEW if quick else EVENTS, force=force)
+    run = cpunet.train(stand.sim, stand.data, in_run, force=force)
     assert isinstance(run, cpunet.Run)  # the stand has one channel
-    report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth, seed=seed)
+    report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth)
     assert isinstance(report, cpunet.Report)
     if quick:
         drawn = {name: draw for name, draw in (report.drawn or {}).items() if name in GLANCE}

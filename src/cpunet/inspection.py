@@ -16,7 +16,6 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.settings import Set, key_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import holds_detector, read_detector
-from cpunet.simulation.hits import HitOptions
 from cpunet.tables import Lines, aligned, text_table
 
 if TYPE_CHECKING:
@@ -86,8 +85,7 @@ def info(
     path: str | Path,
     *,
     read: FileOptions = FileOptions(),
-    detector: str | Path | Detector | None = None,
-    frame: HitOptions = HitOptions(),
+    units: str = "",
     settings: Set = (),
     out: str | Path | None = None,
     force: bool = False,
@@ -106,10 +104,8 @@ def info(
         or LEGEND metadata), or the folder of a run, stand or report.
     read
         How a file of pulses is read.
-    detector
-        Crystal of hits (icpc, bege, ppc or a file): how many lie outside.
-    frame
-        How a file of hits is read.
+    units
+        Units of lengths and energies that a file of hits does not name, as ``cm,keV``.
     settings
         Override a value of the detector looked at: bias_V=3500 (repeatable).
     out
@@ -128,12 +124,11 @@ def info(
 
     cpunet info icpc --set bias_V=3500 --out icpc.png
 
-    cpunet info hits.npz --detector icpc
+    cpunet info hits.csv --units mm,keV
     """
     if out is not None:
-        given = None if isinstance(detector, Detector) else detector
-        refuse_picture(Path(out), path, read.energy, given, force=force)
-    found = _look(path, read, detector, frame, key_values(settings))
+        refuse_picture(Path(out), path, read.energy, force=force)
+    found = _look(path, read, units, key_values(settings))
     if out is not None:
         found.save(out, force)
     return found
@@ -174,11 +169,7 @@ def load(path: str | Path) -> Loaded:
 
 
 def _look(
-    path: str | Path,
-    read: FileOptions,
-    crystal: str | Path | Detector | None,
-    frame: HitOptions,
-    settings: Mapping[str, Any],
+    path: str | Path, read: FileOptions, units: str, settings: Mapping[str, Any]
 ) -> InfoResult:
     if holds_detector(path):
         return _detector(read_detector(path, settings), str(path))
@@ -191,8 +182,7 @@ def _look(
 
     recipe = load_recipe("fast")
     if holds_hits(path):
-        inside = None if crystal is None else read_detector(crystal)
-        hits = describe_hits(Path(path), frame, recipe.peaks, inside)
+        hits = describe_hits(Path(path), recipe.peaks, units)
         lines = [("file", str(path))]
         for name, one in hits.items():
             lines += [("detector", name), *one]

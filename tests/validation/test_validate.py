@@ -74,7 +74,7 @@ def run(files, tmp_path_factory) -> Run:
 
 
 def evaluated(run: Run, sim: PulseFile, data: PulseFile) -> Evaluation:
-    return evaluate(run, sim, data, baselines=False, device="cpu")
+    return evaluate(run, sim, data, baselines=False)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def whole(run, files) -> Evaluation:
 
 @pytest.mark.thorough
 def test_a_sample_of_both_sides_is_compared(run, files) -> None:
-    how = {"baselines": False, "device": "cpu", "max_pulses": 250}
+    how = {"baselines": False, "max_pulses": 250}
     few = evaluate(run, files["sim"], files["data"], **how)
     assert len(few.sets[0].translations.windows["raw"]) == 250
     assert few.metrics["rejections"]["sim"]["not_drawn"] == 130
@@ -130,7 +130,7 @@ def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("cpunet.validation.drawings.drawings", lambda found: {})  # above
     sides = files["sim"], files["no DEP"]
-    report = validate(run, *sides, tmp_path / "report", baselines=False, device="cpu")
+    report = validate(run, *sides, tmp_path / "report", baselines=False)
     metrics = report.metrics
     assert f"DEP: not scored, {metrics['peaks']['DEP']['missing']}" in str(report)
     assert metrics["peaks"]["DEP"]["missing"].startswith("no measured pulses")
@@ -153,7 +153,7 @@ def found(run, files, tmp_path_factory):
     path = tmp_path_factory.mktemp("truth") / "truth.npz"
     n = files["sim"].open().n_pulses
     np.savez(path, response=records(n, np.random.default_rng(1), 4000.0).astype(np.float32))
-    return evaluate(run, files["sim"], files["data"], truth=path, device="cpu")
+    return evaluate(run, files["sim"], files["data"], truth=path)
 
 
 @pytest.mark.thorough
@@ -206,7 +206,7 @@ def test_a_run_of_ren_alone_is_drawn_without_cycles(whole) -> None:
 def report(run, files, tmp_path_factory, all_undrawn) -> cpunet.Report:
     out = tmp_path_factory.mktemp("report") / "report"
     sides = str(files["sim"].path), files["data"]
-    return run.validate(*sides, out, baselines=False, device="cpu")
+    return run.validate(*sides, out, baselines=False)
 
 
 def test_a_report(report):
@@ -249,7 +249,7 @@ def test_a_report_again(report, tmp_path):
 
 def test_nothing_is_written_before_it_is_saved(run, files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    made = validate(run, files["sim"], files["data"], baselines=False, device="cpu")
+    made = validate(run, files["sim"], files["data"], baselines=False)
     assert made.folder is None
     assert not list(tmp_path.iterdir())
     few = dataclasses.replace(made, drawn={})

@@ -173,7 +173,11 @@ def whole_chain() -> dict[str, Any]:
     }
     config["periods"]["p04"] = {"data": "raw*/*.lh5"}
     config["detectors"]["B02"]["periods"] = ["p03"]
-    config["library"] = {"grid_mm": 2, "make": ["--angles=0"], "translate": ["--rings=0"]}
+    config["library"] = {
+        "grid_mm": 2,
+        "make": ["--set=dt_ns=2"],
+        "translate": ["--detector=V01"],
+    }
     config["events"] = {"hits": "stp/*.lh5", "translate": ["--length=2000"], "tau_us": 400}
     del config["train"]["set"]
     return config
@@ -203,10 +207,10 @@ def test_a_dry_run_of_libraries_and_events(place):
         "cpunet simulate --detector=icpc --hits stp/two.lh5 --hits-detector det001 --out "
         f"{made}" in told
     )
-    assert "--adc --length=2000 --out-table V01/raw --seed 1 --device cpu" in told
+    assert "--adc --length=2000 --out-table V01/raw --seed 1 --out" in told
     assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in told
-    assert "library make --detector=icpc --grid-mm 2 --angles=0 --out" in told
-    assert "'all results/V01/library/ideal.lh5' --rings=0 --out" in told
+    assert "library make --detector=icpc --grid-mm 2 --set=dt_ns=2 --out" in told
+    assert "'all results/V01/library/ideal.lh5' --detector=V01 --out" in told
 
 
 @pytest.mark.thorough
@@ -556,7 +560,7 @@ def configuration(metadata: Path) -> dict[str, Any]:
             for name in DETECTORS
         },
         "calibrate": {"free": "temperature", "events": 300},
-        "library": {"grid_mm": 8, "make": ["--angles=0,45"]},
+        "library": {"grid_mm": 8},
         "events": {"hits": "stp/*.lh5"},
         "validate": {"baselines": False},
     }

@@ -160,7 +160,10 @@ wildcard_constraints:
 
 
 # numba takes all cores of a node unless told
-shell.prefix('set -euo pipefail; export NUMBA_NUM_THREADS="$OMP_NUM_THREADS"; ')
+environment = 'set -euo pipefail; export NUMBA_NUM_THREADS="$OMP_NUM_THREADS"; '
+if config["device"] == "cpu":  # for commands that take a GPU if there is one
+    environment += "export CUDA_VISIBLE_DEVICES=; "
+shell.prefix(environment)
 
 
 def a_file(name):

@@ -52,10 +52,9 @@ rule event_raw:
     params:
         seed=event_seed,
         words=words_of("events", "translate"),
-        device=config["device"],
     shell:
         "cpunet translate {input.run:q} {input.pulses:q} --adc {params.words}"
-        " --out-table {wildcards.detector}/raw --seed {params.seed} --device {params.device}"
+        " --out-table {wildcards.detector}/raw --seed {params.seed}"
         " --out {output:q} --force > {log:q} 2>&1"
 
 

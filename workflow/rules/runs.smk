@@ -100,7 +100,6 @@ rule translate:
         options=lambda w: options(
             # noise of its own in each file
             seed=config["train"]["seed"] + list(SIMULATIONS[w.detector]).index(w.part),
-            device=config["device"],
         ),
         reading=translation_reading,
     shell:
@@ -126,7 +125,7 @@ rule validate:
         runtime=60,
     params:
         reading=reading,
-        options=options(seed=config["train"]["seed"], device=config["device"]),
+        options=options(seed=config["train"]["seed"]),
         baselines="--baselines" if config["validate"]["baselines"] else "--no-baselines",
     shell:
         "cpunet validate {input.run:q} --sim {input.sim:q} --data {input.data:q}"

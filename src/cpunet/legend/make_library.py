@@ -6,7 +6,7 @@ A library holds the charge pulse of every place in a detector.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,7 +64,6 @@ def make_library(
     out: str | Path,
     *,
     grid_mm: float = 1.0,
-    angles: str | Sequence[int] = ANGLES_DEG,
     settings: Set = (),
     force: bool = False,
 ) -> MadeLibrary:
@@ -85,8 +84,6 @@ def make_library(
         LH5 file to write.
     grid_mm
         Spacing of the places in r and z.
-    angles
-        Azimuths from <100> in degrees, as 0,45.
     settings
         Override a value of the detector or the simulation, bias_V=3500, or all those in a YAML
         file (repeatable); templates have dt_ns=1 and length_ns=5000 without.
@@ -117,38 +114,25 @@ def make_library(
     of_detector, wanted = split_overrides(settings, dt_ns=DT_NS, length_ns=LENGTH_NS)
     if not isinstance(detector, Detector):
         detector = read_detector(detector, of_detector)
-    angles_deg = _degrees(angles)
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
     with stage(f"Fields of {detector.name or 'the detector'}"):
         fields = compute_fields(detector)
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
     counts = MadeLibrary(out)
-    total = len(angles_deg) * len(r_mm) * len(z_mm)
+    total = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
     with written_hdf5(out) as (made, _), stage("Templates", total) as bar:
         library = made.create_group(detector.name or "detector")
         put_column(library, "r", r_mm, "mm")
         put_column(library, "z", z_mm, "mm")
         put_column(library, "dt", wanted.dt_ns, "ns")
         put_column(library, "t0", 0.0, "ns")
-        for angle in angles_deg:
+        for angle in ANGLES_DEG:
             _fill(library, angle, fields, wanted, counts, bar)
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
         if not counts.written:
             raise CpunetError(f"{counts}; give a finer grid or longer records")
     return counts
-
-
-def _degrees(angles: str | Sequence[int]) -> tuple[int, ...]:
-    words = angles.split(",") if isinstance(angles, str) else angles
-    try:
-        degrees = tuple(int(word) for word in words)
-    except ValueError:
-        raise CpunetError(f"`angles` {angles}: give whole degrees, as 0,45") from None
-    wrong = [angle for angle in degrees if not 0 <= angle < 360]
-    if wrong or not degrees or len(set(degrees)) < len(degrees):
-        raise CpunetError(f"`angles` {angles}: give different ones from 0 to 359 degrees")
-    return degrees
 
 
 def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:

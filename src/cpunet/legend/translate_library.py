@@ -160,7 +160,6 @@ def translate_library(
     out: str | Path,
     *,
     detector: Sequence[str] = (),
-    rings: int = RINGS,
     force: bool = False,
 ) -> TranslatedLibrary:
     """Translate every template of a library without noise, to currents for LEGEND's production.
@@ -187,8 +186,6 @@ def translate_library(
     detector
         Library of the file to translate (repeatable); by default that of the detector that
         the run was trained with, or all if it is unknown.
-    rings
-        Rings of nodes beyond the crystal; 3 as production.
     force
         Replace an existing file.
 
@@ -207,8 +204,6 @@ def translate_library(
     --------
     cpunet library translate run psl.lh5 --out psl_ren.lh5
     """
-    if not 0 <= rings <= 100:
-        raise CpunetError(f"`rings` {rings}: give 0 to 100 rings of padding")
     run, source, out = as_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
     translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
@@ -220,8 +215,8 @@ def translate_library(
         with written_hdf5(out) as (made, _):
             for one in ideal:
                 group = made.require_group(one.path)
-                found = _write(translate, one, given[one.path], group, rings, source)
-                content = {"cpunet": cpunet.__version__, "rings": rings, **made_from}
+                found = _write(translate, one, given[one.path], group, source)
+                content = {"cpunet": cpunet.__version__, "rings": RINGS, **made_from}
                 group.attrs["cpunet"] = json.dumps(content | asdict(found))
                 describe(group)
                 numbers[one.path] = found
@@ -233,16 +228,15 @@ def _write(
     library: IdealLibrary,
     given: h5py.Group,
     group: h5py.Group,
-    rings: int,
     source: Path,
 ) -> LibraryNumbers:
     """Write currents, and drift times within the crystal and beside it."""
     step = np.zeros((1, STEP_LENGTH), np.float32)
     step[:, STEP_SAMPLE:] = 1
     delay_ns = float(currents_about_peak(translate(step))[1][0]) - STEP_SAMPLE
-    r_mm = padded_axis(library.r_mm, 0, rings)  # none at negative radii
-    z_mm = padded_axis(library.z_mm, rings, rings)
-    shape, inner = (len(r_mm), len(z_mm)), np.s_[: len(library.r_mm), rings : len(z_mm) - rings]
+    r_mm = padded_axis(library.r_mm, 0, RINGS)  # none at negative radii
+    z_mm = padded_axis(library.z_mm, RINGS, RINGS)
+    shape, inner = (len(r_mm), len(z_mm)), np.s_[: len(library.r_mm), RINGS : len(z_mm) - RINGS]
     currents, times = dict[str, Floats](), dict[str, Values]()
     not_ending = 0
     with stage(f"Translating {library.path}", library.n_templates) as bar:
@@ -274,8 +268,8 @@ def _write(
         values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
         drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
         currents[angle] /= np.float32(mode)
-        values[...] = with_rings(currents.pop(angle), rings)
-        drift_times[...] = filled = continued(times[angle], rings)
+        values[...] = with_rings(currents.pop(angle))
+        drift_times[...] = filled = continued(times[angle])
         padded += int(np.isfinite(filled).sum() - mask.sum())
         healed += int((np.isfinite(filled[inner]) & ~mask & binary_fill_holes(mask)).sum())
     return LibraryNumbers(library.n_templates, translated, padded, healed, mode, delay_ns)

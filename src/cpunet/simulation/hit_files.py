@@ -14,12 +14,12 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_tables import Steps, StepTable, hit_format, step_tables
 from cpunet.simulation.hits import (
     FARTHEST_MM,
     LATE_NS,
     MAX_KEV,
+    WINDOW_US,
     FloatArray,
     HitOptions,
     Hits,
@@ -27,8 +27,6 @@ from cpunet.simulation.hits import (
 )
 from cpunet.tables import Lines, counted, span
 
-# More hits outside the crystal are those of another frame, or of another detector.
-_MISPLACED_PERCENT = 1.0
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
 # the largest deposit of any source is above the first, the median event below the second
@@ -45,7 +43,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
     name (``edep_in_keV``, ``x [mm]``). Times without a unit are in ns.
 
     Events are the deposits of a detector with one event number that follow each other within
-    `time_window_us`, so that the decays of a chain are events of their own. Where numbering
+    10 µs, so that the decays of a chain are events of their own. Where numbering
     starts anew, as in joined jobs, so do events. If a number comes back it is replaced by one
     above the largest.
 
@@ -146,7 +144,7 @@ def _to_hits(path: Path, steps: Steps, options: HitOptions) -> Hits:
             f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
         )
     kept = steps[steps.edep_kev > 0]
-    first = first_of_event(kept.event, kept.time_ns, options.time_window_us)
+    first = first_of_event(kept.event, kept.time_ns)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")
     starts, counts = np.unique(first, return_counts=True)
@@ -167,24 +165,24 @@ def _to_hits(path: Path, steps: Steps, options: HitOptions) -> Hits:
     return replace(hits, n_late=int((spread > LATE_NS).sum()))
 
 
-def first_of_event(number: IntArray, time_ns: FloatArray | None, window_us: float) -> IntArray:
+def first_of_event(number: IntArray, time_ns: FloatArray | None) -> IntArray:
     """Index of the first step of the event of each step.
 
-    Steps of a number are parted where none comes for `window_us` (the decays of a chain are
+    Steps of a number are parted where none comes for `WINDOW_US` (the decays of a chain are
     simulated as one event), and where the numbering starts anew (jobs joined in one file).
 
     Examples
     --------
-    >>> first_of_event(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]), 10)
+    >>> first_of_event(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]))
     array([0, 1, 2])
-    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), None, 10)
+    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), None)
     array([0, 1, 2, 3, 4, 5])
     """
     job = _job_of_step(number)
     order = np.lexsort((job, number) if time_ns is None else (time_ns, job, number))
     new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
     if time_ns is not None:
-        new |= np.diff(time_ns[order]) > 1000 * window_us
+        new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
     starts = np.flatnonzero(np.append(True, new)[: len(number)])
     first = np.empty(len(number), np.int64)
     counts = np.diff(np.append(starts, len(number)))
@@ -230,10 +228,7 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
 
 
 def describe_hits(
-    path: Path,
-    options: HitOptions,
-    peaks: Mapping[str, PeakConfig],
-    crystal: Detector | None = None,
+    path: Path, peaks: Mapping[str, PeakConfig], units: str = ""
 ) -> dict[str, Lines]:
     """Describe the hits of a file, detector by detector.
 
@@ -241,58 +236,42 @@ def describe_hits(
     ----------
     path
         A file for which `holds_hits` is true.
-    options
-        How it is read; all detectors if none is chosen.
     peaks
         Gamma lines whose events are counted.
-    crystal
-        Crystal in which the hits should lie.
+    units
+        Units that the file does not name, as of `HitOptions`.
 
     Returns
     -------
     dict
         Topics and texts by name of the detector (``""`` if the file names none): hits, their
-        energies, gamma lines and extents in the frame of the crystal; or the reason why they
+        energies, gamma lines and extents in the frame of the file; or the reason why they
         cannot be read.
     """
     found: dict[str, Lines] = {}
-    names: list[str | None] = [options.hits_detector]
-    if options.hits_detector is None:
-        with step_tables(path) as tables:
-            names = [name or None for name in _by_detector(tables)]
+    with step_tables(path) as tables:
+        names = list(_by_detector(tables))
     for name in names:
         try:
-            hits = read_hits(path, replace(options, hits_detector=name))
+            hits = read_hits(path, HitOptions(name or None, units=units))
         except CpunetError as error:
-            found[name or ""] = [("hits", str(error).removeprefix(f"{path}: "))]
+            found[name] = [("hits", str(error).removeprefix(f"{path}: "))]
         else:
-            found[name or ""] = _in_words(hits, peaks, crystal)
+            found[name] = _in_words(hits, peaks)
     return found
 
 
-def _in_words(
-    hits: Hits, peaks: Mapping[str, PeakConfig], crystal: Detector | None
-) -> list[tuple[str, str]]:
+def _in_words(hits: Hits, peaks: Mapping[str, PeakConfig]) -> list[tuple[str, str]]:
     energy_kev = hits.energy_kev
     lines = label_peaks(energy_kev, peaks)
     places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
     extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
-    words = [
+    return [
         ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
         ("energy", f"{span(_ends(energy_kev))} keV an event"),
         ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
         ("extents", f"{', '.join(extents)} mm"),
     ]
-    if crystal is not None:
-        percent = 100 * float(np.mean(~crystal.inside(hits.r_mm, hits.z_mm)))
-        size = f"radius {crystal.crystal_radius:g} mm, z 0 to {crystal.crystal_length:g} mm"
-        misplaced = percent > _MISPLACED_PERCENT
-        remedy = "; check `origin`, `flip_z` and the dimensions" if misplaced else ""
-        words += [
-            ("crystal", f"{crystal.name}, {size}"),
-            ("outside", f"{percent:.2f} % of the hits{remedy}"),
-        ]
-    return words
 
 
 def _ends(values: FloatArray) -> list[float]:

@@ -20,7 +20,7 @@ from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hits import LATE_NS, HitOptions, Hits
+from cpunet.simulation.hits import LATE_NS, WINDOW_US, HitOptions, Hits
 
 log = logging.getLogger(__name__)
 
@@ -143,8 +143,8 @@ class HitFile:
         if hits.n_late:
             log.warning(
                 f"{self.path}: {hits.n_late} events have deposits more than {LATE_NS:g} ns "
-                "after their first, simulated as if at once; a shorter `time_window_us` parts "
-                "them"
+                "after their first, simulated as if at once; if these are other events, give "
+                "them numbers of their own"
             )
         if self.windows:
             hits = hits[_in_windows(hits.energy_kev, self.windows)]
@@ -184,7 +184,7 @@ class HitFile:
             "table": self.options.hits_detector,
             "origin_mm": list(self.options.origin),
             "flip_z": self.options.flip_z,
-            "time_window_us": self.options.time_window_us,
+            "time_window_us": WINDOW_US,
             "windows_kev": _by_name(self.windows),
         }
 

@@ -16,6 +16,8 @@ IntArray = npt.NDArray[np.int64]
 # Larger than any laboratory and any event. Compiled loops convert positions into indices and
 # would overflow beyond.
 FARTHEST_MM, MAX_KEV = 1e7, 1e9
+# Deposits of an event number that come later are another event, as in remage.
+WINDOW_US = 10.0
 # Deposits of an event are simulated at once; later ones would change the edge of its pulse.
 LATE_NS = 50.0
 
@@ -34,16 +36,12 @@ class HitOptions:
         The file's point contact is on top.
     units
         Units of lengths and energies that the file does not name, as ``cm,keV``.
-    time_window_us
-        Hits of an event number that come later than this are another event; remage's interval
-        by default.
     """
 
     hits_detector: str | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     flip_z: bool = False
     units: str = ""
-    time_window_us: float = 10.0
 
     def to_crystal(self, position_mm: FloatArray) -> FloatArray:
         """Positions of shape ``(n, 3)`` in mm, from the frame of the file to the crystal's.

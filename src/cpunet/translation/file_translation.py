@@ -93,8 +93,6 @@ class FileTranslation:
         A trained run, or its folder.
     options
         How to translate.
-    device
-        ``"cpu"``, ``"cuda"`` or ``"auto"``.
 
     Raises
     ------
@@ -102,10 +100,10 @@ class FileTranslation:
         If the run cannot be used, or lacks information for output in ADC counts.
     """
 
-    def __init__(self, run: RunLike, options: TranslateOptions, device: str = "auto") -> None:
+    def __init__(self, run: RunLike, options: TranslateOptions) -> None:
         self.run, self.options = as_run(run), options
         self.kind: type[Translator] = IREN if options.inverse else REN
-        self.translator = self.kind.of(self.run, resolve_device(device))
+        self.translator = self.kind.of(self.run, resolve_device("auto"))
         self.form = self._form()
         identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
         self._print = hashlib.sha256(identity.encode()).hexdigest()

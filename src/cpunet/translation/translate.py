@@ -49,7 +49,6 @@ def translate(
     seed: int = 0,
     jobs: int = 1,
     resume: bool = False,
-    device: str = "auto",
     read: FileOptions = FileOptions(),
     force: bool = False,
 ) -> Translation | Outcome[Translation]:
@@ -85,8 +84,6 @@ def translate(
         Processes, each of which translates a file at a time.
     resume
         Keep files that are there already, if made from the same input in the same way.
-    device
-        ``cpu``, ``cuda`` or ``auto``.
     read
         How files are read, if they do not tell themselves.  With ``all`` for the table, each
         table is translated to a file in `out`.
@@ -132,11 +129,11 @@ def translate(
         if several or channels:
             raise CpunetError("several files or tables do not stay in memory; give `out`")
         run = as_run(run)
-        job = FileTranslation(run, options, device)
+        job = FileTranslation(run, options)
         job.warn()
         kept, counts = job.in_memory(files[0])
         return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
-    to_files = _ToFiles(options, device, resume, force)
+    to_files = _ToFiles(options, resume, force)
     if channels:
         if len(files) > 1:
             raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
@@ -167,14 +164,13 @@ class _ToFiles:
     """How to translate files into files; see `cpunet.translate`."""
 
     options: TranslateOptions
-    device: str
     resume: bool
     force: bool
 
     def one(
         self, run: Run, source: PulseFile, out: Path, noise_key: str | None = None
     ) -> Translation:
-        job = FileTranslation(run, self.options, self.device)
+        job = FileTranslation(run, self.options)
         job.warn()
         counts = job(source, out, noise_key=noise_key, resume=self.resume, force=self.force)
         return Translation(run.name, run.recipe, counts, self.options.adc is not None, out)
@@ -217,7 +213,7 @@ class _ToFiles:
         if out.exists() and not out.is_dir():
             raise CpunetError(f"{out}: is a file, but several outputs need a folder")
         self._check(tasks, run.folder)
-        FileTranslation(run, self.options, self.device).warn()  # what is wrong is said once
+        FileTranslation(run, self.options).warn()  # what is wrong is said once
         done: list[Counts] = []
         failed: list[str] = []
         with (
@@ -244,7 +240,7 @@ class _ToFiles:
 
     def work(self, run: Run) -> Callable[[Task], Counts]:
         """Return a function that translates a file after the other."""
-        translation = FileTranslation(run, self.options, self.device)
+        translation = FileTranslation(run, self.options)
         how = {"resume": self.resume, "force": self.force}
         return lambda task: translation(task[0], task[1], noise_key=task[1].name, **how)
 

@@ -77,7 +77,6 @@ def evaluate(
     baselines: bool = True,
     max_pulses: int = MAX_PULSES,
     seed: int = 0,
-    device: str = "auto",
 ) -> Evaluation:
     """Translate, compare and score; see `cpunet.validation.validate.validate`.
 
@@ -86,8 +85,8 @@ def evaluate(
     CpunetError
         If the input cannot be used, or no peak can be scored.
     """
-    device, recipe, trained_on = resolve_device(device), run.recipe, run.peak
-    ren = REN.of(run, device)
+    recipe, trained_on = run.recipe, run.peak
+    ren = REN.of(run, resolve_device("auto"))
     names = list(dict.fromkeys([*recipe.peaks, trained_on]))
     selection = _selected(recipe, names)
     sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)

@@ -34,7 +34,6 @@ def validate(
     baselines: bool = True,
     max_pulses: int = 50_000,
     seed: int = 0,
-    device: str = "auto",
     read: ReadOptions = ReadOptions(),
     force: bool = False,
 ) -> Report | Outcome[Report]:
@@ -61,8 +60,6 @@ def validate(
         Pulses of a side that are compared: of more, a random sample. Some 30 kB each.
     seed
         Seed of noise and bootstraps.
-    device
-        cpu, cuda, or auto: the GPU if there is one.
     read
         How the files are read.
     force
@@ -89,7 +86,7 @@ def validate(
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
     sim, data = pulse_file(sim, read.sim), pulse_file(data, read.data)
     how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses}
-    how |= {"seed": require_seed(seed), "device": device, "truth": truth and Path(truth)}
+    how |= {"seed": require_seed(seed), "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)
     if data.table == ALL:
         return _of_channels(run, (sim, data), folder, how, force)
