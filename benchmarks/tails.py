@@ -165,7 +165,7 @@ def main() -> None:
     tails = PileUpTails.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
     raw = next(iter(source.blocks(4096)))
     console = Console()
-    for name, value in tails.describe().items():
+    for name, value in tails.describe():
         console.print(f"{name}: {value}")
     after, noise = Slopes.of(raw, tails).spreads
     console.print(f"slopes without tails {after:.2f} keV, of empty baselines {noise:.2f} keV")

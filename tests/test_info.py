@@ -12,7 +12,7 @@ import pytest
 from torch import nn
 
 from cpunet import CpunetError, FileOptions, PulseFile, info, load
-from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
+from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.description import trace_properties
@@ -64,8 +64,8 @@ def test_tails_of_a_bench_detector(reference_data: Path):
     file = PulseFile(path, kev_per_adc=calibrated)
     tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
     lines = info(path, read=FileOptions(kev_per_adc=calibrated)).lines
-    assert lines[-2:] == tails_in_words(tails.describe())
-    assert tails.describe()["rate_khz"] == pytest.approx(1.4, abs=0.3)
+    assert lines[-2:] == tails.describe().in_words()
+    assert tails.describe().rate_khz == pytest.approx(1.4, abs=0.3)
     assert len(tails.kev) == 1000
     assert np.nanmean(tails.kev > 10) == pytest.approx(0.3, abs=0.03)
 

@@ -250,7 +250,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert report.scores.loc["FEP", "drift_time", "ren"].iou > 0
     assert report["FEP"].loc["drift_time", "ren"].ceiling > 0
     assert report.plot().axes
-    assert "FEP" in report.to_dict()["peaks"]
+    assert "FEP" in report.metrics["peaks"]
     report.save(tmp_path / "report")
     again = cpunet.load(tmp_path / "report")
     assert again.verdicts == report.verdicts
@@ -273,7 +273,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> cpunet.Report:
 
 @pytest.mark.thorough
 def test_every_method_and_the_truth_stand_beside_the_ren(whole: cpunet.Report) -> None:
-    metrics = whole.to_dict()
+    metrics = whole.metrics
     assert metrics["baseline_methods"]["missing"] == {}
     assert set(metrics["baseline_methods"]["fits"]) == set(BASELINE_METHODS)
     for peak in PEAKS:

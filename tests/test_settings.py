@@ -15,7 +15,8 @@ from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
+from cpunet.simulation.geometry_readers import detector_and_settings, read_detector
+from cpunet.simulation.settings import Shift, SimulationSettings
 from synthetic import one_line
 
 KINDS = (Electronics, Recipe, Detector, SimulationSettings, Shift)
@@ -177,7 +178,7 @@ def test_wrong_settings_of_a_matching_are_named(override, part):
 def test_values_of_a_file_and_of_words(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text("dt_ns: 4\nbias_V: 3000\n")
-    expected = {"bias_V": 3000}, SimulationSettings(dt_ns=2)
-    assert split_overrides([str(path), "dt_ns=2"]) == expected
+    expected = read_detector("ppc", ["bias_V=3000"]), SimulationSettings(dt_ns=2)
+    assert detector_and_settings("ppc", [str(path), "dt_ns=2"]) == expected
     with pytest.raises(CpunetError, match="expected KEY=VALUE"):
-        split_overrides([str(tmp_path / "none.yaml")])
+        detector_and_settings("ppc", [str(tmp_path / "none.yaml")])

@@ -274,7 +274,7 @@ def _is_measured(source: PulseSource) -> bool:
 
 def _traces(source: PulseSource, recipe: Recipe) -> list[tuple[str, str]]:
     """Properties of measured traces, and the pile-up tails under them."""
-    from cpunet.electronics.pile_up_tails import PileUpTails, tails_in_words
+    from cpunet.electronics.pile_up_tails import PileUpTails
     from cpunet.pulses.baselines import Baselines
     from cpunet.pulses.description import BLOCK, trace_properties
 
@@ -284,6 +284,6 @@ def _traces(source: PulseSource, recipe: Recipe) -> list[tuple[str, str]]:
         lines = [("", f"cannot be described: {error}")]
     try:
         baselines = Baselines.of(source.blocks(_TAILS_BLOCK), recipe.preparation)
-        return lines + tails_in_words(PileUpTails.of(baselines).describe())
+        return lines + PileUpTails.of(baselines).describe().in_words()
     except CpunetError as error:
         return [*lines, ("pile-up tails", f"not known: {error}")]

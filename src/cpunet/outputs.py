@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from cpunet.errors import CpunetError
 
@@ -86,7 +85,7 @@ def refuse_picture(target: Path, *inputs: Given, force: bool = False) -> None:
 def require_kind(target: Path, kind: FolderKind) -> None:
     """Raise a `CpunetError` if `target` is neither missing, empty nor a folder of this kind."""
     empty = target.is_dir() and not any(target.iterdir())
-    if target.exists() and not (empty or _marker(target).get("kind") == kind.name):
+    if target.exists() and not (empty or _marker(target)[0] == kind.name):
         raise CpunetError(
             f"{target}: is no folder that {kind.command} made, so `force` does not replace it; "
             "choose another name"
@@ -96,7 +95,7 @@ def require_kind(target: Path, kind: FolderKind) -> None:
 def require_replaceable(target: Path, kind: FolderKind) -> None:
     """Raise a `CpunetError` like `require_kind`, or if files of the user are in the folder."""
     require_kind(target, kind)
-    listed = {MARKER, *_marker(target).get("files", ())}
+    listed = {MARKER, *_marker(target)[1]}
     for name in _names(target):
         if name not in listed and not re.fullmatch(kind.own, name):
             raise CpunetError(
@@ -253,12 +252,13 @@ def _same(one: Path, other: Path) -> bool:
     return False
 
 
-def _marker(folder: Path) -> dict[str, Any]:
+def _marker(folder: Path) -> tuple[str, list[str]]:
+    """Kind of a folder, and the files that were listed as its own; nothing of other folders."""
     try:
         content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
+        return content["kind"], content["files"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return "", []
 
 
 def _names(folder: Path) -> list[str]:

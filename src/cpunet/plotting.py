@@ -79,10 +79,10 @@ def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
     return in_style
 
 
-def line_look(method: str) -> dict[str, Any]:
-    """Look of a line; that of the data is broad and grey, so that it shows below others."""
-    data = {"color": "0.65", "linewidth": 4.0}
-    return (data if method == "data" else {"color": COLOURS[method]}) | {"gid": GROUP + method}
+def line(axes: Axes, x: Any, y: Any, method: str, text: str | None = None) -> None:
+    """Draw a line of a method; that of the data is broad and grey, to show below others."""
+    colour, width = ("0.65", 4.0) if method == "data" else (COLOURS[method], None)
+    axes.plot(x, y, label=text, color=colour, linewidth=width, gid=GROUP + method)
 
 
 def group(drawn: Container, method: str) -> None:

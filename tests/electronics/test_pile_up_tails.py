@@ -140,7 +140,7 @@ def test_the_rate_is_found_without_the_energies(found: PileUpTails):
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(1, abs=3 * found.fit.rate_error_khz)
     assert found.fit.rate_error_khz < 0.12
-    assert found.describe()["percent_above"]["30_kev"]["law"] == pytest.approx(10.5, abs=1.5)
+    assert found.describe().percent_above["30_kev"]["law"] == pytest.approx(10.5, abs=1.5)
 
 
 @pytest.mark.thorough
@@ -157,7 +157,7 @@ def test_recorded_energies_are_taken_if_they_do():
 def test_nothing_is_invented_where_there_is_nothing(preset: str):
     found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.0, preset))], PREPARATION))
     assert found.law is None
-    assert found.describe()["rate_khz"] == 0
+    assert found.describe().rate_khz == 0
 
 
 def test_tails_can_be_taken_off(busy: RawTraces, found: PileUpTails):
@@ -185,7 +185,7 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     blocks = [raw.with_waveforms(lost.astype(np.float32))]
     found = PileUpTails.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
     assert not found.coupled
-    assert found.describe()["told_by"] == "slope"
+    assert found.describe().told_by == "slope"
     large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)
     ratio = np.median(found.kev[large] / busy.tails_kev[large])
     assert ratio == pytest.approx(1, abs=0.1)
@@ -234,7 +234,7 @@ def test_a_bench_detector_follows_the_law(reference_data: Path):
     assert found.fit.recorded
     assert found.decay_us == pytest.approx(85, rel=0.04)
     assert found.law.rate_khz == pytest.approx(1.4, abs=0.3)
-    shares = found.describe()["percent_above"].values()
+    shares = found.describe().percent_above.values()
     for share in shares:  # in percent of a thousand traces
         assert share["measured"] == pytest.approx(share["law"], abs=3)
 

@@ -89,7 +89,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def values(*runs: Path) -> dict[str, float]:
-    return response(*runs).content["runs"][0]["values"]
+    return response(*runs).runs[0].values
 
 
 def test_a_single_pole_and_a_single_decay(tmp_path):
@@ -125,31 +125,25 @@ def test_noise_is_told_in_kev(tmp_path):
 
 
 def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
-    told = response(run, truth=electronics()).content
-    truth = told["truth"]
-    assert truth["name"] == "known"
-    assert truth["values"].keys() - truth["difference"].keys() == {
-        "noise_rms_kev",
-        "noise_corner_mhz",
-    }
-    for name, difference in truth["difference"].items():
-        assert difference == pytest.approx(0, abs=1e-6 * abs(truth["values"][name]) + 1e-7), (
-            name
-        )
-    assert truth["values"]["rise_10_90_ns"] == pytest.approx(165, abs=10)
-    assert truth["values"]["noise_rms_kev"] == pytest.approx(1.95, rel=1e-3)
-    assert truth["values"]["noise_corner_mhz"] == pytest.approx(8.5, rel=0.02)
+    told = response(run, truth=electronics())
+    true = told.true_values
+    assert true.keys() - told.difference.keys() == {"noise_rms_kev", "noise_corner_mhz"}
+    for name, difference in told.difference.items():
+        assert difference == pytest.approx(0, abs=1e-6 * abs(true[name]) + 1e-7), name
+    assert true["rise_10_90_ns"] == pytest.approx(165, abs=10)
+    assert true["noise_rms_kev"] == pytest.approx(1.95, rel=1e-3)
+    assert true["noise_corner_mhz"] == pytest.approx(8.5, rel=0.02)
 
 
 def test_errors_go_with_the_poles_they_belong_to(run):
-    (told,) = response(run).content["runs"]
-    assert told["values"]["pole_1_ns"] == pytest.approx(55)
-    assert told["errors"] == pytest.approx(
+    (told,) = response(run).runs
+    assert told.values["pole_1_ns"] == pytest.approx(55)
+    assert told.errors == pytest.approx(
         {"pole_1_ns": 0.05 * 55, "pole_2_ns": 0.02 * 35, "decay_us": 0.8, "decay_4_us": 0.002}
     )
-    assert told["parameter_errors"]["slow_400_ns"] == 0.004
-    assert told["parameters"]["slow_400_ns"] == pytest.approx(0.065)
-    assert told["values"]["chi_square_per_moment"] == 1.5
+    assert told.parameter_errors["slow_400_ns"] == 0.004
+    assert told.parameters["slow_400_ns"] == pytest.approx(0.065)
+    assert told.values["chi_square_per_moment"] == 1.5
 
 
 def test_differences_are_told_in_their_errors(tmp_path):
@@ -163,11 +157,11 @@ def test_differences_are_told_in_their_errors(tmp_path):
         noise_density=density * np.exp(2 * 397.5 * DT_NS / 500e3),
         fit=FIT | {"noise": noise, "errors": {"log_poles_ns.1": 0.02}},
     )
-    told = response(run, truth=electronics(bandwidth_poles_ns=[49])).content
-    (own,), sigma = told["runs"], told["truth"]["sigma"]
-    assert own["values"]["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
+    told = response(run, truth=electronics(bandwidth_poles_ns=[49]))
+    (own,), sigma = told.runs, told.sigma
+    assert own.values["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
     # 2 % of the baselines, and 1 µs of the decay
-    assert own["errors"]["noise_rms_kev"] == pytest.approx(
+    assert own.errors["noise_rms_kev"] == pytest.approx(
         1.98 * np.hypot(0.02, 1 / 500), rel=0.01
     )
     assert sigma["noise_rms_kev"] == pytest.approx(0.03 / (1.98 * 0.0201), rel=0.1)
@@ -209,13 +203,17 @@ def test_the_closed_form_is_the_chain_of_the_stand():
 
 def test_a_folder_with_numbers_and_figure(run, tmp_path):
     out = tmp_path / "out"
-    told = response(run, truth=electronics(), out=out).content
+    told = response(run, truth=electronics(), out=out)
     assert {file.name for file in out.iterdir()} == {
         ".cpunet.json",
         "response.json",
         "response.png",
     }
-    assert json.loads((out / "response.json").read_text()) == told
+    stored = json.loads((out / "response.json").read_text())
+    assert stored["runs"][0]["recipe"] == "fast"
+    assert stored["runs"][0]["values"] == told.runs[0].values
+    assert stored["truth"]["name"] == "known"
+    assert stored["truth"]["sigma"] == told.sigma
     assert (out / "response.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(CpunetError, match="exists already"):
         response(run, out=out)
@@ -250,8 +248,8 @@ def test_the_truth_of_a_stand(run, tmp_path):
     content = {"electronics": electronics().model_dump(mode="json")}
     (stand / "stand.json").write_text(json.dumps(content))
     known = response(run, truth=electronics())
-    assert response(run, truth=stand).content == known.content
-    assert response(Run.load(run), truth="legend200").content["truth"]["name"] == "legend200"
+    assert response(run, truth=stand).true_values == known.true_values
+    assert response(Run.load(run), truth="legend200").truth.name == "legend200"
     for text, fault in (("", "damaged"), ("{}", "electronics: ")):
         (stand / "stand.json").write_text(text)
         one_line(lambda: response(run, truth=stand), f"stand.json: {fault}")
@@ -314,7 +312,7 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
 
     def doubts(fit: object) -> list[str]:
         (run / "run.json").write_text(json.dumps(info | {"fit": fit}))
-        return response(run).content["runs"][0]["doubts"]
+        return response(run).runs[0].doubts
 
     assert doubts(FIT) == []
     poor = FIT | {

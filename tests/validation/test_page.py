@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from cpunet.plotting import line_look, styled
+from cpunet.plotting import line, styled
 from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
 from synthetic import write_report
@@ -281,7 +281,7 @@ def two_methods() -> Figure:
     figure = Figure()
     axes = figure.subplots()
     for method, text in (("data", "Data, n = 3"), ("ren", "REN translation, n = 3")):
-        axes.plot([1, 2, len(text)], label=text, **line_look(method))
+        line(axes, [0, 1, 2], [1, 2, len(text)], method, text)
     axes.legend()
     return figure
 

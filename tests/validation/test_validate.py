@@ -222,7 +222,7 @@ def test_a_report(report):
     assert row["iou"] == compared["iou"]["ren"]
     assert row["ceiling"] == compared["iou"]["ceiling"]
     assert report.scores.loc["SEP", "drift_time", "ren"].equals(row)
-    assert report.verdicts == report.to_dict()["verdicts"]["summary"]
+    assert report.verdicts == report.metrics["verdicts"]["summary"]
     assert "current amplitude" in report._repr_html_()
     assert repr(report).startswith(f"<Report {report.folder}: ")
     assert report.figures["FEP mean pulse"].axes
@@ -256,7 +256,7 @@ def test_nothing_is_written_before_it_is_saved(run, files, tmp_path, monkeypatch
     few.save("report")
     with pytest.raises(CpunetError, match="report: exists already"):
         few.save("report")
-    assert cpunet.Report.load("report").to_dict() == made.to_dict()
+    assert cpunet.Report.load("report").metrics == made.metrics
 
 
 @pytest.mark.timeout(1800)

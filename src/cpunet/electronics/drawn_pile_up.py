@@ -107,7 +107,7 @@ class DrawnTails:
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, float | list[float] | None]:
         """Serialise to a mapping that `of` reads."""
         told: dict[str, Any] = plain(asdict(self))
         del told["decay_error_us"]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise, passing
 from cpunet.electronics.finishing import PADDING_BEFORE
-from cpunet.electronics.pile_up_tails import PileUpTails
+from cpunet.electronics.pile_up_tails import PileUpTails, TailsInfo
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.loading import InputSet
@@ -22,7 +21,7 @@ NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
 MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
 
 
-def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, dict[str, Any]]:
+def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, TailsInfo]:
     """Measure noise and pile-up tails in the data of a training, and note what was found.
 
     Parameters
@@ -45,14 +44,14 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
     """
     found, reason = tails_of(data)
     drawn: DrawnTails | None = None
-    told: dict[str, Any] = {"missing": reason}
+    told = TailsInfo(missing=reason)
     if found is None:
         log.info(f"pile-up tails are not measured: {reason}")
     else:
         likely = drawn_like(found, data, config)
-        told = found.describe() | {"drawn": likely.describe()}
+        told = found.describe().model_copy(update={"drawn": likely.describe()})
     if found is not None and found.law is not None:
-        drawn, tenth = likely, told["percent_above"]["10_kev"]["law"]
+        drawn, tenth = likely, told.percent_above["10_kev"]["law"]
         alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
         log.info(
             f"pile-up tails: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "

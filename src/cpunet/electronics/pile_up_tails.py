@@ -10,18 +10,19 @@ their baselines, a time :math:`h` apart, have a ratio of :math:`e^{h/\tau}`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import InfoPart
 
 MIN_BASELINES = 30  # minimum number of baselines
 SIGMA_PER_MAD = 1.4826
@@ -164,6 +165,42 @@ SURE, SURE_GAIN = 4.0, 12.0
 MAX_FULL = 0.97  # maximum fraction of traces with a tail larger than the error
 MIN_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
 SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
+
+
+class TailsInfo(InfoPart):
+    """What was measured of pile-up tails, or why it is `missing`, and what to draw them from.
+
+    The measured fractions of traces include the effect of the measurement error. Those of the
+    law do not.
+    """
+
+    rate_khz: float = 0.0
+    drawn: dict[str, Any] | None = None
+    rate_error_khz: float = 0.0
+    decay_us: float = 0.0
+    decay_error_us: float | None = None
+    error_kev: float = 0.0
+    told_by: str = ""
+    energies: str = ""
+    traces: int = 0
+    not_told: int = 0
+    percent_above: dict[str, dict[str, float]] = Field(default_factory=dict)
+    missing: str | None = None
+
+    def in_words(self) -> list[tuple[str, str]]:
+        """Names and texts."""
+        if not self.rate_khz:
+            return [("pile-up tails", "none that are certain")]
+        shares = ", ".join(
+            f"{share['measured']:.3g} % above {size.partition('_')[0]} keV"
+            for size, share in self.percent_above.items()
+        )
+        rate = f"{self.rate_khz:.3g} ± {self.rate_error_khz:.2g} kHz"
+        by = f"told by {self.told_by}, error {self.error_kev:.2g} keV"
+        return [
+            ("pile-up tails", f"{rate}, decaying with {self.decay_us:.3g} µs"),
+            ("", f"{shares} ({by})"),
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,49 +353,29 @@ class PileUpTails:
             kev -= self.fit.level_kev
         return np.where(width <= self.widest_adc, kev, np.nan)
 
-    def describe(self) -> dict[str, Any]:
-        """Summary: the rate, its error, and fractions of traces above several thresholds.
-
-        The measured fractions include the effect of the measurement error. Those of the law
-        do not.
-        """
+    def describe(self) -> TailsInfo:
+        """Summary: the rate, its error, and fractions of traces above several thresholds."""
         told = self.kev[np.isfinite(self.kev)]
         law, surely = self.fit.law, self.law is not None
         of_law = law.share_above(SHARES_KEV) if surely else np.zeros(len(SHARES_KEV))
-        return {
-            "rate_khz": law.rate_khz if surely else 0.0,
-            "rate_error_khz": self.fit.rate_error_khz,
-            "decay_us": self.decay_us,
-            "decay_error_us": self.decay_error_us,
-            "error_kev": self.error_kev,
-            "told_by": "level and slope" if self.coupled else "slope",
-            "energies": "recorded" if self.fit.recorded else "learned from the tails",
-            "traces": len(told),
-            "not_told": len(self.kev) - len(told),
-            "percent_above": {
+        return TailsInfo(
+            rate_khz=law.rate_khz if surely else 0.0,
+            rate_error_khz=self.fit.rate_error_khz,
+            decay_us=self.decay_us,
+            decay_error_us=self.decay_error_us,
+            error_kev=self.error_kev,
+            told_by="level and slope" if self.coupled else "slope",
+            energies="recorded" if self.fit.recorded else "learned from the tails",
+            traces=len(told),
+            not_told=len(self.kev) - len(told),
+            percent_above={
                 f"{kev:g}_kev": {
                     "measured": round(100 * float((told > kev).mean()), 2),
                     "law": round(100 * float(share), 2),
                 }
                 for kev, share in zip(SHARES_KEV, of_law, strict=True)
             },
-        }
-
-
-def tails_in_words(told: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Names and texts for the result of `PileUpTails.describe`."""
-    if not told["rate_khz"]:
-        return [("pile-up tails", "none that are certain")]
-    shares = ", ".join(
-        f"{share['measured']:.3g} % above {size.partition('_')[0]} keV"
-        for size, share in told["percent_above"].items()
-    )
-    rate = f"{told['rate_khz']:.3g} ± {told['rate_error_khz']:.2g} kHz"
-    by = f"told by {told['told_by']}, error {told['error_kev']:.2g} keV"
-    return [
-        ("pile-up tails", f"{rate}, decaying with {told['decay_us']:.3g} µs"),
-        ("", f"{shares} ({by})"),
-    ]
+        )
 
 
 def _read(

@@ -24,20 +24,20 @@ from cpunet.pulses.provenance import MADE_BY, SIDE, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.settings import Set, checked, read_json, require_seed
+from cpunet.settings import Set, checked, read_json, require_seed, words_and_files
 from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.geometry_readers import detector_and_settings
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
 from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import PulseLibrary
-from cpunet.simulation.settings import Shift, SimulationSettings, split_overrides
+from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.tables import counted
 
 Labels = npt.NDArray[np.int64]
@@ -193,13 +193,14 @@ def make_stand(
     words = [w for given in (shift, settings) if not isinstance(given, Mapping) for w in given]
     given = (electronics, detector, *words)
     refuse_inputs(Path(out), *(f for f in given if isinstance(f, str | Path)))
-    of_detector, physics = split_overrides(settings)
-    readout = Electronics.model_fields.keys() - {"name"}
-    of_chain = {k: of_detector.pop(k) for k in [*of_detector] if k.split(".")[0] in readout}
+    values = words_and_files(settings)
+    others = {"name", *SimulationSettings.model_fields}  # a period is that of the pulses
+    readout = Electronics.model_fields.keys() - others
+    of_chain = {k: values.pop(k) for k in [*values] if k.split(".")[0] in readout}
     seed, moved = require_seed(seed), Shift.of(shift)
     chain = read_electronics(electronics, of_chain)
+    crystal, physics = detector_and_settings(detector, values)
     wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
-    crystal = read_detector(detector, of_detector)
     sim, data, readout_seed = stand_sides(chain, crystal, wanted, moved, physics, seed)
     mode, n_events = sim.settings.mode, sum(sim.source.events.values())
     many = mode == "library" or (mode == "auto" and n_events >= _LIBRARY_FROM_EVENTS)

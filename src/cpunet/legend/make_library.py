@@ -21,8 +21,8 @@ from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import Set
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
-from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.settings import SimulationSettings, split_overrides
+from cpunet.simulation.geometry_readers import detector_and_settings
+from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
 
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
@@ -111,9 +111,9 @@ def make_library(
     words = () if isinstance(settings, Mapping) else settings
     inputs = [given for given in (detector, *words) if isinstance(given, str | Path)]
     refuse_existing(out, *inputs, force=force)
-    of_detector, wanted = split_overrides(settings, dt_ns=DT_NS, length_ns=LENGTH_NS)
-    if not isinstance(detector, Detector):
-        detector = read_detector(detector, of_detector)
+    detector, wanted = detector_and_settings(
+        detector, settings, dt_ns=DT_NS, length_ns=LENGTH_NS
+    )
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
     with stage(f"Fields of {detector.name or 'the detector'}"):

@@ -267,7 +267,7 @@ class InputSet:
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
         )
 
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> dict[str, str | float]:
         """Entries of the provenance that identify the pulses used, wherever their file is."""
         return self.provenance().model_dump(include={"dt_ns", "used", "sha256"})
 

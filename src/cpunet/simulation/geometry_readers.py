@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.settings import Set, checked, key_values, names, read_text, read_values
+from cpunet.settings import (
+    Set,
+    checked,
+    key_values,
+    names,
+    read_text,
+    read_values,
+    words_and_files,
+)
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_metadata import (
     LIQUID_ARGON_K,
@@ -17,6 +25,7 @@ from cpunet.simulation.legend_metadata import (
     why_missing,
 )
 from cpunet.simulation.legend_metadata import detector_values as legend_values
+from cpunet.simulation.settings import SimulationSettings
 
 log = logging.getLogger(__name__)
 
@@ -122,17 +131,45 @@ def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
             return path
         return _completed(path.model_dump(), given, path.name, {})
     name = str(path)
-    hints: _Hints = {}
     if name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
         values = read_values(path, _FOLDER)
     else:
         values = {**siggen_values(read_text(path, _FOLDER), name)}
     if "geometry" in values:
-        values, hints = _legend(values, Path(path))
-        if "temperature_K" not in given:
-            values["temperature_K"] = LIQUID_ARGON_K
-            log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
-    return _completed({"name": Path(name).stem} | values, given, name, hints)
+        return _legend(values, given, name)
+    return _completed({"name": Path(name).stem} | values, given, name, {})
+
+
+def detector_and_settings(
+    detector: str | Path | Detector, overrides: Set, **defaults: float
+) -> tuple[Detector, SimulationSettings]:
+    """Read a detector, and the settings of its simulation; `overrides` are values of both.
+
+    Parameters
+    ----------
+    detector
+        See `read_detector`.
+    overrides
+        Values by key, words as ``"bias_V=3500"``, or YAML files.
+    defaults
+        Settings of the simulation, unless overridden.
+
+    Raises
+    ------
+    CpunetError
+        If a file cannot be read, or a value is not allowed.
+
+    Examples
+    --------
+    >>> words = ["bias_V=3500", "hole_trapping_per_us=0.01"]
+    >>> detector, settings = detector_and_settings("icpc", words)
+    >>> detector.bias_V, settings.hole_trapping_per_us
+    (3500.0, 0.01)
+    """
+    values = words_and_files(overrides)
+    own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
+    settings = checked(SimulationSettings, defaults | own, "settings")
+    return read_detector(detector, values), settings
 
 
 def _completed(
@@ -165,9 +202,13 @@ def holds_detector(path: str | Path) -> bool:
         return b"xtal_length" in file.read(_SIGGEN_BYTES)
 
 
-def _legend(diode: dict[str, Any], path: Path) -> tuple[dict[str, Any], _Hints]:
-    """Values of a LEGEND diode and its crystal, and reasons why some are missing."""
-    values = legend_values(diode, str(path))
+def _legend(diode: dict[str, Any], given: dict[str, Any], name: str) -> Detector:
+    """The detector of a LEGEND diode and its crystal; see `read_detector`."""
+    path = Path(name)
+    values = {"name": path.stem} | legend_values(diode, name)
+    if "temperature_K" not in given:
+        values["temperature_K"] = LIQUID_ARGON_K
+        log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
     crystal_name, slice_name = crystal_and_slice(diode, path.stem)
     places = [
         folder / f"{crystal_name}{suffix}"
@@ -176,14 +217,12 @@ def _legend(diode: dict[str, Any], path: Path) -> tuple[dict[str, Any], _Hints]:
     ]
     found = next(filter(Path.is_file, places), None)
     content = read_values(found) if found else {}
-    hints = why_missing()
+    hints, length = why_missing(), values.get("crystal_length")
     if content.get("impurity_curve") is None:
-        lacking = f"{found} has no impurity_curve" if found else f"there is no {places[0]}"
-        return values, hints | {_Z0: lacking}
-    length = values.get("crystal_length")
-    if not isinstance(length, int | float):
-        return values, hints  # refused together with the rest of the geometry
-    return values | impurity_values(content, str(found), slice_name, length), hints
+        hints[_Z0] = f"{found} has no impurity_curve" if found else f"there is no {places[0]}"
+    elif isinstance(length, int | float):  # else refused with the rest of the geometry
+        values |= impurity_values(content, str(found), slice_name, length)
+    return _completed(values, given, name, hints)
 
 
 def siggen_values(text: str, name: str) -> dict[str, float]:

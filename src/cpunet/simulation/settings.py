@@ -154,22 +154,6 @@ class SimulationSettings(Config):
         return self
 
 
-def split_overrides(
-    overrides: Set, **defaults: float
-) -> tuple[dict[str, Any], SimulationSettings]:
-    """Split words and YAML files into values of the detector, and settings with `defaults`.
-
-    Examples
-    --------
-    >>> of_detector, settings = split_overrides(["bias_V=3500", "hole_trapping_per_us=0.01"])
-    >>> of_detector, settings.hole_trapping_per_us
-    ({'bias_V': 3500}, 0.01)
-    """
-    values = words_and_files(overrides)
-    own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
-    return values, checked(SimulationSettings, defaults | own, "settings")
-
-
 _SHIFTS = Path(__file__).parent / "shifts"
 
 Number = Annotated[float, Field(allow_inf_nan=False)]

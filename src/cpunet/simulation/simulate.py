@@ -27,7 +27,7 @@ from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.geometry_readers import detector_and_settings
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import (
     GammaSource,
@@ -40,7 +40,7 @@ from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
-from cpunet.simulation.settings import SimulationSettings, split_overrides
+from cpunet.simulation.settings import SimulationSettings
 
 log = logging.getLogger(__name__)
 
@@ -183,11 +183,11 @@ def simulate(
     """
     require_seed(seed)
     out = Path(out)
-    of_detector, physics = split_overrides(settings)
     words = () if isinstance(settings, Mapping) else settings
     files = [f for f in (detector, *words) if isinstance(f, str | Path)]
     files += [hits.path if isinstance(hits, HitFile) else hits] if hits is not None else []
     refuse_inputs(out, *files)
+    found, physics = detector_and_settings(detector, settings)
     peaks = load_recipe("fast").peaks
     windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
     source: HitSource
@@ -203,7 +203,6 @@ def simulate(
         source = GammaSource(wanted, physics.source_height_mm, physics.source_radius_mm, seed)
     else:
         raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
-    found = read_detector(detector, of_detector)
     simulation = Simulation(out, found, physics, windows, seed)
     attrs = {MADE_BY: f"cpunet simulate {cpunet.__version__}"}
     writer = PulseWriter(out, attrs=attrs, force=force)

@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cpunet.electronics.pile_up_tails import tails_in_words
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -60,14 +58,6 @@ class DescribedChain:
     parameters: Numbers
     parameter_errors: Numbers
     doubts: list[str]
-
-    @property
-    def content(self) -> dict[str, Any]:
-        """As ``response.json`` has it."""
-        facts: dict[str, Any] = {"path": self.run.name, "recipe": self.run.recipe.name}
-        facts |= {"peak": self.run.peak, "seed": self.run.seed, "dt_ns": self.run.dt_ns}
-        names = ("values", "errors", "parameters", "parameter_errors", "doubts")
-        return facts | {name: getattr(self, name) for name in names}
 
 
 def describe_chain(run: Run) -> DescribedChain:
@@ -163,7 +153,7 @@ def summary(run: Run) -> list[tuple[str, str]]:
             size = f"{with_std(kev, error)} keV (RMS), "
         lines.append(("noise", f"{size}of {fit.noise['baselines']:.0f} baselines"))
     if known is not None and "rate_khz" in known.model_fields_set:
-        lines += tails_in_words(known.model_dump())
+        lines += known.in_words()
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]

@@ -12,7 +12,7 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -189,6 +189,26 @@ def discriminators_noted(records: Sequence[Record]) -> list[str]:
     return lines
 
 
+class _Iteration(NamedTuple):
+    """What came of an iteration: its losses, and the accuracies of discriminators updated."""
+
+    number: int
+    rate: float
+    losses: dict[str, Tensor]
+    accuracy: dict[str, Tensor]
+
+    def record(self, seed: int) -> Record:
+        """The same in numbers, if all losses are finite."""
+        losses, accuracy = (
+            {name: float(value) for name, value in part.items()} for part in self[2:]
+        )
+        for name, value in losses.items():
+            if not math.isfinite(value):
+                raise _diverged(f"{name} is {value} in iteration {self.number}", seed)
+        told: Record = {"iteration": self.number, "rate": self.rate, "losses": losses}
+        return told | ({"accuracy": accuracy} if accuracy else {})
+
+
 class _Training:
     """Everything that changes from iteration to iteration."""
 
@@ -205,19 +225,18 @@ class _Training:
         }
         self.iteration = 0  # number of completed iterations
 
-    def advance(self) -> dict[str, Any]:
-        """Do an iteration; return its record, with tensors for numbers."""
+    def advance(self) -> _Iteration:
+        """Do an iteration."""
         iteration, rate = self.iteration, float(self.step.schedules[0].get_last_lr()[0])
         sim, data = (sampler.next_batch() for sampler in self.samplers)
         losses = self.step(iteration, sim, data, self.samplers[0].last_rows)
         self.iteration += 1
-        told = {"iteration": iteration, "rate": rate, "losses": losses}
-        return told | ({"accuracy": self.step.accuracy} if self.step.accuracy else {})
+        return _Iteration(iteration, rate, losses, self.step.accuracy)
 
     def run(self, listener: Listener | None, save: Callable[[State], None] | None) -> None:
         """Do all iterations that are left, or those until it is interrupted."""
         config = self.config
-        pending: list[dict[str, Any]] = []
+        pending: list[_Iteration] = []
         with _Interruption() as interruption:
             while self.iteration < config.iterations:
                 pending.append(self.advance())
@@ -227,7 +246,7 @@ class _Training:
                 keep = last or stop or done % config.checkpoint_interval == 0
                 # several iterations are fetched at once: each transfer makes a GPU wait
                 if keep or len(pending) == config.log_interval:
-                    records = [_finite(record, self.seed) for record in pending]
+                    records = [one.record(self.seed) for one in pending]
                     pending.clear()
                     if listener is not None:
                         listener(records)
@@ -289,17 +308,6 @@ class _Interruption:
         self.__exit__()
         self.signal = number
         log.info("stopping after this iteration; once more to stop at once")
-
-
-def _finite(record: dict[str, Any], seed: int) -> Record:
-    """The record in numbers, if all losses are finite."""
-    for part in ("losses", "accuracy"):
-        if part in record:
-            record[part] = {name: float(value) for name, value in record[part].items()}
-    for name, value in record["losses"].items():
-        if not math.isfinite(value):
-            raise _diverged(f"{name} is {value} in iteration {record['iteration']}", seed)
-    return record
 
 
 def _diverged(told: str, seed: int) -> CpunetError:

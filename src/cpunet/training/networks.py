@@ -135,7 +135,7 @@ def outside_noise(
             "without it (training.noise=none in `settings`)"
         ) from error
     outside = Outside(noise, sim.prepared.pulses.energy_kev, recipe.preparation)
-    return outside, FitInfo.model_validate({"tails": tails})
+    return outside, FitInfo(tails=tails)
 
 
 def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:

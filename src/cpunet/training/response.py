@@ -33,6 +33,9 @@ RESPONSE = FolderKind(
     name="response", command="cpunet response", own=r"response\.json|response\.png"
 )
 _DPI = 150
+# What ``response.json`` has of a `Run` and of a `DescribedChain`
+_OF_RUN = ("peak", "seed", "dt_ns")
+_OF_CHAIN = ("values", "errors", "parameters", "parameter_errors", "doubts")
 
 # What a name of `describe_chain` stands for, and its unit; shares are given in percent.
 ROWS = {
@@ -104,20 +107,6 @@ class Response:
         }
 
     @property
-    def content(self) -> dict[str, Any]:
-        """As ``response.json`` has it."""
-        content: dict[str, Any] = {"cpunet": cpunet.__version__}
-        content["runs"] = [one.content for one in self.runs]
-        if self.truth is not None:
-            content["truth"] = {
-                "name": self.truth.name,
-                "values": self.true_values,
-                "difference": self.difference,
-                "sigma": self.sigma,
-            }
-        return content
-
-    @property
     def values(self) -> DataFrame:
         """A row per quantity, a column per run, and ``truth``."""
         from pandas import DataFrame
@@ -144,9 +133,21 @@ class Response:
         CpunetError
             If the folder exists and `force` is off, or is of something else.
         """
+        content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": []}
+        for one in self.runs:
+            facts = {"path": one.run.name, "recipe": one.run.recipe.name}
+            facts |= {name: getattr(one.run, name) for name in _OF_RUN}
+            content["runs"].append(facts | {name: getattr(one, name) for name in _OF_CHAIN})
+        if self.truth is not None:
+            content["truth"] = {
+                "name": self.truth.name,
+                "values": self.true_values,
+                "difference": self.difference,
+                "sigma": self.sigma,
+            }
         folders = [one.run.folder for one in self.runs]
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
-            text = json.dumps(self.content, indent=1, ensure_ascii=False)
+            text = json.dumps(content, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
             self.plot().savefig(folder / "response.png", dpi=_DPI)
 

@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 import cpunet
 from cpunet.electronics.drawn_pile_up import DrawnTails
+from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo
@@ -61,13 +62,6 @@ RUN = FolderKind(
 )
 Network = TypeVar("Network", bound=nn.Module)
 _NOT_STORED: Any = {"exclude": True, "repr": False}
-
-
-class TailsInfo(InfoPart):
-    """What was measured of pile-up tails, and what to draw them from."""
-
-    rate_khz: float = 0.0
-    drawn: dict[str, Any] | None = None
 
 
 class FitInfo(InfoPart):

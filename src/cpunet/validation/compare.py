@@ -300,7 +300,7 @@ def compared(
         if isinstance(report, Report):
             # one in memory is named by its run
             places.append(report.folder or Path(report.metrics["compared"]["run"]))
-            metrics.append(report.to_dict())
+            metrics.append(report.metrics)
             folders.append(report.folder)
             continue
         path = Path(report)

@@ -51,7 +51,7 @@ class Report:
     Parameters
     ----------
     metrics
-        The content of ``metrics.json``.
+        The content of ``metrics.json``; numbers that are not finite are None.
     values
         Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
     folder
@@ -128,10 +128,6 @@ class Report:
     def figures(self) -> Mapping[str, Figure]:
         """Figures by name, drawn on every access."""
         return _Figures(self.drawn or {})
-
-    def to_dict(self) -> dict[str, Any]:
-        """The metrics, ready for JSON: numbers that are not finite are None."""
-        return dict(plain(self.metrics))
 
     def hist(self, peak: str, parameter: str = "current_amplitude") -> hist.Hist[Any]:
         """Distributions of a parameter by method, in the bins in which it is scored.
@@ -210,9 +206,8 @@ class Report:
 
         if self.drawn is None:
             raise CpunetError(f"{self.folder}: is a report already", "copy the folder")
-        metrics = self.to_dict()
         text = json.dumps(
-            metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False
+            self.metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False
         )
         (folder / METRICS).write_text(text + "\n", encoding="utf-8")
         parameters = {
@@ -226,7 +221,7 @@ class Report:
         # garbage is collected rarely: each time, all that is loaded is looked through as well
         gc.set_threshold(100_000, 20, 100)
         try:
-            write_page(folder, metrics, self.drawn, self.notes)
+            write_page(folder, self.metrics, self.drawn, self.notes)
         finally:
             gc.set_threshold(*before)
 

@@ -24,7 +24,7 @@ from cpunet.plotting import (
     STACKED,
     label,
     legend_above,
-    line_look,
+    line,
     panels,
     steps,
     styled,
@@ -224,15 +224,15 @@ def shape_figure(
         data = pulses["data"]
         time_ns = dt_ns * np.arange(-BEFORE, len(data.mean) - BEFORE, dtype=float)
         for method, pulse in pulses.items():
-            mean, look = pulse.mean, line_look(method)
+            mean = pulse.mean
             if method == "raw":
                 mean = mean * (data.mean[-1] / mean[-1])
-            above.plot(time_ns, mean, label=label(method), **look)
+            line(above, time_ns, mean, method, label(method))
             if method != "data":
                 middle = 100 * (mean - data.mean)
                 error = 100 * np.hypot(pulse.error, data.error)
                 band = {"color": COLOURS[method], "gid": GROUP + method, "alpha": 0.2, "lw": 0}
-                below.plot(time_ns, middle, **look)
+                line(below, time_ns, middle, method)
                 below.fill_between(time_ns, middle - error, middle + error, **band)
         counts = "n = " + ", ".join(str(pulse.n) for pulse in pulses.values())
         if data.n > 1:
@@ -311,8 +311,7 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
                 continue
             cuts = np.quantile(single, 1 - accepted)
             left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
-            look = line_look(method)
-            axes.plot(100 * accepted, 100 * left, label=label(method), **look)
+            line(axes, 100 * accepted, 100 * left, method, label(method))
         axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
     # useful cuts leave few multi-site events
     grid[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))

@@ -129,7 +129,8 @@ def tune(
             "choose another name"
         )
     study.set_user_attr(BEGUN, begun)
-    own = {key: own_values(recipe)[key] for key in space}
+    known = dict(flat(recipe.model_dump(mode="json")))
+    own = {key: known[key] for key in space}
     given = {key: _in_journal(space[key], value) for key, value in own.items()}
     if not study.trials and None not in given.values():
         study.enqueue_trial(given, {UNCHANGED: True})
@@ -189,13 +190,14 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
             f"recipe {recipe.name}: has no search space; add one, as "
             "search: {training.ridge: {low: 0.01, high: 0.2, log: true}}"
         )
+    known = dict(flat(recipe.model_dump(mode="json")))
     for key, config in recipe.search.items():
         if key.split(".")[0] not in TUNED:
             raise CpunetError(
                 f"recipe {recipe.name}: search.{key}: only settings of {', '.join(TUNED)} "
                 "can be tuned"
             )
-        if key not in own_values(recipe):
+        if key not in known:
             raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
         for value in config.choices or (config.low, config.high):
             try:
@@ -203,11 +205,6 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
             except CpunetError as error:
                 raise CpunetError(f"recipe {recipe.name}: search.{key}: {error}") from error
     return dict(recipe.search)
-
-
-def own_values(recipe: Recipe) -> dict[str, Any]:
-    """All settings of a recipe, as ``training.ridge``, and their values."""
-    return dict(flat(recipe.model_dump(mode="json")))
 
 
 def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:

@@ -6,7 +6,7 @@ import struct
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -120,7 +120,7 @@ class PulseFile:
         return () if self.pulses is not None else (self.path, self.energy)
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, str | float]:
         """The reading options given by the user."""
         given = {name: getattr(self, name) for name in _TOLD}
         return {name: value for name, value in given.items() if value is not None}
