@@ -44,7 +44,7 @@ from cpunet.validation.methods import (
     scores_of_squares,
     true_responses,
 )
-from cpunet.validation.report import Report
+from cpunet.validation.report import Report, as_stored
 
 Values = npt.NDArray[np.float64]
 DT_NS = 16.0
@@ -352,7 +352,7 @@ def write_report(
 ) -> None:
     """Write a report of these metrics and figures into a folder."""
     drawn = {name: partial(lambda one: one, one) for name, one in (figures or {}).items()}
-    Report(metrics, {}, None, drawn, notes).write(folder)
+    Report(as_stored(metrics), {}, None, drawn, notes).write(folder)
 
 
 def mean_kev(law: TailsLaw) -> float:
