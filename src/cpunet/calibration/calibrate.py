@@ -51,7 +51,7 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
@@ -144,7 +144,7 @@ def calibrate(
     """
     if out is None and not plan:
         raise CpunetError("give `out`, the run folder to make, or `plan`")
-    sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    sides = read.files(sim, data)
     target = None if out is None else Path(out)
     if target is not None and not isinstance(recipe, Recipe):
         refuse_inputs(target, recipe)

@@ -30,7 +30,7 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import Kind, Rejection
-from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -210,7 +210,7 @@ def check(
 
     ``cpunet check --sim sim.lh5 --data raw.lh5 --data-table all``
     """
-    both = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    both = read.files(sim, data)
     picture = None if out is None else Path(out)
     alone = both[1].table != ALL
     if picture is not None:

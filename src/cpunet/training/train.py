@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
 from cpunet.pulses.channels import ALL, Outcome, each_channel, paired
-from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source
 
 if TYPE_CHECKING:
     from cpunet.recipes.schema import Recipe
@@ -99,7 +99,7 @@ def train(
         refuse_inputs(target, recipe)
     require_seed(seed)
     chosen, device = load_recipe(recipe, settings), resolve_device(device)
-    sides = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    sides = read.files(sim, data)
 
     training = Training(chosen, peak, init, seed, device, resume, force)
     trained: Run | Outcome[Run]

@@ -50,6 +50,7 @@ def translate(
     jobs: int = 1,
     resume: bool = False,
     read: FileOptions = FileOptions(),
+    insist: bool = False,
     force: bool = False,
 ) -> Translation | Outcome[Translation]:
     """Translate pulses with a trained run, keeping the rows and columns of their files.
@@ -87,6 +88,8 @@ def translate(
     read
         How files are read, if they do not tell themselves.  With ``all`` for the table, each
         table is translated to a file in `out`.
+    insist
+        Pulses are simulated or measured as given, whatever they look like.
     force
         Replace existing files.
 
@@ -122,7 +125,7 @@ def translate(
         tails,
         pile_up_khz,
     )
-    files = list(_files(pulses, read, run))
+    files = list(_files(pulses, read, insist, run))
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
     if out is None:
@@ -145,7 +148,10 @@ def translate(
 
 
 def _files(
-    given: Sequence[Source] | Source | npt.ArrayLike, read: FileOptions, run: RunLike
+    given: Sequence[Source] | Source | npt.ArrayLike,
+    read: FileOptions,
+    insist: bool,
+    run: RunLike,
 ) -> Iterator[PulseFile]:
     """Files of pulses from all that a user may give."""
     sources: list[Any] = [given] if isinstance(given, Source) else list(given)  # type: ignore[arg-type]
@@ -156,7 +162,7 @@ def _files(
         sources = [Pulses.of(waveforms, dt_ns=as_run(run).dt_ns)]
     for source in sources:
         names = expanded(Path(source)) if isinstance(source, str | Path) else [source]
-        yield from (pulse_file(name, read) for name in names)
+        yield from (pulse_file(name, read, insist) for name in names)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, flat, read_settings
@@ -103,7 +103,7 @@ def tune(
             "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    out, sides = Path(out), (pulse_file(sim, read.sim), pulse_file(data, read.data))
+    out, sides = Path(out), read.files(sim, data)
     recipe = load_recipe(recipe, settings)
     device, space = resolve_device(device), search_space(recipe)
     refuse_inputs(out, *sides[0].files, *sides[1].files)

@@ -12,7 +12,7 @@ from typing import Any
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside
 from cpunet.pulses.channels import ALL, Outcome, Pair, each_channel, own_folder, paired
-from cpunet.pulses.reading.files import ReadOptions, Source, pulse_file
+from cpunet.pulses.reading.files import ReadOptions, Source
 from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, as_run
 from cpunet.validation.compare import compared
@@ -84,7 +84,7 @@ def validate(
     """
     if max_pulses < 100:
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
-    sim, data = pulse_file(sim, read.sim), pulse_file(data, read.data)
+    sim, data = read.files(sim, data)
     how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses}
     how |= {"seed": require_seed(seed), "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)

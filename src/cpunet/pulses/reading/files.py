@@ -34,15 +34,12 @@ class FileOptions:
         Calibration of pulses without energies in keV: keV per ADC count.
     dt_ns
         Sampling period in ns.
-    insist
-        Pulses are simulated or measured as given, whatever they look like.
     """
 
     table: str | None = None
     energy: str | None = None
     kev_per_adc: float | None = None
     dt_ns: float | None = None
-    insist: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,17 +69,11 @@ class ReadOptions:
     sim_table: str | None = None
     insist: bool = False
 
-    @property
-    def sim(self) -> FileOptions:
-        """Those of the simulated pulses, which are in keV."""
-        return FileOptions(self.sim_table, None, None, self.dt_ns, self.insist)
-
-    @property
-    def data(self) -> FileOptions:
-        """Those of the measured pulses."""
-        return FileOptions(
-            self.data_table, self.data_energy, self.kev_per_adc, self.dt_ns, self.insist
-        )
+    def files(self, sim: Source, data: Source) -> tuple[PulseFile, PulseFile]:
+        """Files of both sides, see `pulse_file`; the simulated pulses are in keV."""
+        of_sim = FileOptions(self.sim_table, None, None, self.dt_ns)
+        of_data = FileOptions(self.data_table, self.data_energy, self.kev_per_adc, self.dt_ns)
+        return pulse_file(sim, of_sim, self.insist), pulse_file(data, of_data, self.insist)
 
 
 @dataclass(frozen=True)
@@ -93,8 +84,10 @@ class PulseFile:
     ----------
     path
         The file.
-    table, energy, kev_per_adc, dt_ns, insist
+    table, energy, kev_per_adc, dt_ns
         As of `FileOptions`.
+    insist
+        Pulses are simulated or measured as given, whatever they look like.
     pulses
         Pulses in memory, which are read in place of a file.
     """
@@ -133,7 +126,9 @@ class PulseFile:
 Source: TypeAlias = str | Path | PulseFile | Pulses
 
 
-def pulse_file(source: Source, options: FileOptions = FileOptions()) -> PulseFile:
+def pulse_file(
+    source: Source, options: FileOptions = FileOptions(), insist: bool = False
+) -> PulseFile:
     """A file of pulses from what a user gives: a path, a `PulseFile`, or `Pulses` in memory.
 
     Raises
@@ -141,9 +136,10 @@ def pulse_file(source: Source, options: FileOptions = FileOptions()) -> PulseFil
     CpunetError
         If it is none of these, or options are given for what has its own.
     """
+    how = asdict(options) | {"insist": insist}
     if isinstance(source, str | Path):
-        return PulseFile(Path(source), **asdict(options))
-    given = ", ".join(name for name, value in asdict(options).items() if value)
+        return PulseFile(Path(source), **how)
+    given = ", ".join(name for name, value in how.items() if value)
     if given and isinstance(source, PulseFile | Pulses):
         raise CpunetError(
             f"{given}: is an option of a path", "give it to the PulseFile, or leave it out"
