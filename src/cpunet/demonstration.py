@@ -8,7 +8,8 @@ from pathlib import Path
 import cpunet
 from cpunet.outputs import refuse_existing
 
-EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
+EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=600,SEP=150,DEP=150"
+COARSE = ("step_ns=2",)  # of the drift, in a quick look: half the time
 GLANCE = ("SEP mean pulse", "SEP current_amplitude", "SEP single pulse")
 QUICK_LOOK = (
     "This is a quick look: with so few events the response is not well learned, and scores "
@@ -26,7 +27,7 @@ def demo(
     out
         Folder of stand, run and report.
     quick
-        Few events, the scores and three figures.
+        Few events, drifted in coarser steps; the scores and three figures.
     seed
         Seed of all random numbers.
     force
@@ -47,7 +48,8 @@ def demo(
     for part in parts:
         refuse_existing(part, force=force)
     in_stand, in_run, in_report = parts
-    stand = cpunet.make_stand(in_stand, events=FEW if quick else EVENTS, seed=seed, force=force)
+    size, steps = (FEW, COARSE) if quick else (EVENTS, ())
+    stand = cpunet.make_stand(in_stand, events=size, settings=steps, seed=seed, force=force)
     run = cpunet.train(stand.sim, stand.data, in_run, seed=seed, force=force)
     assert isinstance(run, cpunet.Run)  # the stand has one channel
     report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth, seed=seed)

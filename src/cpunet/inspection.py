@@ -266,30 +266,19 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
 
 def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
     """Describe the pulses of one table."""
+    from cpunet.pulses import provenance
     from cpunet.pulses.description import describe_pulses
 
     source = file.open()
     blocks = source.blocks()
     first = next(blocks)  # a few thousand
     lines = describe_pulses(source, chain([first], blocks), recipe.peaks)
-    if not _is_measured(source, first):
+    found = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
+    # translated windows look measured, but are not raw traces
+    translated = provenance.TRANSLATED_BY in provenance.recorded_attributes(source)
+    if found is None or found.side != "measured" or translated:
         return lines
     return [*lines, *_traces(source, first, recipe, quality)]
-
-
-def _is_measured(source: PulseSource, first: Pulses) -> bool:
-    """Whether they are raw traces, by what the file records or by the shape of the pulses."""
-    from cpunet.pulses.provenance import (
-        TRANSLATED_BY,
-        apparent_side,
-        recorded_attributes,
-        recorded_side,
-    )
-
-    found = recorded_side(source) or apparent_side(first.waveforms)
-    # translated windows look measured, but are not raw traces
-    translated = TRANSLATED_BY in recorded_attributes(source)
-    return found is not None and found.side == "measured" and not translated
 
 
 def _traces(source: PulseSource, first: Pulses, recipe: Recipe, quality: bool) -> Lines:

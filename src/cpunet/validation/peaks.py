@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
@@ -190,12 +192,14 @@ def classifier_tests(
     seed
         Seed of the folds.
     """
-    tested: dict[str, TwoSample | Missing] = {}
-    data = peak.windows("data")
-    for method in list(values)[1:]:
+    data, methods = peak.windows("data"), list(values)[1:]
+
+    def tested(method: str) -> TwoSample | Missing:
         others, features = peak.windows(method), (values["data"], values[method])
         try:
-            tested[method] = classifier_auc(data, others, seed=seed, features=features)
+            return classifier_auc(data, others, seed=seed, features=features)
         except CpunetError as error:
-            tested[method] = Missing(str(error))
-    return tested
+            return Missing(str(error))
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        return dict(zip(methods, pool.map(tested, methods), strict=True))
