@@ -15,7 +15,7 @@ from cpunet import CpunetError, FileOptions, PulseFile, info, load
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.description import trace_properties
+from cpunet.pulses.description import left_out, trace_properties
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits
@@ -63,7 +63,7 @@ def test_tails_of_a_bench_detector(reference_data: Path):
     path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
     file = PulseFile(path, kev_per_adc=calibrated)
     tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
-    lines = info(path, read=FileOptions(kev_per_adc=calibrated)).lines
+    lines = info(path, read=FileOptions(kev_per_adc=calibrated), quality=True).lines
     assert lines[-2:] == tails.describe().in_words()
     assert tails.describe().rate_khz == pytest.approx(1.4, abs=0.3)
     assert len(tails.kev) == 1000
@@ -73,7 +73,7 @@ def test_tails_of_a_bench_detector(reference_data: Path):
 def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
-    told = dict(info(path).lines)["pile-up tails"]
+    told = dict(info(path, quality=True).lines)["pile-up tails"]
     assert told.startswith("not known: only 0 of 40 traces can be prepared")
 
 
@@ -154,15 +154,15 @@ def test_the_properties_are_those_that_were_made():
     traces = np.round(traces + rng.normal(0, 6, traces.shape))
     traces[:3] = np.minimum(traces[:3], 2000)
     pulses = Pulses.of(traces, dt_ns=16, energy_kev=np.linspace(1000, 2000, n))
-    told = dict(trace_properties([pulses], RECIPE))
+    told = dict(trace_properties(pulses, RECIPE.preparation))
     adc, kev = (float(part.split()[0]) for part in told["noise"].split(", ")[:2])
     assert adc == pytest.approx(6, rel=0.1)
     # 1000 keV are 2000 ADC, of which an eighth has decayed at the end of a window
     assert kev == pytest.approx(3, rel=0.04)
     assert float(told["decay"].split()[0]) == pytest.approx(50, rel=0.02)
-    assert told["left out"].startswith("3 saturated")
+    assert left_out(pulses, RECIPE).startswith("3 saturated")
     with pytest.raises(CpunetError, match="only 0 of 60 traces hold a pulse"):
-        trace_properties([Pulses.of(np.ones((n, 200)), dt_ns=16)], RECIPE)
+        trace_properties(Pulses.of(np.ones((n, 200)), dt_ns=16), RECIPE.preparation)
 
 
 def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
@@ -259,7 +259,7 @@ def test_the_command_line(tmp_path, capsys):
 
 def test_measured_traces_are_described(reference_data: Path):
     """A bench detector, whose properties are seen by eye."""
-    told = dict(info(reference_data / "real" / "th228.fcio").lines)
+    told = dict(info(reference_data / "real" / "th228.fcio", quality=True).lines)
     assert float(told["decay"].removesuffix(" µs")) == pytest.approx(78.9, rel=0.03)
     adc, _, words = told["noise"].partition(" ADC ")
     assert float(adc) == pytest.approx(15, abs=2)

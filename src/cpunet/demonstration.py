@@ -9,6 +9,7 @@ import cpunet
 from cpunet.outputs import refuse_existing
 
 EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
+COARSE = ("step_ns=2",)  # of the drift, in a quick look: half the time
 GLANCE = ("SEP mean pulse", "SEP current_amplitude", "SEP single pulse")
 QUICK_LOOK = (
     "This is a quick look: with so few events the response is not well learned, and scores "
@@ -26,7 +27,7 @@ def demo(
     out
         Folder of stand, run and report.
     quick
-        Few events, the scores and three figures.
+        Few events, drifted in coarser steps; the scores and three figures.
     force
         Replace an existing demonstration.
 
@@ -45,7 +46,8 @@ def demo(
     for part in parts:
         refuse_existing(part, force=force)
     in_stand, in_run, in_report = parts
-    stand = cpunet.make_stand(in_stand, events=FEW if quick else EVENTS, force=force)
+    size, steps = (FEW, COARSE) if quick else (EVENTS, ())
+    stand = cpunet.make_stand(in_stand, events=size, settings=steps, force=force)
     run = cpunet.train(stand.sim, stand.data, in_run, force=force)
     assert isinstance(run, cpunet.Run)  # the stand has one channel
     report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
-from cpunet.pulses.channels import ALL, channels_of
-from cpunet.pulses.reading.files import FileOptions, PulseFile, pulse_file
+from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.settings import Set, key_values
 from cpunet.simulation.geometry import Detector
@@ -21,12 +21,12 @@ from cpunet.tables import Lines, aligned, text_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from cpunet.pulses.container import Pulses
     from cpunet.recipes.schema import Recipe
 
     Loaded: TypeAlias = cpunet.Run | cpunet.Report | cpunet.Stand | PulseFile
 
 _DPI = 150
-_FIRST_PULSES, _TAILS_BLOCK = 256, 4096  # traces read at a time
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,15 +87,16 @@ def info(
     read: FileOptions = FileOptions(),
     units: str = "",
     settings: Set = (),
+    quality: bool = False,
     out: str | Path | None = None,
     force: bool = False,
 ) -> InfoResult:
     """Say what is in a file, detector, run, stand or report.
 
     Of pulses: events, sampling, energies, peaks and provenance; of measured traces, also
-    decay, noise, what quality cuts leave out, and pile-up tails. Of hits: events, energies and
-    where they lie. Of a detector: its capacitance, depletion voltage and fields. Of a run: what
-    was trained on what, and how well it fits.
+    decay and noise, and on request what quality cuts leave out, and pile-up tails. Of hits:
+    events, energies and where they lie. Of a detector: its capacitance, depletion voltage and
+    fields. Of a run: what was trained on what, and how well it fits.
 
     Parameters
     ----------
@@ -108,6 +109,8 @@ def info(
         Units of lengths and energies that a file of hits does not name, as ``cm,keV``.
     settings
         Override a value of the detector looked at: bias_V=3500 (repeatable).
+    quality
+        Of measured traces also what quality cuts leave out, and pile-up tails: some seconds.
     out
         Figure of the fields of a detector: .png, .pdf or .svg.
     force
@@ -122,13 +125,15 @@ def info(
     --------
     cpunet info raw.lh5 --table all
 
+    cpunet info raw.lh5 --quality
+
     cpunet info icpc --set bias_V=3500 --out icpc.png
 
     cpunet info hits.csv --units mm,keV
     """
     if out is not None:
         refuse_picture(Path(out), path, read.energy, force=force)
-    found = _look(path, read, units, key_values(settings))
+    found = _look(path, read, units, key_values(settings), quality)
     if out is not None:
         found.save(out, force)
     return found
@@ -169,7 +174,11 @@ def load(path: str | Path) -> Loaded:
 
 
 def _look(
-    path: str | Path, read: FileOptions, units: str, settings: Mapping[str, Any]
+    path: str | Path,
+    read: FileOptions,
+    units: str,
+    settings: Mapping[str, Any],
+    quality: bool,
 ) -> InfoResult:
     if holds_detector(path):
         return _detector(read_detector(path, settings), str(path))
@@ -187,7 +196,7 @@ def _look(
         for name, one in hits.items():
             lines += [("detector", name), *one]
         return InfoResult(str(path), lines)
-    return _file(pulse_file(path, read), recipe)
+    return _file(pulse_file(path, read), recipe, quality)
 
 
 def _folder(path: str | Path) -> InfoResult:
@@ -214,22 +223,25 @@ def _detector(detector: Detector, path: str) -> InfoResult:
     return InfoResult(path, fields_in_words(detector, fields), _draw=draw)
 
 
-def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
-    from cpunet.pulses.reading.files import table_sizes
-
+def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
     path = str(file.path)
     if file.table == ALL:
+        from cpunet.pulses.channels import channels_of  # processes, bars
+
         texts, ok = [], True
         for name, one in channels_of(file).items():
             try:
-                text = aligned(_pulses(one, recipe))
+                text = aligned(_pulses(one, recipe, quality))
             except CpunetError as error:
                 text, ok = str(error).removeprefix(f"{path}: "), False
             texts.append(("", f"{name}:\n{text}"))
         return InfoResult(path, texts, ok)
-    tables = table_sizes(file.path) if file.table is None else {}
-    if len(tables) < 2:
-        return InfoResult(path, _pulses(file, recipe))
+    try:
+        return InfoResult(path, _pulses(file, recipe, quality))
+    except CpunetError:
+        tables = table_sizes(file.path) if file.table is None else {}
+        if len(tables) < 2:
+            raise
     rows: list[list[object]] = []
     for name, number in tables.items():
         try:
@@ -245,45 +257,39 @@ def _file(file: PulseFile, recipe: Recipe) -> InfoResult:
     )
 
 
-def _pulses(file: PulseFile, recipe: Recipe) -> list[tuple[str, str]]:
+def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
     """Describe the pulses of one table."""
+    from cpunet.pulses import provenance
     from cpunet.pulses.description import describe_pulses
 
     source = file.open()
-    lines = describe_pulses(source, recipe.peaks)
-    return lines + _traces(source, recipe) if _is_measured(source) else lines
-
-
-def _is_measured(source: PulseSource) -> bool:
-    """Whether they are raw traces, by what the file records or by the shape of the pulses."""
-    from cpunet.pulses.provenance import (
-        TRANSLATED_BY,
-        apparent_side,
-        recorded_attributes,
-        recorded_side,
-    )
-
-    found = recorded_side(source)
-    if found is None:
-        first = next(iter(source.blocks(_FIRST_PULSES)), None)
-        found = None if first is None else apparent_side(first.waveforms)
+    blocks = source.blocks()
+    first = next(blocks)  # a few thousand
+    lines = describe_pulses(source, chain([first], blocks), recipe.peaks)
+    found = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
     # translated windows look measured, but are not raw traces
-    translated = TRANSLATED_BY in recorded_attributes(source)
-    return found is not None and found.side == "measured" and not translated
+    translated = provenance.TRANSLATED_BY in provenance.recorded_attributes(source)
+    if found is None or found.side != "measured" or translated:
+        return lines
+    return [*lines, *_traces(source, first, recipe, quality)]
 
 
-def _traces(source: PulseSource, recipe: Recipe) -> list[tuple[str, str]]:
-    """Properties of measured traces, and the pile-up tails under them."""
-    from cpunet.electronics.pile_up_tails import PileUpTails
-    from cpunet.pulses.baselines import Baselines
-    from cpunet.pulses.description import BLOCK, trace_properties
+def _traces(source: PulseSource, first: Pulses, recipe: Recipe, quality: bool) -> Lines:
+    """Properties of measured traces; on request their quality and the pile-up tails."""
+    from cpunet.pulses.description import left_out, trace_properties
 
     try:
-        lines = trace_properties(source.blocks(BLOCK), recipe)
+        lines = trace_properties(first, recipe.preparation)
     except CpunetError as error:
         lines = [("", f"cannot be described: {error}")]
+    if not quality:
+        return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
+    from cpunet.electronics.pile_up_tails import PileUpTails
+    from cpunet.pulses.baselines import Baselines
+
+    lines.append(("left out", left_out(first, recipe)))
     try:
-        baselines = Baselines.of(source.blocks(_TAILS_BLOCK), recipe.preparation)
+        baselines = Baselines.of(source.blocks(), recipe.preparation)
         return lines + PileUpTails.of(baselines).describe().in_words()
     except CpunetError as error:
         return [*lines, ("pile-up tails", f"not known: {error}")]

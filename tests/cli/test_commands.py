@@ -60,7 +60,7 @@ def test_the_help_does_not_load_torch(words):
 
 
 @pytest.mark.parametrize("name", ["pulses.lh5", "pulses.h5", "pulses.npy", "pulses.npz"])
-def test_plain_files_load_neither_torch_nor_the_lh5_library(stand, tmp_path, name):
+def test_plain_files_load_neither_torch_nor_compiled_loops(stand, tmp_path, name):
     """A look at a file waits for nothing that networks, compressed traces or figures need."""
     file, traces = tmp_path / name, stand.data_waveforms
     if name.endswith(".lh5"):
@@ -73,7 +73,7 @@ def test_plain_files_load_neither_torch_nor_the_lh5_library(stand, tmp_path, nam
     else:
         np.save(file, traces)
     period = [] if name.endswith(".lh5") else ["--dt-ns", "16"]
-    heavy = "torch lh5 lgdo dspeed pandas matplotlib hist"
+    heavy = "torch numba scipy lh5 lgdo dspeed pandas matplotlib hist"
     told = told_without(["info", str(file), *period], heavy)
     assert f"{len(traces)} of {traces.shape[1]} samples, every 16 ns" in told
 

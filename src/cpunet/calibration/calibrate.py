@@ -43,7 +43,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
-from cpunet.pulses.channels import ALL, CHANNEL, Outcome, Pair, each_channel, paired
+from cpunet.pulses.channels import CHANNEL, Outcome, Pair, each_channel, paired
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
@@ -51,7 +51,7 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.pulses.reading.files import PulseFile, ReadOptions, Source
+from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed

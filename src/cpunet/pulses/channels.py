@@ -16,11 +16,10 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import MARKER
 from cpunet.processes import outcomes, usable_cores
 from cpunet.progress import stage
-from cpunet.pulses.reading.files import PulseFile, tables_of
+from cpunet.pulses.reading.files import ALL, PulseFile, tables_of
 
 log = logging.getLogger(__name__)
 
-ALL = "all"  # in place of the name of a table
 CHANNEL = "{channel}"  # in the name of an energy column
 
 R = TypeVar("R")

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from itertools import islice
 
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import label_peaks
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.energies import amplitude
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.spectrum import suggested_calibration
-from cpunet.recipes.schema import PeakConfig, Recipe
+from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
 from cpunet.tables import counted, span
 
-BLOCKS, BLOCK = 4, 1024  # number of blocks, traces per block: a few thousand are enough
 MIN_SIGMAS = 5.0  # least height of a pulse in standard deviations of the noise
 MIN_BASELINE = 16  # minimum number of samples to estimate the noise
 MIN_NUMBER = 10  # minimum number of traces
@@ -25,55 +23,73 @@ MIN_NUMBER = 10  # minimum number of traces
 Words = list[tuple[str, str]]
 
 
-def trace_properties(blocks: Iterable[Pulses], recipe: Recipe) -> Words:
+def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
     """Describe the traces of a digitiser.
 
     Parameters
     ----------
-    blocks
-        Measured traces of one channel; the first few thousand are used.
-    recipe
-        Settings of preparation and quality cuts.
+    whole
+        Measured traces of one channel.
+    config
+        Preparation settings.
 
     Returns
     -------
     list
-        Names and texts: decay time by the median of the tails, median RMS of the baselines,
-        and what preparation and quality cuts leave out.
+        Names and texts: decay time by the median of the tails, and median RMS of the baselines.
 
     Raises
     ------
     CpunetError
         If too few traces contain a pulse.
     """
-    # compiled loops, which a look at plain pulses does not need
-    from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
-
-    whole = Pulses.concatenate(list(islice(blocks, BLOCKS)))
     first = whole.waveforms[:, : max(MIN_BASELINE, whole.length // 20)]
     with np.errstate(invalid="ignore", over="ignore"):
         height, rms = whole.waveforms.max(axis=1) - first.mean(axis=1), first.std(axis=1)
         is_pulse = np.isfinite(height) & (height > MIN_SIGMAS * rms)
     if is_pulse.sum() < MIN_NUMBER:
         raise CpunetError(f"only {is_pulse.sum()} of {len(whole)} traces hold a pulse")
-    noise_adc = float(np.median(rms[is_pulse].astype(float)))
+    traces, noise_adc = whole.waveforms[is_pulse], float(np.median(rms[is_pulse].astype(float)))
     noise = f"{noise_adc:.3g} ADC"
-    kev_per_adc = whole.energy_kev[is_pulse] / amplitude(whole.waveforms[is_pulse])
+    kev_per_adc = whole.energy_kev[is_pulse] / amplitude(traces)
     if np.isfinite(kev_per_adc).sum() >= MIN_NUMBER:
         noise += f", {noise_adc * float(np.nanmedian(kev_per_adc)):.3g} keV"
-    prepared, slope = prepare(whole, recipe.preparation, "measured"), 0.0
-    if len(prepared) >= MIN_NUMBER:
-        slope = float(np.median(prepared.tail_slope))
-        prepared = apply_cuts(prepared, fit_cuts(prepared, recipe.cuts))
-    left_out = counted(prepared.rejections) or "none"
+    slope = _tail_slope(traces, config) * 1e3 / whole.dt_ns
     return [
-        ("decay", f"{-1e3 / slope:.3g} µs" if slope < 0 else "the tails do not decay"),
+        ("decay", f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"),
         ("noise", f"{noise} (RMS of a baseline, median)"),
-        ("left out", f"{left_out} of {len(whole)} traces"),
     ]
 
 
-def describe_pulses(source: PulseSource, peaks: Mapping[str, PeakConfig]) -> Words:
+def _tail_slope(traces: FloatArray, config: PreparationConfig) -> float:
+    """Slope per sample of the logarithm of the tails, median; 0 if there are few."""
+    # where a window has them, but without its compiled loops, which load in a second
+    top = traces.argmax(axis=1)
+    known = (top >= config.samples_before) & (top + config.samples_after <= traces.shape[1])
+    start = top[known, np.newaxis] - config.samples_before
+    windows = np.take_along_axis(traces[known], start + np.arange(config.length), axis=1)
+    tails = windows[:, -config.decay_fit_samples :].astype(float)
+    tails -= windows[:, : config.baseline_samples].mean(axis=1, keepdims=True, dtype=float)
+    tails = tails[tails.min(axis=1) > 0]
+    lever = np.arange(tails.shape[1]) - (tails.shape[1] - 1) / 2
+    slopes = np.log(tails) @ lever / (lever @ lever)
+    return float(np.median(slopes)) if len(slopes) >= MIN_NUMBER else 0.0
+
+
+def left_out(whole: Pulses, recipe: Recipe) -> str:
+    """What preparation and quality cuts of a recipe leave out of measured traces, and why."""
+    # compiled loops, which a look at pulses does not need
+    from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
+
+    prepared = prepare(whole, recipe.preparation, "measured")
+    if len(prepared) >= MIN_NUMBER:
+        prepared = apply_cuts(prepared, fit_cuts(prepared, recipe.cuts))
+    return f"{counted(prepared.rejections) or 'none'} of {len(whole)} traces"
+
+
+def describe_pulses(
+    source: PulseSource, blocks: Iterable[Pulses], peaks: Mapping[str, PeakConfig]
+) -> Words:
     """Describe the pulses of one table, by names and texts.
 
     The file is read in blocks; only energies or amplitudes of all pulses are held in memory.
@@ -82,12 +98,14 @@ def describe_pulses(source: PulseSource, peaks: Mapping[str, PeakConfig]) -> Wor
     ----------
     source
         The opened file.
+    blocks
+        Its pulses.
     peaks
         Gamma lines to count.
     """
     energies, heights, extremes = [], [], [np.empty(0)]
     n_pulses = n_not_finite = n_constant = 0
-    for block in source.blocks():
+    for block in blocks:
         n_pulses += len(block)
         energies.append(known := block.energy_kev[np.isfinite(block.energy_kev)])
         if not len(known):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import chain
 from typing import Annotated, Any
 
@@ -18,7 +18,6 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from cpunet.settings import Config, Millimetres
-from cpunet.simulation.outline import GERMANIUM, Outline, insides, regions
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -247,7 +246,7 @@ class Detector(Config):
         >>> read_detector("icpc").inside([0, 0, 12, 40], [10, 90, 1, 50])
         array([ True, False, False,  True])
         """
-        return np.asarray(self._at(insides, r, z), np.bool_)
+        return np.asarray(self._at("insides", r, z), np.bool_)
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
@@ -258,6 +257,8 @@ class Detector(Config):
         >>> read_detector("icpc").active([0, 0, 12, 40], [10, 1, 1, 50])
         array([ True, False, False, False])
         """
+        from cpunet.simulation.outline import GERMANIUM  # see `_at`
+
         return np.asarray(self.region(r, z) == GERMANIUM)
 
     def region(self, r: npt.ArrayLike, z: npt.ArrayLike) -> RegionArray:
@@ -265,12 +266,15 @@ class Detector(Config):
 
         Surfaces belong to the contacts and to the ditch.
         """
-        return np.asarray(self._at(regions, r, z), np.int8)
+        return np.asarray(self._at("regions", r, z), np.int8)
 
-    def _at(self, loop: Callable[..., Any], r: npt.ArrayLike, z: npt.ArrayLike) -> Any:
+    def _at(self, loop: str, r: npt.ArrayLike, z: npt.ArrayLike) -> Any:
         """What a loop of `cpunet.simulation.outline` finds at each place."""
+        from cpunet.simulation import outline  # compiled, which few users of a detector need
+
         r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
-        return loop(Outline.of(self), r.flatten(), z.flatten()).reshape(r.shape)
+        found = getattr(outline, loop)(outline.Outline.of(self), r.flatten(), z.flatten())
+        return found.reshape(r.shape)
 
     def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
         """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""

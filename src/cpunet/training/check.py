@@ -19,7 +19,7 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
-from cpunet.pulses.channels import ALL, Pair, paired
+from cpunet.pulses.channels import Pair, paired
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.loading import (
     InputSet,
@@ -30,7 +30,7 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.parameters import Values, current_amplitude
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.preparation import Kind, Rejection
-from cpunet.pulses.reading.files import ReadOptions, Source
+from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe

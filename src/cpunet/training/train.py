@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
-from cpunet.pulses.channels import ALL, Outcome, each_channel, paired
-from cpunet.pulses.reading.files import ReadOptions, Source
+from cpunet.pulses.channels import Outcome, each_channel, paired
+from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 
 if TYPE_CHECKING:
     from cpunet.recipes.schema import Recipe

@@ -19,9 +19,9 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.processes import outcomes
 from cpunet.progress import stage
-from cpunet.pulses.channels import ALL, Outcome, Pair, channels_of, each_channel, own_folder
+from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own_folder
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.files import FileOptions, PulseFile, Source, pulse_file
+from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run
 from cpunet.translation.file_translation import Counts, FileTranslation
 from cpunet.translation.options import NONE, Adc, TranslateOptions

@@ -11,8 +11,8 @@ from typing import Any
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside
-from cpunet.pulses.channels import ALL, Outcome, Pair, each_channel, own_folder, paired
-from cpunet.pulses.reading.files import ReadOptions, Source
+from cpunet.pulses.channels import Outcome, Pair, each_channel, own_folder, paired
+from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, as_run
 from cpunet.validation.compare import compared

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from cpunet.pulses.reading.source import PulseSource
 
 
+ALL = "all"  # in place of the name of a table
 _TOLD = ("table", "energy", "kev_per_adc", "dt_ns")  # what a run keeps
 
 
