@@ -331,6 +331,13 @@ class JointProblem:
         problem.weigh_like(self)
         return problem
 
+    def of_bands(self, bands: Sequence[Band]) -> JointProblem:
+        """The same comparison, weights included, of parts of these bands, wholly used."""
+        part = replace(self, bands=bands, held=True)  # held ones need no weights of their own
+        part.few = None
+        part.weigh_like(self)
+        return part
+
     def weigh_like(self, other: JointProblem) -> None:
         """Adopt errors and correlations of the same functions from another problem."""
         self._sigma, self._whiten = other._sigma, other._whiten

@@ -25,6 +25,7 @@ from cpunet.calibration.joint_problem import (
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.calibration.result import Calibrated
+from cpunet.calibration.sampling import of_events
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
@@ -238,21 +239,15 @@ class Search:
         parameters, vector = problem.parameters, problem.parameters.vector()
         residuals = problem.residuals(vector)
         jacobian = problem.jacobian(vector, residuals)
-        halves = []
-        for k in range(2):
-            half = self._problem(
-                parameters.chain.response,
-                problem.nearby,
-                parameters.free,
-                bands=[_half(band, k) for band in self._bands],
-                held=True,  # with the weights of all, and all of its pulses
-            )
-            half.few = None
-            half.weigh_like(problem)
-            half.parameters.coordinates = parameters.coordinates.copy()
-            halves.append(half.residuals(vector)[: problem.moments])
+        halves = [
+            problem.of_bands([_half(band, k) for band in problem.bands]).residuals(vector)
+            for k in range(2)
+        ]
         selection = Selection(
-            jacobian, residuals, np.array(halves), parameters.coordinates[parameters.free]
+            jacobian,
+            residuals,
+            np.array(halves)[:, : problem.moments],
+            parameters.coordinates[parameters.free],
         )
         return Information.of(problem, jacobian), selection
 
@@ -304,6 +299,10 @@ class Search:
             problem, found = best
             promised, information, _ = self._examined(problem)
         before.weigh_like(problem)
+        move, covariance = of_events(problem)
+        parameters = problem.parameters
+        moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
+        parameters.set(moved)
         chi_square = problem.chi_square()
         mean, spread = problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
@@ -312,7 +311,7 @@ class Search:
         rises.sort(key=lambda one: (one[0] is not problem, one[1]))
         return Calibrated(
             problem=problem,
-            covariance=scale**2 * found.covariance,
+            covariance=scale**2 * covariance,
             chi_square_before=before.chi_square(),
             pulls_before=before.pulls(),
             chi_square=chi_square,
