@@ -193,7 +193,9 @@ def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
     parameters, physics = calibrated.problem.parameters, calibrated.physics
     centres, widths = physics.priors(parameters.given)
     errors = np.sqrt(calibrated.covariance.diagonal()[parameters.n_chain :])
-    errors_all = calibrated.scale * calibrated.information.errors()
+    information = calibrated.information
+    # sampling noise makes those with all free larger, too
+    larger = errors / information.errors(parameters.free)
     free = {}
     for k, (i, error) in enumerate(zip(parameters.free, errors, strict=True)):
         name, x = physics.nuisances[i].name, float(parameters.coordinates[i])
@@ -202,7 +204,7 @@ def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
         free[name] = FreeParameter(
             value=value,
             error=own_error,
-            error_all=physics.in_own_unit(i, x, errors_all[i])[1],
+            error_all=physics.in_own_unit(i, x, larger[k] * information.errors()[i])[1],
             simulated=physics.nominal(physics.nuisances[i]),
             doubt=_doubt(calibrated, k, value),
             prior={
