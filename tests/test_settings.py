@@ -15,8 +15,12 @@ from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.geometry_readers import detector_and_settings, read_detector
-from cpunet.simulation.settings import Shift, SimulationSettings
+from cpunet.simulation.settings import (
+    Shift,
+    SimulationSettings,
+    detector_and_settings,
+    read_detector,
+)
 from synthetic import one_line
 
 KINDS = (Electronics, Recipe, Detector, SimulationSettings, Shift)

@@ -31,7 +31,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_problem import Band, ResponseProblem
+from cpunet.training.response_problem import Band, Parameters, ResponseProblem
 from cpunet.training.response_starts import set_decay
 
 log = logging.getLogger(__name__)
@@ -89,6 +89,7 @@ class Search:
         self._functions = [SlicedFunctions(band.moments) for band in self._bands]
         nuisances = self.simulator.physics.nuisances
         self._all = list(range(len(nuisances)))
+        self._nominal: dict[str, float] = {}  # parameters of the chain before any fit
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
 
     def plan(self) -> Information:
@@ -153,6 +154,8 @@ class Search:
         start = ElectronicsResponse(config, dt_ns)
         problem = ResponseProblem(start, bands, draws=1)
         set_decay(start, problem.slope)
+        before = Parameters(start)
+        self._nominal = before.by_name(before.vector())
         problem = problem.of(start)
         levenberg_marquardt(problem, FIRST_STEPS, None)
         chain: ElectronicsResponse = problem.response
@@ -164,14 +167,16 @@ class Search:
         nearby: Nearby,
         free: Sequence[int],
         *,
-        bands: Sequence[Band] | None = None,
         held: bool = False,
     ) -> JointProblem:
         """Comparison near the point at which pulses were simulated."""
         parameters = JointParameters(
             copy.deepcopy(response), self.simulator.physics, nearby.centre, free, self.given
         )
-        sets = parameters, bands or self._bands, self._functions, nearby, self.energy_kev
+        # priors are about a readout, not about the one that a fit begins with
+        for k, name in enumerate(parameters.names[: parameters.n_chain]):
+            parameters.centre[k] = self._nominal.get(name, parameters.centre[k])
+        sets = parameters, self._bands, self._functions, nearby, self.energy_kev
         return JointProblem(*sets, self.recipe, self.known, held)
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:

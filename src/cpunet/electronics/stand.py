@@ -30,14 +30,13 @@ from cpunet.simulation.events import simulate_events
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.geometry_readers import detector_and_settings
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
 from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import PulseLibrary
-from cpunet.simulation.settings import Shift, SimulationSettings
+from cpunet.simulation.settings import Shift, SimulationSettings, detector_and_settings
 from cpunet.tables import counted
 
 Labels = npt.NDArray[np.int64]

@@ -21,8 +21,7 @@ from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import Set
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
-from cpunet.simulation.geometry_readers import detector_and_settings
-from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.settings import SimulationSettings, detector_and_settings
 from cpunet.simulation.signals import hit_signals
 
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.

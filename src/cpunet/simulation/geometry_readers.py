@@ -8,15 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.settings import (
-    Set,
-    checked,
-    key_values,
-    names,
-    read_text,
-    read_values,
-    words_and_files,
-)
+from cpunet.settings import Set, checked, key_values, names, read_text, read_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_metadata import (
     LIQUID_ARGON_K,
@@ -25,7 +17,6 @@ from cpunet.simulation.legend_metadata import (
     why_missing,
 )
 from cpunet.simulation.legend_metadata import detector_values as legend_values
-from cpunet.simulation.settings import SimulationSettings
 
 log = logging.getLogger(__name__)
 
@@ -138,38 +129,6 @@ def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
     if "geometry" in values:
         return _legend(values, given, name)
     return _completed({"name": Path(name).stem} | values, given, name, {})
-
-
-def detector_and_settings(
-    detector: str | Path | Detector, overrides: Set, **defaults: float
-) -> tuple[Detector, SimulationSettings]:
-    """Read a detector, and the settings of its simulation; `overrides` are values of both.
-
-    Parameters
-    ----------
-    detector
-        See `read_detector`.
-    overrides
-        Values by key, words as ``"bias_V=3500"``, or YAML files.
-    defaults
-        Settings of the simulation, unless overridden.
-
-    Raises
-    ------
-    CpunetError
-        If a file cannot be read, or a value is not allowed.
-
-    Examples
-    --------
-    >>> words = ["bias_V=3500", "hole_trapping_per_us=0.01"]
-    >>> detector, settings = detector_and_settings("icpc", words)
-    >>> detector.bias_V, settings.hole_trapping_per_us
-    (3500.0, 0.01)
-    """
-    values = words_and_files(overrides)
-    own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
-    settings = checked(SimulationSettings, defaults | own, "settings")
-    return read_detector(detector, values), settings
 
 
 def _completed(

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from cpunet.settings import Config, Set, checked, words_and_files
 from cpunet.simulation.clustering import MERGING_MM
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.velocity import VelocityFactors
 
 _Factor = Annotated[float, Field(ge=0.2, le=5)]
@@ -158,6 +159,38 @@ _SHIFTS = Path(__file__).parent / "shifts"
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+def detector_and_settings(
+    detector: str | Path | Detector, overrides: Set, **defaults: float
+) -> tuple[Detector, SimulationSettings]:
+    """Read a detector, and the settings of its simulation; `overrides` are values of both.
+
+    Parameters
+    ----------
+    detector
+        See `read_detector`.
+    overrides
+        Values by key, words as ``"bias_V=3500"``, or YAML files.
+    defaults
+        Settings of the simulation, unless overridden.
+
+    Raises
+    ------
+    CpunetError
+        If a file cannot be read, or a value is not allowed.
+
+    Examples
+    --------
+    >>> words = ["bias_V=3500", "hole_trapping_per_us=0.01"]
+    >>> detector, settings = detector_and_settings("icpc", words)
+    >>> detector.bias_V, settings.hole_trapping_per_us
+    (3500.0, 0.01)
+    """
+    values = words_and_files(overrides)
+    own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
+    settings = checked(SimulationSettings, defaults | own, "settings")
+    return read_detector(detector, values), settings
 
 
 class Shift(Config):

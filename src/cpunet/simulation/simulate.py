@@ -27,7 +27,6 @@ from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.geometry_readers import detector_and_settings
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import (
     GammaSource,
@@ -40,7 +39,7 @@ from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.library import build_library
 from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
-from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.settings import SimulationSettings, detector_and_settings
 
 log = logging.getLogger(__name__)
 
