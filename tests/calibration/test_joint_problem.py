@@ -66,7 +66,7 @@ class Numbers:
 def problem(sim, data, *, free=(0, 1), held=False, known=None, centre=(0.0, 0.0)):
     response = ElectronicsResponse(RECIPE.matching[0], 16.0)
     at = np.array(centre)
-    parameters = JointParameters(response, PHYSICS, at, free, {})
+    parameters = JointParameters(response, PHYSICS, at, free, {}, response)
     simulator = SimpleNamespace(physics=PHYSICS)
     nearby = Nearby(simulator, at, sim, {})
     slopes = {

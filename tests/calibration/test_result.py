@@ -24,7 +24,9 @@ PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
 def calibrated(values=(), given=None) -> Calibrated:
     """A calibration that ended at these values, in their order; others are as simulated."""
     response = ElectronicsResponse(load_recipe("fast").matching[0], 16.0)
-    parameters = JointParameters(response, PHYSICS, np.zeros(5), range(5), given or {})
+    parameters = JointParameters(
+        response, PHYSICS, np.zeros(5), range(5), given or {}, response
+    )
     vector = parameters.vector()
     for i, value in enumerate(values):
         nominal = PHYSICS.nominal(NUISANCES[i])

@@ -152,7 +152,7 @@ class JointParameters:
     Parameters
     ----------
     response
-        The chain. Its priors are centred on its current values.
+        The chain.
     physics
         All parameters of the physics.
     coordinates
@@ -161,6 +161,10 @@ class JointParameters:
         Positions of the free coordinates.
     given
         Priors that replace the defaults: value and error by name.
+    start
+        The chain before any fit, on which the priors of the same parameters are centred; those
+        of others on their current values. Centred on the last fit, they would make a result
+        depend on where the first one ended.
     """
 
     def __init__(
@@ -170,13 +174,16 @@ class JointParameters:
         coordinates: Values,
         free: Sequence[int],
         given: Mapping[str, tuple[float, float]],
+        start: ElectronicsResponse,
     ) -> None:
-        self.chain, self.given = Parameters(response), given
+        self.chain, self.given, self.start = Parameters(response), given, start
         self.coordinates, self.free = coordinates.copy(), list(free)
         self.n_chain = len(self.chain.labels)
         chosen = [physics.nuisances[i] for i in self.free]
         centres, widths = physics.priors(given)
-        self.centre = np.concatenate([self.chain.centre, centres[self.free]])
+        nominal, current = (p.by_name(p.centre) for p in (Parameters(start), self.chain))
+        of_chain = [nominal.get(name, value) for name, value in current.items()]
+        self.centre = np.concatenate([of_chain, centres[self.free]])
         self.widths = np.concatenate([self.chain.widths, widths[self.free]])
         # a prior may lie far from what was simulated, and its centre must be reached
         self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
@@ -326,7 +333,9 @@ class JointProblem:
     def of_chain(self, response: ElectronicsResponse) -> JointProblem:
         """The same comparison, weights included, for another chain and fixed physics."""
         physics, own = self.nearby.simulator.physics, self.parameters
-        parameters = JointParameters(response, physics, own.coordinates, [], own.given)
+        parameters = JointParameters(
+            response, physics, own.coordinates, [], own.given, own.start
+        )
         problem = replace(self, parameters=parameters, known=lambda _: np.empty(0), held=False)
         problem.weigh_like(self)
         return problem

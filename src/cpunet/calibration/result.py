@@ -195,6 +195,7 @@ def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
     errors = np.sqrt(calibrated.covariance.diagonal()[parameters.n_chain :])
     information = calibrated.information
     # sampling noise makes those with all free larger, too
+    errors_all = information.errors()
     larger = errors / information.errors(parameters.free)
     free = {}
     for k, (i, error) in enumerate(zip(parameters.free, errors, strict=True)):
@@ -204,7 +205,7 @@ def free_parameters(calibrated: Calibrated) -> dict[str, FreeParameter]:
         free[name] = FreeParameter(
             value=value,
             error=own_error,
-            error_all=physics.in_own_unit(i, x, larger[k] * information.errors()[i])[1],
+            error_all=physics.in_own_unit(i, x, larger[k] * errors_all[i])[1],
             simulated=physics.nominal(physics.nuisances[i]),
             doubt=_doubt(calibrated, k, value),
             prior={

@@ -23,9 +23,9 @@ from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Values
 
 PARTS = 8
-# Least share of the information along a direction that is not taken for noise: fast decays
-# are not linear, so that parts of the events differ by more.
-LEAST = 0.5
+# Along a direction where more than this share of the information would be noise, parts of the
+# events differ because the functions are not linear, as with fast decays: nothing is corrected.
+MOST = 0.5
 
 
 def of_events(problem: JointProblem) -> tuple[Values, Values]:
@@ -64,9 +64,10 @@ def of_parts(jacobian: Values, slopes: Values, deviations: Values) -> tuple[Valu
     noise = np.einsum("kij,kil->jl", slopes, slopes) / (parts * (parts - 1))
     gradient = np.einsum("kij,ki->j", slopes, deviations) / (parts * (parts - 1))
     inverse = np.linalg.inv(np.linalg.cholesky(jacobian.T @ jacobian))
-    share, axes = np.linalg.eigh(np.eye(len(inverse)) - inverse @ noise @ inverse.T)
-    root = inverse.T @ axes / np.maximum(share, LEAST)
-    return root @ (axes.T @ (inverse @ gradient)), root @ root.T
+    share, axes = np.linalg.eigh(inverse @ noise @ inverse.T)
+    linear = share < MOST
+    root = inverse.T @ axes / np.where(linear, 1 - share, 1)
+    return root @ (linear * (axes.T @ (inverse @ gradient))), root @ root.T
 
 
 def of_weights(n: float, d: float, p: int) -> float:

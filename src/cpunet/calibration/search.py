@@ -31,7 +31,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import set_decay
 
 log = logging.getLogger(__name__)
@@ -89,8 +89,10 @@ class Search:
         self._functions = [SlicedFunctions(band.moments) for band in self._bands]
         nuisances = self.simulator.physics.nuisances
         self._all = list(range(len(nuisances)))
-        self._nominal: dict[str, float] = {}  # parameters of the chain before any fit
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
+        dt_ns = self.simulator.physics.settings.dt_ns
+        self._start = ElectronicsResponse(self.recipe.chain, dt_ns)
+        set_decay(self._start, float(np.mean([b.moments.slope for b in self._bands])))
 
     def plan(self) -> Information:
         """Information of the pulses on all parameters that may become free, before a fit."""
@@ -148,15 +150,8 @@ class Search:
 
     def _chain(self) -> ElectronicsResponse:
         """Fit of the chain alone to some of the pulses, with the physics as simulated."""
-        config, training = self.recipe.chain, self.recipe.matching.training
-        bands = self.sets.bands(training.search_pulses)
-        dt_ns = self.simulator.physics.settings.dt_ns
-        start = ElectronicsResponse(config, dt_ns)
-        problem = ResponseProblem(start, bands, draws=1)
-        set_decay(start, problem.slope)
-        before = Parameters(start)
-        self._nominal = before.by_name(before.vector())
-        problem = problem.of(start)
+        bands = self.sets.bands(self.recipe.matching.training.search_pulses)
+        problem = ResponseProblem(copy.deepcopy(self._start), bands, draws=1)
         levenberg_marquardt(problem, FIRST_STEPS, None)
         chain: ElectronicsResponse = problem.response
         return chain
@@ -170,12 +165,10 @@ class Search:
         held: bool = False,
     ) -> JointProblem:
         """Comparison near the point at which pulses were simulated."""
+        response, physics = copy.deepcopy(response), self.simulator.physics
         parameters = JointParameters(
-            copy.deepcopy(response), self.simulator.physics, nearby.centre, free, self.given
+            response, physics, nearby.centre, free, self.given, self._start
         )
-        # priors are about a readout, not about the one that a fit begins with
-        for k, name in enumerate(parameters.names[: parameters.n_chain]):
-            parameters.centre[k] = self._nominal.get(name, parameters.centre[k])
         sets = parameters, self._bands, self._functions, nearby, self.energy_kev
         return JointProblem(*sets, self.recipe, self.known, held)
 
