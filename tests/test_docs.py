@@ -23,7 +23,7 @@ import pytest
 import yaml
 
 import cpunet
-from cpunet.cli import app, with_options
+from cpunet.cli import application, with_options
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import list_recipes, load_recipe
@@ -31,6 +31,7 @@ from cpunet.training.train import train
 from cpunet.translation.translator import RejectionWarning
 from synthetic import KEV, phased_edges, write_pulses, write_sides
 
+app = application()
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -10,8 +10,9 @@ from cyclopts import App
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from cpunet.cli import app
+from cpunet.cli import application
 
+app = application()
 FOLDER = "reference/commands"
 
 

@@ -17,6 +17,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from types import FrameType
 from typing import Any
 
@@ -32,9 +33,6 @@ from cyclopts import (
 import cpunet
 from cpunet import DISTRIBUTION, other_package
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.files import FileOptions, ReadOptions
-from cpunet.simulation.hits import HitOptions
-from cpunet.translation.options import Adc
 
 log = logging.getLogger(__name__)
 
@@ -72,10 +70,8 @@ GROUPS = {
     "export": App(name="export", help="Write a run for other software."),
     "library": App(name="library", help="Make and translate pulse-shape libraries."),
 }
-# Parameters whose options have other names; those of these classes are options of their own.
+# Parameters whose options have other names.
 SHORT = {"electronics": "preset", "settings": "set"}
-for _options in (Adc, FileOptions, HitOptions, ReadOptions):
-    Parameter(name="*", accepts_keys=True)(_options)
 
 DEBUG, USAGE, BUG = "--debug", 2, 1
 HELP = {"--help", "-h"}
@@ -124,6 +120,21 @@ def _made() -> App:
 app = _made()
 
 
+@cache
+def application() -> App:
+    """The application, in which parameters of these classes are options of their own.
+
+    Their modules load NumPy, which the list of all commands need not wait for.
+    """
+    from cpunet.pulses.reading.files import FileOptions, ReadOptions
+    from cpunet.simulation.hits import HitOptions
+    from cpunet.translation.options import Adc
+
+    for options in (Adc, FileOptions, HitOptions, ReadOptions):
+        Parameter(name="*", accepts_keys=True)(options)
+    return app
+
+
 def run(words: Sequence[str]) -> int:
     """Run the command of some words, print its result, and return the exit status.
 
@@ -133,8 +144,9 @@ def run(words: Sequence[str]) -> int:
         If the words are no command, or the command fails; parameters, which stand in
         backticks, are named as the options that they are.
     """
+    made = app if not words or words[0].startswith("-") else application()
     try:
-        result: Any = app(words, exit_on_error=False, print_error=False)
+        result: Any = made(words, exit_on_error=False, print_error=False)
     except CycloptsError as error:
         command = " ".join(["cpunet", *(error.command_chain or ())])
         raise CpunetError(_wrong_usage(error), f"see {command} --help") from error
