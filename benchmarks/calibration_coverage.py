@@ -118,7 +118,7 @@ def experiment(
     return {
         "group": group,
         "seed": seed,
-        "pulses": len(search.energy_kev),
+        "pulses": len(search.sets.sim),
         "chi_square": calibrated.chi_square / calibrated.problem.moments,
         "by_chance": calibrated.problem.by_chance[0] / calibrated.problem.moments,
         "rounds": calibrated.rounds,
@@ -166,7 +166,6 @@ def _search(
     search = Search(
         simulator=Simulator(stored.hits[sim.index], physics),
         sets=PulseSets(sim.pulses, data.pulses, noise, recipe, np.random.default_rng(seed)),
-        energy_kev=sim.pulses.energy_kev,
         recipe=recipe,
         given={k: v for k, v in GIVEN.items() if k in {n.name for n in physics.nuisances}},
         chosen=True,

@@ -112,7 +112,7 @@ def _at_these_physics(
     problem: JointProblem, chain: ElectronicsResponse, sets: PulseSets, training: MatchingConfig
 ) -> ResponseProblem:
     """Comparison for the chain alone, of some of the pulses with the physics of a problem."""
-    waveforms = problem.prepared(problem.parameters.coordinates).waveforms
+    waveforms = problem.windows(problem.parameters.coordinates)
     bands = [
         replace(band, sim=replace(band.sim, sim=waveforms[band.rows]))
         for band in sets.bands(training.search_pulses)

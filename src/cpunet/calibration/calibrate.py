@@ -317,7 +317,6 @@ class _Job:
         return Search(
             simulator=Simulator(hits, physics, simulated),
             sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
-            energy_kev=pulses.energy_kev,
             recipe=self.recipe,
             given={k: v for k, v in given.items() if k != DEPLETION},
             known=known_depletion(physics, given.get(DEPLETION)),

@@ -13,9 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg
 
-from cpunet.calibration.nearby import Nearby
+from cpunet.calibration.nearby import FloatArray, Nearby, cut
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -23,7 +24,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.moments import Moments, Readings
-from cpunet.training.response_problem import Band, Parameters
+from cpunet.training.response_problem import Band, SmoothParameters
 from cpunet.training.translated import SimulatedSide
 
 RIDGE = 0.05  # fraction of the identity in the correlation matrix of the functions
@@ -176,12 +177,12 @@ class JointParameters:
         given: Mapping[str, tuple[float, float]],
         start: ElectronicsResponse,
     ) -> None:
-        self.chain, self.given, self.start = Parameters(response), given, start
+        self.chain, self.given, self.start = SmoothParameters(response), given, start
         self.coordinates, self.free = coordinates.copy(), list(free)
         self.n_chain = len(self.chain.labels)
         chosen = [physics.nuisances[i] for i in self.free]
         centres, widths = physics.priors(given)
-        nominal, current = (p.by_name(p.centre) for p in (Parameters(start), self.chain))
+        nominal, current = (p.by_name(p.centre) for p in (SmoothParameters(start), self.chain))
         of_chain = [nominal.get(name, value) for name, value in current.items()]
         self.centre = np.concatenate([of_chain, centres[self.free]])
         self.widths = np.concatenate([self.chain.widths, widths[self.free]])
@@ -189,10 +190,7 @@ class JointParameters:
         self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
         self.reach = np.array([nuisance.reach for nuisance in chosen])
         self.steps = np.concatenate([self.chain.steps, FINITE * self.reach])
-        self.names = (
-            *self.chain.by_name(self.chain.vector()),
-            *(nuisance.name for nuisance in chosen),
-        )
+        self.names = tuple(nuisance.name for nuisance in chosen)
         bounds = [n.bounds(physics.nominal(n)) for n in chosen]
         low, high = np.reshape(bounds, (len(chosen), 2)).T
         self.low = np.concatenate([self.chain.low, low])
@@ -235,8 +233,6 @@ class JointProblem:
         Functions of each band.
     nearby
         Pulses near a point of the physics.
-    energy_kev
-        Energies of its events in keV.
     recipe
         Recipe with the preparation of simulated pulses.
     known
@@ -250,7 +246,6 @@ class JointProblem:
     bands: Sequence[Band]
     functions: Sequence[SlicedFunctions]
     nearby: Nearby
-    energy_kev: Values
     recipe: Recipe
     known: Callable[[Values], Values] = lambda _: np.empty(0)
     held: bool = False
@@ -261,6 +256,7 @@ class JointProblem:
 
     def __post_init__(self) -> None:
         self.few = fewest(self.bands) if self.held else None
+        self._placed: tuple[Nearby, npt.NDArray[np.int64]] | None = None
         self._translated: dict[int | None, tuple[Nearby, Values, list[SimulatedSide]]] = {}
         self._weigh(None)
 
@@ -393,26 +389,36 @@ class JointProblem:
         moved[i] += sign * step
         return sign * (self._residuals(moved, self.few) - here)
 
-    def prepared(self, coordinates: Values, most: int | None = None) -> Pulses:
-        """Prepared simulated pulses of the first `most` events, as input of a readout."""
-        pulses = Pulses.of(
-            self.nearby.at(coordinates, most),
-            dt_ns=self.nearby.simulator.physics.settings.dt_ns,
-            energy_kev=self.energy_kev[:most],
-        )
-        prepared = prepare(pulses, self.recipe.preparation, "simulated")
-        if len(prepared) < len(pulses):
+    def windows(self, coordinates: Values, most: int | None = None) -> FloatArray:
+        """Prepared simulated pulses of the first `most` events, as input of a readout.
+
+        Their windows are those of the centre.  Noise begins with a window: if windows followed
+        the pulses, by whole samples, every step would give some pulses other noise.
+        """
+        if self._placed is None or self._placed[0] is not self.nearby:
+            self._placed = self.nearby, self._starts()
+        preparation = self.recipe.preparation
+        length = preparation.samples_before + preparation.samples_after
+        windows: FloatArray = cut(self.nearby.at(coordinates, most), self._placed[1], length)
+        return windows
+
+    def _starts(self) -> npt.NDArray[np.int64]:
+        """Sample of each pulse at the centre with which its window begins."""
+        base, preparation = self.nearby.base, self.recipe.preparation
+        pulses = Pulses.of(base, dt_ns=self.nearby.simulator.physics.settings.dt_ns)
+        prepared = prepare(pulses, preparation, "simulated")
+        if len(prepared) < len(base):
             told = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
             raise CpunetError(
-                f"with these physics {len(pulses) - len(prepared)} of {len(pulses)} events "
+                f"with these physics {len(base) - len(prepared)} of {len(base)} events "
                 f"give no pulse ({told}); narrow the `prior` of what is free"
             )
-        return prepared.pulses
+        return prepared.align_sample - preparation.samples_before
 
     def _covariance(self, band: Band, functions: SlicedFunctions) -> Values:
         """Covariance of the functions over the simulated pulses of a band."""
         some = band.sim.of(slice(FOR_COVARIANCE))
-        waveforms = self.prepared(self.nearby.centre).waveforms[band.rows[: len(some)]]
+        waveforms = self.windows(self.nearby.centre)[band.rows[: len(some)]]
 
         def of(readings: Readings) -> tuple[Values, ...]:
             values = functions(readings, self._clip)
@@ -460,7 +466,7 @@ class JointProblem:
             nearby, where, translated = kept
             if nearby is self.nearby and np.array_equal(where, coordinates):
                 return translated
-        waveforms = self.prepared(coordinates, most).waveforms
+        waveforms = self.windows(coordinates, most)
         translated = []
         for band in self.bands:
             n_rows = len(band.rows) if most is None else np.searchsorted(band.rows, most)

@@ -75,6 +75,17 @@ def move(pulses: Any, samples: Any) -> Any:  # pragma: no cover - compiled
     return moved
 
 
+@kernel(parallel=True)
+def cut(pulses: Any, starts: Any, length: int) -> Any:  # pragma: no cover - compiled
+    """Windows of pulses, scaled to a highest value of 1."""
+    windows = np.empty((len(pulses), length), np.float32)
+    for i in prange(len(pulses)):
+        highest = pulses[i].max()
+        for j in range(length):
+            windows[i, j] = _sample(pulses[i], starts[i] + j, pulses.shape[1]) / highest
+    return windows
+
+
 class Simulator:
     """Simulation of events as a function of the coordinates of the physics.
 

@@ -112,11 +112,11 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
     dict
         ``parameters`` (each a `FreeParameter`) and ``fixed`` by name;
         ``together``: pairs of which only a combination is known, with its value and error in
-        units of the priors; ``chi_square``; ``directions``; ``covariance`` of chain and
+        units of the priors; ``chi_square``; ``directions``; ``covariance`` of the
         coordinates; ``pulls`` of the functions, before and after; ``profiles``; ``notes``.
     """
     problem = calibrated.problem
-    vector = problem.parameters.vector()
+    vector, n = problem.parameters.vector(), problem.parameters.n_chain
     mean, spread = problem.by_chance
     free = free_parameters(calibrated)
     return {
@@ -134,8 +134,8 @@ def described(calibrated: Calibrated) -> dict[str, Any]:
         "directions": [found.describe() for found in calibrated.information.directions()],
         "covariance": {
             "names": list(problem.parameters.names),
-            "values": vector.tolist(),
-            "matrix": calibrated.covariance.tolist(),
+            "values": vector[n:].tolist(),
+            "matrix": calibrated.covariance[n:, n:].tolist(),
         },
         "pulls": {
             "names": list(problem.names),
@@ -247,7 +247,7 @@ def _together(calibrated: Calibrated) -> list[dict[str, dict[str, float] | float
     """Pairs of free parameters of which only a combination is known."""
     parameters = calibrated.problem.parameters
     n = parameters.n_chain
-    names, widths = parameters.names[n:], parameters.widths[n:]
+    names, widths = parameters.names, parameters.widths[n:]
     off = (parameters.vector()[n:] - parameters.centre[n:]) / widths
     at = dict(zip(names, off.tolist(), strict=True))
     return [

@@ -63,8 +63,6 @@ class Search:
         Simulation of the events, with all parameters that may become free.
     sets
         Prepared simulated and measured datasets, in bands.
-    energy_kev
-        Energies of the events in keV.
     recipe
         Recipe of the chain.
     given
@@ -78,7 +76,6 @@ class Search:
 
     simulator: Simulator
     sets: PulseSets
-    energy_kev: Values
     recipe: Recipe
     given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     known: Callable[[Values], Values] = lambda _: np.empty(0)
@@ -169,7 +166,7 @@ class Search:
         parameters = JointParameters(
             response, physics, nearby.centre, free, self.given, self._start
         )
-        sets = parameters, self._bands, self._functions, nearby, self.energy_kev
+        sets = parameters, self._bands, self._functions, nearby
         return JointProblem(*sets, self.recipe, self.known, held)
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
