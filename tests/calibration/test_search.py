@@ -76,7 +76,7 @@ def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
         )
 
     monkeypatch.setattr(
-        search, "levenberg_marquardt", lambda *_: SimpleNamespace(covariance=np.eye(3))
+        search, "levenberg_marquardt", lambda *_, **__: SimpleNamespace(covariance=np.eye(3))
     )
     found = Search.__new__(Search)
     found.chosen = False

@@ -268,7 +268,7 @@ class Search:
                     nearby = self._moved(nearby, move, other)
                     fit = self._problem(fit.parameters.chain.response, nearby, other)
                     fit.weigh_like(problem)
-                    minimum = levenberg_marquardt(fit, STEPS, None)
+                    minimum = levenberg_marquardt(fit, STEPS, None, coarse=False)
                     there = fit.parameters.coordinates
                     if _settled(fit, minimum, there - nearby.centre):
                         break

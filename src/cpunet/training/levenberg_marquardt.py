@@ -76,7 +76,8 @@ def levenberg_marquardt(
 
     .. math:: \delta = -\left[J^T J + \lambda\, \mathrm{diag}(J^T J)\right]^{-1} J^T r
 
-    (Marquardt, J. SIAM 11 (1963) 431), and the covariance is :math:`(J^T J)^{-1}`.
+    (Marquardt, J. SIAM 11 (1963) 431), and the covariance is :math:`(J^T J)^{-1}`, with
+    the derivatives before a last step that hardly changes chi-square.
 
     Parameters
     ----------
@@ -103,11 +104,6 @@ def levenberg_marquardt(
         cost = float(residuals @ residuals)
         jacobian, updates = problem.jacobian(vector, residuals), 0
         for _ in range(max(1, most)):
-            if not updates:  # what a full step would gain if the residuals were linear
-                gradient = jacobian.T @ residuals
-                move = _within(parameters, vector, jacobian.T @ jacobian, gradient)
-                if -float(gradient @ move) < CONVERGED:
-                    break
             step = _step(problem, jacobian, vector, residuals, damping)
             if step is None and updates:
                 # the derivatives may be outdated
@@ -116,22 +112,22 @@ def levenberg_marquardt(
             if step is None:
                 break
             tried, found, damping = step
-            fall = cost - float(found @ found)
-            if updates < UPDATES:
+            before, cost = cost, float(found @ found)
+            small = before - cost < CONVERGED * max(1.0, cost / problem.moments)
+            converged = small and not updates
+            if updates == UPDATES or (small and updates):
+                jacobian, updates = problem.jacobian(tried, found), 0
+            elif not small:
                 # Broyden's update: correct the derivatives by the change in this step
                 way = (tried - vector) / parameters.widths
                 change = found - residuals - jacobian @ (tried - vector)
                 jacobian = jacobian + np.outer(change, way / parameters.widths) / (way @ way)
                 updates += 1
-            else:
-                jacobian, updates = problem.jacobian(tried, found), 0
-            vector, residuals, cost = tried, found, cost - fall
+            vector, residuals = tried, found
             if tell is not None:
                 tell(cost)
-            if fall < CONVERGED * max(1.0, cost / problem.moments):
-                if not updates:
-                    break
-                jacobian, updates = problem.jacobian(vector, residuals), 0
+            if converged:
+                break
     if not math.isfinite(cost):
         raise CpunetError(
             "the fit of the response diverged; check that the sets hold single pulses of one "

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -127,6 +128,12 @@ class Noise:
         return noisy
 
 
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads for blocks, which are kept: to start them takes a tenth of the time of these."""
+    return ThreadPoolExecutor(threads)
+
+
 @dataclass(frozen=True, eq=False)
 class SimulatedSide:
     """A set of simulated pulses, the noise they get, and the functions they are compared by.
@@ -237,9 +244,8 @@ class SimulatedSide:
         if threads == 1 or len(starts) == 1:
             blocks = [one(first) for first in starts]
         else:
-            with ThreadPoolExecutor(min(threads, len(starts))) as pool:
-                # in the order of the pulses, whichever thread finishes first
-                blocks = list(pool.map(one, starts))
+            # in the order of the pulses, whichever thread finishes first
+            blocks = list(_pool(threads).map(one, starts))
         # decided for all pulses together, so that it does not depend on the blocks
         n_read = len(self) * len(range(len(self.noise.factor))[:draws])
         exclude = sum(n for _, _, n in blocks) < MAX_CUT * n_read
