@@ -7,7 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cpunet.calibration.joint_problem import AMPLITUDES, DENSITY, FEW, SLICES, SlicedFunctions
+from cpunet.calibration.sliced_functions import (
+    AMPLITUDES,
+    DENSITY,
+    FEW,
+    SLICES,
+    SlicedFunctions,
+)
 from cpunet.training.moments import Readings
 
 # Two stretches, three components of which the first is the drift time, the tail slope.

@@ -16,16 +16,12 @@ import numpy as np
 
 from cpunet.calibration.alternatives import OTHER_CHAINS, other_chain
 from cpunet.calibration.identifiability import Information, Selection
-from cpunet.calibration.joint_problem import (
-    JointParameters,
-    JointProblem,
-    SlicedFunctions,
-    fewest,
-)
+from cpunet.calibration.joint_problem import JointParameters, JointProblem, fewest
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.calibration.result import Calibrated
 from cpunet.calibration.sampling import of_events
+from cpunet.calibration.sliced_functions import SlicedFunctions
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
