@@ -298,10 +298,8 @@ REMEDIES = {
         "padding (preparation.max_padding_before, max_padding_after in `settings`)"
     ),
     Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
-    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info tells them)",
-    Rejection.BASELINE_SLOPE: (
-        "baselines are not flat: pile-up tails (cpunet info tells them)"
-    ),
+    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
+    Rejection.BASELINE_SLOPE: ("baselines are not flat: pile-up tails (cpunet info --quality)"),
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",
 }

@@ -31,7 +31,7 @@ PARTS = {
     "top": "charge that arrives late with times that the recipe does not have, or a ringing; "
     "try: --set generator.slow_ns=[…]",
     "tail": "in-trace pile-up, pile-up tails too few to be sure of, or a decay that the recipe "
-    "does not have; try: cpunet info tells of pile-up tails; "
+    "does not have; try: cpunet info --quality tells of pile-up tails; "
     "--set generator.fast_decays_us=[…]",
     "current amplitude": "another detector, or other energies than simulated; try: cpunet "
     "check compares both sides",

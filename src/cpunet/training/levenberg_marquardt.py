@@ -19,6 +19,7 @@ FIRST_CLIPS, ROUNDS_EACH = (64.0, 16.0), 4
 # tenths of a standard deviation along the worst-known direction.
 CONVERGED = 0.2
 DAMPING, DAMPING_UP, DAMPING_DOWN, TRIES = 0.01, 6.0, 6.0, 6
+UNDAMPED = 1e-6  # for the last step
 UPDATES = 2  # steps between evaluations of the derivatives, which are only updated meanwhile
 
 
@@ -102,27 +103,32 @@ def levenberg_marquardt(
         problem.clip = clip
         residuals, damping = problem.residuals(vector), DAMPING
         cost = float(residuals @ residuals)
-        jacobian, updates = problem.jacobian(vector, residuals), 0
+        jacobian, updates, stalled = problem.jacobian(vector, residuals), 0, False
         for _ in range(max(1, most)):
-            step = _step(problem, jacobian, vector, residuals, damping)
-            if step is None and updates:
+            fresh = not updates
+            converged = fresh and _gain(parameters, vector, jacobian, residuals) < CONVERGED
+            step = _step(
+                problem, jacobian, vector, residuals, UNDAMPED if converged else damping
+            )
+            if step is None and not fresh:
                 # the derivatives may be outdated
-                jacobian, updates = problem.jacobian(vector, residuals), 0
+                jacobian, updates, fresh = problem.jacobian(vector, residuals), 0, True
                 step = _step(problem, jacobian, vector, residuals, damping)
             if step is None:
                 break
             tried, found, damping = step
             before, cost = cost, float(found @ found)
             small = before - cost < CONVERGED * max(1.0, cost / problem.moments)
-            converged = small and not updates
-            if updates == UPDATES or (small and updates):
-                jacobian, updates = problem.jacobian(tried, found), 0
-            elif not small:
+            converged = converged or (small and fresh and stalled)
+            stalled = small and fresh
+            if not (small or updates == UPDATES):
                 # Broyden's update: correct the derivatives by the change in this step
                 way = (tried - vector) / parameters.widths
                 change = found - residuals - jacobian @ (tried - vector)
                 jacobian = jacobian + np.outer(change, way / parameters.widths) / (way @ way)
                 updates += 1
+            elif not converged:
+                jacobian, updates = problem.jacobian(tried, found), 0
             vector, residuals = tried, found
             if tell is not None:
                 tell(cost)
@@ -156,6 +162,12 @@ def _step(
             return tried, found, damping / DAMPING_DOWN
         damping *= DAMPING_UP
     return None
+
+
+def _gain(parameters: Unknowns, vector: Values, jacobian: Values, residuals: Values) -> float:
+    """Decrease of chi-square by a full step if the residuals were linear."""
+    gradient = jacobian.T @ residuals
+    return -float(gradient @ _within(parameters, vector, jacobian.T @ jacobian, gradient))
 
 
 def _within(
