@@ -113,6 +113,27 @@ def test_the_temperature_is_found_with_a_small_error(tmp_path):
     assert np.argmin(profile) == 2  # of five, the middle one
 
 
+@pytest.mark.slow  # two to three minutes
+def test_physics_of_data_by_others_are_found(reference_data, tmp_path):
+    """Siggen's pulses at 92 K, with charge that repels, behind an unknown readout."""
+    sim, run = tmp_path / "sim.lh5", tmp_path / "run"
+    data = reference_data / "closure-shifted" / "data.lh5"
+    cpunet.simulate(
+        sim,
+        detector=reference_data / "siggen" / "geometry_A.yaml",
+        hits=reference_data / "geant4" / "g4_h20mm.npz",
+        settings={"diffusion_constant": "siggen"},
+    )
+    found = cpunet.calibrate(sim, data, run).physics
+    for name, true in (("temperature_K", 92), ("impurity_factor", 1), ("self_repulsion", 1)):
+        value, error = found.loc[name, ["value", "error"]]
+        assert abs(value - true) < 3 * error, name
+    assert found.loc["temperature_K", "error"] < 0.2
+    scores = cpunet.validate(run, run / "sim.lh5", data, baselines=False).scores
+    of_ren = scores.xs("ren", level="method")
+    assert (of_ren["iou"] > 0.9 * of_ren["ceiling"]).all(), of_ren
+
+
 def test_it_is_a_run_like_any_other(calibrated, stand):
     run = cpunet.Calibration.load(calibrated.folder)
     physics = run.physics.loc["temperature_K"]
