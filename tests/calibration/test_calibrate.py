@@ -86,7 +86,7 @@ def require_temperature(run: Path) -> dict[str, Any]:
     assert told["directions"][0]["components"] == {"temperature_K": 1.0}
     assert told["covariance"]["names"] == ["temperature_K"]
     assert np.shape(told["covariance"]["matrix"]) == (1, 1)
-    assert len(told["profiles"]["temperature_K"]["chi_square"]) == 5
+    assert len(told["profiles"]["temperature_K"]["chi_square"]) == 3
     for name in ("profiles", "pulls", "directions"):
         assert (run / f"{name}.png").stat().st_size > 1000
     return told
@@ -110,7 +110,8 @@ def test_the_temperature_is_found_with_a_small_error(tmp_path):
     chi = told["chi_square"]
     assert chi["after"] < 1.6 * chi["moments"] < chi["before"]
     profile = told["profiles"]["temperature_K"]["chi_square"]
-    assert np.argmin(profile) == 2  # of five, the middle one
+    # that of the error quoted, which contains the noise of the simulation as well
+    assert all(1.5**2 * 0.8 < profile[k] - profile[1] < 1.5**2 * 2 for k in (0, 2))
 
 
 @pytest.mark.slow  # two to three minutes

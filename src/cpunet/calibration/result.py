@@ -13,9 +13,10 @@ from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 
 # Offsets of a profile in errors, and steps in which the other parameters are minimised.
-OFFSETS, FOLLOWING = (-2.0, -1.0, 0.0, 1.0, 2.0), 2
+OFFSETS, STEPS = (-1.5, 0.0, 1.5), 6
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
 # Advice where a parameter is unexpected, besides the general one.
@@ -260,42 +261,27 @@ def _together(calibrated: Calibrated) -> list[dict[str, dict[str, float] | float
 
 
 def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
-    """Chi-square including priors along the valley of each free coordinate."""
-    problem = calibrated.problem
-    parameters, physics = problem.parameters, calibrated.physics
+    """Chi-square including priors along each free coordinate, all others at their best."""
+    problem, physics = calibrated.problem, calibrated.physics
+    parameters = problem.parameters
     here, n = parameters.vector(), parameters.n_chain
-    if not parameters.free:
-        return {}
-    jacobian = problem.jacobian(here, problem.residuals(here))
+    residuals = problem.residuals(here)
     found = {}
-    for k, i in enumerate(parameters.free):
-        others = [j for j in range(len(here)) if j != n + k]
-        follow = np.asarray(np.linalg.pinv(jacobian[:, others]), float)
-        error = float(np.sqrt(calibrated.covariance[n + k, n + k]))
-        valley = calibrated.covariance[:, n + k] / error
+    for k, i in enumerate(parameters.free, n):
+        error = float(np.sqrt(calibrated.covariance[k, k]))
+        valley = calibrated.covariance[:, k] / error
         nuisance = physics.nuisances[i]
         nominal = physics.nominal(nuisance)
         values, costs = [], []
         for offset in OFFSETS:
-            moved = here.copy()
-            moved[n + k] += offset * error
-            x = float(moved[n + k])
+            x = float(here[k] + offset * error)
             added = nuisance.kind == "added"  # told without bounds
             values.append(nominal + x if added else nuisance.value(nominal, x))
-            starts = (moved, here + offset * valley)
-            costs.append(min(_lowest(problem, s, others, follow) for s in starts))
+            cost = float(residuals @ residuals)
+            if offset:
+                rest = problem.without(i, here + offset * valley)
+                cost = levenberg_marquardt(rest, STEPS, None, coarse=False).cost
+                cost += ((x - parameters.centre[k]) / parameters.widths[k]) ** 2
+            costs.append(cost)
         found[nuisance.name] = {"value": values, "chi_square": costs}
-    parameters.set(here)
     return found
-
-
-def _lowest(problem: JointProblem, vector: Values, others: list[int], follow: Values) -> float:
-    """Sum of squares with one coordinate fixed and all others at their optimum."""
-    residuals = problem.residuals(vector)
-    lowest = float(residuals @ residuals)
-    for _ in range(FOLLOWING):
-        vector = vector.copy()
-        vector[others] -= follow @ residuals
-        residuals = problem.residuals(vector)
-        lowest = min(lowest, float(residuals @ residuals))
-    return lowest
