@@ -14,9 +14,11 @@ import pytest
 
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import HOLD, RIDGE, JointParameters, JointProblem
-from cpunet.calibration.nearby import Derivative, Nearby
+from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -207,6 +209,29 @@ def test_derivatives_are_those_of_the_pulses(sides):
     priors = jacobian[2:].diagonal()
     assert priors == pytest.approx(1 / both.parameters.widths)
     assert both.parameters.vector() == pytest.approx(vector, rel=1e-12)
+
+
+def test_windows_do_not_jump_where_the_alignment_of_pulses_does(sides):
+    """Noise begins with a window, so that a jump by a sample would change it."""
+    one, time = problem(*sides), np.arange(1200.0)
+    flat = np.linspace(100, 101, 21)[:, np.newaxis]  # samples to the flat top
+    base, longer = (np.clip((time - 500) / (flat + x) + 0.5, 0, 1) for x in (0.0, 1.0))
+    base, slope = base.astype(np.float32), (longer - base).astype(np.float32)
+    centre = np.zeros(2)
+    slopes = {0: Derivative(slope, centre, half_maxima(base, np.zeros(len(base))))}
+    one.nearby = Nearby(one.nearby.simulator, centre, base, slopes)
+
+    def prepared(x):
+        at = Pulses.of(one.nearby.at(np.array([x, 0.0])), dt_ns=16)
+        return prepare(at, RECIPE.preparation, "simulated")
+
+    here, one_more = (JointProblem.windows(one, np.array([x, 0.0])) for x in (0.0, 1.0))
+    assert here == pytest.approx(prepared(0.0).pulses.waveforms, abs=1e-6)
+    for x in (-0.02, 0.02, 0.3):
+        there = JointProblem.windows(one, np.array([x, 0.0]))
+        # a jump by a sample is 0.01; the scale to a highest value of 1 changes by 1e-4
+        assert there == pytest.approx(here + x * (one_more - here), abs=2e-4)
+    assert (prepared(0.3).align_sample != prepared(0.0).align_sample).any()
 
 
 def test_what_is_not_free_stays(sides):

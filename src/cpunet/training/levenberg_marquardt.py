@@ -77,8 +77,7 @@ def levenberg_marquardt(
 
     .. math:: \delta = -\left[J^T J + \lambda\, \mathrm{diag}(J^T J)\right]^{-1} J^T r
 
-    (Marquardt, J. SIAM 11 (1963) 431), and the covariance is :math:`(J^T J)^{-1}`, with
-    the derivatives before a last step that hardly changes chi-square.
+    (Marquardt, J. SIAM 11 (1963) 431), and the covariance is :math:`(J^T J)^{-1}`.
 
     Parameters
     ----------
@@ -121,14 +120,16 @@ def levenberg_marquardt(
             small = before - cost < CONVERGED * max(1.0, cost / problem.moments)
             converged = converged or (small and fresh and stalled)
             stalled = small and fresh
-            if not (small or updates == UPDATES):
+            if converged:
+                updates += 1  # the derivatives are those before this step
+            elif small or updates == UPDATES:
+                jacobian, updates = problem.jacobian(tried, found), 0
+            else:
                 # Broyden's update: correct the derivatives by the change in this step
                 way = (tried - vector) / parameters.widths
                 change = found - residuals - jacobian @ (tried - vector)
                 jacobian = jacobian + np.outer(change, way / parameters.widths) / (way @ way)
                 updates += 1
-            elif not converged:
-                jacobian, updates = problem.jacobian(tried, found), 0
             vector, residuals = tried, found
             if tell is not None:
                 tell(cost)
@@ -139,7 +140,7 @@ def levenberg_marquardt(
             "the fit of the response diverged; check that the sets hold single pulses of one "
             "detector (cpunet info), or train on other energies (`peak`)"
         )
-    if updates:  # the last derivatives may be those before a long step
+    if updates:  # the last derivatives are those before some step
         jacobian = problem.jacobian(vector, residuals)
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
