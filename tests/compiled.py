@@ -32,7 +32,8 @@ OWN = (
     "stand --preset legend200 --events FEP=400 --out stand"
     "; train --sim stand/sim.lh5 --data stand/data.lh5 --out run"
     "; validate run --sim stand/sim.lh5 --data stand/data.lh5 --no-baselines --out report",
-    "simulate --detector ppc --hits hits.npz --library --out library.lh5"
+    "simulate --detector ppc --hits hits.npz --out few.lh5"
+    "; library make --detector ppc --grid-mm 5 --out library.lh5"
     "; info ppc --out fields.png",
 )
 RUN = """

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from cyclopts import App
 
+from compiled import OWN
 from cpunet.cli import COMMANDS, application
 from cpunet.networks.positional_unet import PositionalUNet
 
@@ -41,6 +42,11 @@ def test_words_that_are_missing_or_unknown_are_named(command):
         "error: --data is missing; see cpunet train --help\n"
     )
     assert command("trai").err.startswith('error: Unknown command "trai"')
+
+
+@pytest.mark.parametrize("line", [line for lines in OWN for line in lines.split("; ")])
+def test_commands_that_compile_what_tests_share_exist(line):
+    app.parse_args(line.split(), exit_on_error=False, print_error=False)
 
 
 def told_without(words: list[str], heavy: str) -> str:
