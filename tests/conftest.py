@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from hypothesis import settings
 
-from cpunet import progress
-from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.source import PulseSource
+# torch and cpunet are imported where they are used: the process that only hands out tests
+# begins sooner without them
 
 # compilation and a shared machine make single examples slow now and then
 settings.register_profile("cpunet", deadline=None, max_examples=25)
@@ -54,6 +52,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture
 def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
     """Total and steps of each stage of the work, by title."""
+    from cpunet import progress
+
     seen: dict[str, list[float | None]] = {}
 
     def update(bar: progress.Stage, n: float = 1) -> None:
@@ -66,9 +66,11 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
 @pytest.fixture(scope="module")
 def reads() -> Iterator[Counter[Path]]:
     """How often the pulses of each file have been read by the tests of a module."""
+    from cpunet.pulses.reading.source import PulseSource
+
     times, blocks = Counter[Path](), PulseSource.blocks
 
-    def counted(source: PulseSource, size: int = 4096) -> Iterator[Pulses]:
+    def counted(source: PulseSource, size: int = 4096) -> Iterator[Any]:
         times[source.path] += 1
         return blocks(source, size)
 
@@ -124,6 +126,8 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> None:
     """Tiny networks: threads that wait for each other cost more than they gain."""
+    import torch
+
     torch.set_num_threads(1)
 
 
@@ -131,4 +135,6 @@ def one_thread() -> None:
 def one_thread_again() -> Iterator[None]:
     """What a test sets must not reach the next one: the last bits depend on it."""
     yield
+    import torch
+
     torch.set_num_threads(1)

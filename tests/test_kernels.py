@@ -68,6 +68,7 @@ def words(process: subprocess.Popen[str]) -> list[str]:
     return told.split()
 
 
+@pytest.mark.thorough
 def test_a_changed_callee_or_constant_gives_a_new_folder_and_result(home: Path) -> None:
     assert words(begin(home, SHOW.format(1))) == ["20", "0"]
     assert words(begin(home, SHOW.format(1))) == ["20", "1"]

@@ -88,7 +88,7 @@ def test_a_run_of_a_network(tmp_path):
         run.plot()
 
 
-def test_a_run_is_read_once(home, run, tmp_path):
+def test_a_run_is_read_once(home, run, tmp_path, undrawn):
     opened: list[str] = []
     listening = [True]
 

@@ -159,7 +159,7 @@ def work(name: str, _pair: object, out: Path) -> str:
     return out.name
 
 
-@pytest.mark.parametrize("cores", ["1", "2"])
+@pytest.mark.parametrize("cores", ["1", pytest.param("2", marks=pytest.mark.thorough)])
 def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path, caplog, monkeypatch, cores):
     caplog.set_level("INFO", "cpunet")
     data = PulseFile(made(tmp_path / "raw.h5", "ch1/raw", "ch2/raw", "ch3/raw"), "all")

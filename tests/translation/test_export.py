@@ -116,6 +116,7 @@ def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
         assert write_onnx(graph, tmp_path / "graph") < 2e-5
 
 
+@pytest.mark.thorough
 def test_the_noise_and_the_origin(chain, tmp_path):
     onnx = pytest.importorskip("onnx")
     done = export_onnx(chain, tmp_path / "ren.onnx")

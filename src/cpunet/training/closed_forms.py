@@ -25,7 +25,8 @@ from cpunet.training.response_problem import Parameters
 
 Numbers = dict[str, float]
 
-_FINE_NS, _SHORTEST_NS = 0.5, 10_000.0  # step and minimum length of step responses
+_FINE_NS = 0.5
+_TIMES_NS = np.arange(0, 10_000, _FINE_NS)  # of step responses
 _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 # Range in which a spectrum is flat, in units of half the sampling rate, and smoothing bins.
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
@@ -73,9 +74,8 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
         ``droop_…_us``: fraction that has decayed.  ``noise_rms_kev`` and
         ``noise_corner_mhz``, the frequency at which the noise power falls to half.
     """
-    end_ns = reaches_ns(chain, preparation.align_fraction) + preparation.samples_after * dt_ns
-    time_ns = np.arange(0, max(end_ns, _SHORTEST_NS), _FINE_NS)
-    step, undecayed = chain.whole.step(time_ns), chain.undecayed.step(time_ns)
+    step, undecayed = chain.whole.step(_TIMES_NS), chain.undecayed.step(_TIMES_NS)
+    end_ns = _reaches_ns(step, preparation.align_fraction) + preparation.samples_after * dt_ns
     numbers = {
         name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
         for name, low in _RISES.items()
@@ -95,7 +95,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
 
 def reaches_ns(chain: Chain, fraction: float) -> float:
     """Time in ns after a step at which its response reaches a fraction of its maximum."""
-    return _reaches_ns(chain.whole.step(np.arange(0, _SHORTEST_NS, _FINE_NS)), fraction)
+    return _reaches_ns(chain.whole.step(_TIMES_NS), fraction)
 
 
 def noise_numbers(chain: Chain) -> Numbers:

@@ -3,9 +3,9 @@
 A fit of many parameters, and a network, need derivatives that differences do not give: noise
 moves a half maximum by a sample here and there, and each such jump is as large as what is
 looked for.  Here the samples at which a record is read are found first, by the rules of
-`cpunet.training._record_kernels` and without derivatives; all that is read there is then in the
-graph.  Where a window moves with the half maximum, by whole samples, the derivative is that of
-its mean position.
+`cpunet.training._record_kernels` and without derivatives.  What is read there is linear in a
+record, so its derivatives are read alike; what follows from it is in the graph.  Where a window
+moves with the half maximum, by whole samples, the derivative is that of its mean position.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ AGAIN = 20  # samples after the half maximum from which it is searched for again
 Functions = Callable[[Tensor, Tensor], Tensor]
 
 
-class _Samples(NamedTuple):
+class Samples(NamedTuple):
     """Samples at which records are read, each of shape (pulses,)."""
 
     level: Tensor  # half maximum that baseline and level refer to
@@ -72,22 +72,50 @@ class DifferentiableReadings:
         self.weights = torch.from_numpy(np.asarray(current_amplitude_kernel(), np.float32))
         lever = torch.arange(w.fit_samples) - 0.5 * (w.fit_samples - 1)
         self.lever = lever / (lever @ lever)
+        n = self.matrix.shape[1]
+        self.sizes = [2, 2, 2, 2, 2, n, n, w.fit_samples + 1]
 
     def __call__(self, records: Tensor) -> tuple[Tensor, Tensor]:
         """Read noisy records (pulses, samples): linear readings, and log current amplitudes."""
-        w = self.window
-        at = self._samples(records.detach())
-        normal, moved = self._normalised(records, at.level)
-        aligned = self._aligned(normal, at.half)
-        linear = aligned @ self.matrix - self.offset
-        logs = stretch(normal, at.tail, 0, w.fit_samples + 1).clamp_min(1e-3).log()
+        return self.read(self.parts(records, self.samples(records.detach())))
+
+    def parts(self, records: Tensor, at: Samples) -> Tensor:
+        """All of the records that is read, shape (pulses, parts); it is linear in them.
+
+        Of what is read between two samples, both are there.
+        """
+        w, half = self.window, self.weights.shape[1] // 2
+        base = stretch(records, at.level, -w.base_first, -w.base_stop + 1)
+        top = stretch(records, at.level, w.after - w.level_samples, w.after + 1)
+        means = [
+            torch.stack([x[:, :-1].mean(dim=1), (x[:, -1] - x[:, 0]) / (x.shape[1] - 1)], dim=1)
+            for x in (base, top)
+        ]
+        halves = [stretch(records, sample, 0, 2) for sample in (at.level, at.half)]
+        centre = at.half - w.before + at.steepest
+        current = torch.diff(stretch(records, centre, -half, half + 3)).unfold(1, 2, 1)
+        steepest = (current * self.weights[at.phase][:, :, None]).sum(dim=1)
+        around = stretch(records, at.half, -w.before, w.after + 1)
+        quantities = [around[:, :-1] @ self.matrix, around[:, 1:] @ self.matrix]
+        tail = stretch(records, at.tail, 0, w.fit_samples + 1)
+        return torch.cat([*means, *halves, steepest, *quantities, tail], dim=1)
+
+    def read(self, parts: Tensor) -> tuple[Tensor, Tensor]:
+        """Linear readings, and log current amplitudes, of the parts of records."""
+        base, top, first, half, current, early, late, tail = torch.split(parts, self.sizes, 1)
+        # 0, but has the derivative of the time of the half maximum
+        moved = self._time(self._normalised(first, base[:, 0], top[:, 0]))
+        moved = moved - moved.detach()
+        zero, level = ((x[:, 0] + moved * x[:, 1]) for x in (base, top))
+        time = self._time(self._normalised(half, zero, level))[:, None]
+        linear = torch.lerp(early, late, time) - zero[:, None] * self.matrix.sum(dim=0)
+        scale = (self.window.tail_level / (level - zero))[:, None]
+        logs = self._normalised(tail, zero, level).clamp_min(1e-3).log()
         slope = logs[:, :-1] @ self.lever
         slope = slope + moved * (logs[:, 1:] @ self.lever - slope)
-        half = self.weights.shape[1] // 2
-        current = stretch(torch.diff(aligned), at.steepest, -half, half + 1)
-        amplitude = (current * self.weights[at.phase]).sum(dim=1).clamp_min(1e-4).log()
-        whole = torch.cat([linear, slope[:, None]], dim=1)
-        return (whole - self.centres) / self.spreads, amplitude
+        amplitude = torch.lerp(current[:, :1], current[:, 1:], time) * scale
+        whole = torch.cat([linear * scale - self.offset, slope[:, None]], dim=1)
+        return (whole - self.centres) / self.spreads, amplitude[:, 0].clamp_min(1e-4).log()
 
     def functions(self, linear: Tensor, amplitude: Tensor, clip: float | None = None) -> Tensor:
         """Functions of each pulse as `Moments.functions`, shape (pulses, moments)."""
@@ -113,18 +141,21 @@ class DifferentiableReadings:
 
         return functions
 
-    def _samples(self, records: Tensor) -> _Samples:
+    def samples(self, records: Tensor) -> Samples:
+        """Samples at which noisy records are read."""
         w = self.window
         first = self._crossing(records, torch.full_like(records[:, 0], w.last))
-        level = self._crossing(self._normalised(records, first)[0], first + AGAIN)
-        normal = self._normalised(records, level)[0]
+        level = self._crossing(self._about(records, first), first + AGAIN)
+        normal = self._about(records, level)
         half = self._crossing(normal, level + AGAIN)
         begin = w.last - w.align_before
         top = normal[:, begin : w.last + w.align_after]
         before = torch.arange(top.shape[1]) < top.argmax(dim=1, keepdim=True)
         below = (top < w.align_fraction * top.amax(dim=1, keepdim=True)) & before
         tail = begin + _last(below) + 1 + w.align_after - w.fit_samples
-        current = torch.diff(self._aligned(normal, half))
+        around = stretch(normal, half, -w.before, w.after + 1)
+        time = self._time(stretch(normal, half, 0, 2))[:, None]
+        current = torch.diff(torch.lerp(around[:, :-1], around[:, 1:], time))
         from_sample = max(w.before - w.edge, 0)
         steepest = from_sample + current[:, from_sample : w.before + w.edge].argmax(dim=1)
         near, width = w.edge // 3, self.weights.shape[1]
@@ -132,7 +163,7 @@ class DifferentiableReadings:
         best = (around.unfold(1, width, 1) @ self.weights.T).flatten(1).argmax(dim=1)
         phases = len(self.weights)
         centre = steepest - near + torch.div(best, phases, rounding_mode="floor")
-        return _Samples(level, half, tail, centre, best % phases)
+        return Samples(level, half, tail, centre, best % phases)
 
     def _crossing(self, records: Tensor, last: Tensor) -> Tensor:
         """Sample before the last upward crossing of the half height before `last`."""
@@ -140,32 +171,21 @@ class DifferentiableReadings:
         index = torch.arange(low.shape[1])
         return _last((low < self.window.level) & (index < last[:, None])).clamp_min(0)
 
-    def _normalised(self, records: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
-        """Records with baseline 0 and nominal level, and the motion of the half maximum.
-
-        The latter is 0, but has the derivative of the time of the half maximum.
-        """
+    def _about(self, records: Tensor, sample: Tensor) -> Tensor:
+        """Records with baseline 0 and nominal level about their half maxima."""
         w = self.window
-        base = stretch(records, sample, -w.base_first, -w.base_stop + 1)
-        tail = stretch(records, sample, w.after - w.level_samples, w.after + 1)
-        zero, top = base[:, :-1].mean(dim=1), tail[:, :-1].mean(dim=1)
-        time = self._part(
-            (records - zero[:, None]) * (w.tail_level / (top - zero))[:, None], sample
-        )
-        moved = time - time.detach()
-        zero = zero + moved * (base[:, -1] - base[:, 0]) / (base.shape[1] - 1)
-        top = top + moved * (tail[:, -1] - tail[:, 0]) / (tail.shape[1] - 1)
-        return (records - zero[:, None]) * (w.tail_level / (top - zero))[:, None], moved
+        zero = stretch(records, sample, -w.base_first, -w.base_stop).mean(dim=1)
+        level = stretch(records, sample, w.after - w.level_samples, w.after).mean(dim=1)
+        return self._normalised(records, zero, level)
 
-    def _part(self, records: Tensor, sample: Tensor) -> Tensor:
-        """Time of the half maximum after a sample."""
-        low, high = stretch(records, sample, 0, 2).unbind(dim=1)
+    def _normalised(self, values: Tensor, zero: Tensor, level: Tensor) -> Tensor:
+        scale = self.window.tail_level / (level - zero)
+        return (values - zero[:, None]) * scale[:, None]
+
+    def _time(self, pair: Tensor) -> Tensor:
+        """Time of the half maximum after the first of two samples."""
+        low, high = pair.unbind(dim=1)
         return (self.window.level - low) / (high - low).clamp_min(1e-6)
-
-    def _aligned(self, records: Tensor, sample: Tensor) -> Tensor:
-        w = self.window
-        around = stretch(records, sample, -w.before, w.after + 1)
-        return torch.lerp(around[:, :-1], around[:, 1:], self._part(records, sample)[:, None])
 
 
 class DifferentiableSet:
@@ -189,8 +209,12 @@ class DifferentiableSet:
 
     def scaled(self, records: Tensor) -> Tensor:
         """Records of the height to which noise is added."""
+        return records / self.height(records)
+
+    def height(self, records: Tensor) -> Tensor:
+        """Mean long after the pulse over the nominal level, shape (pulses, 1)."""
         plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(dim=1, keepdim=True)
-        return records * (self.sim.moments.preparation.tail_level / plateau)
+        return plateau / self.sim.moments.preparation.tail_level
 
     @torch.no_grad()
     def values(self, response: Readout) -> npt.NDArray[np.float64]:
@@ -226,15 +250,20 @@ class DifferentiableSet:
         for first in range(0, len(self.sim), BLOCK):
             spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
             clean, moved = self.records(spectra, transfer), self.records(spectra, slopes)
+            heights = self.height(clean), torch.func.vmap(self.height)(moved)
             for draw in range(len(self.sim.noise.factor))[:draws]:
                 noise = self.noise(draw, first, len(clean))
+                at = self.readings.samples(clean / heights[0] + noise)
+                parts = partial(self.readings.parts, at=at)
+                added = parts(noise)
 
-                def of(records: Tensor, noise: Tensor = noise) -> Tensor:
-                    return functions(*self.readings(self.scaled(records) + noise))
+                def of(own: Tensor, height: Tensor, added: Tensor = added) -> Tensor:
+                    return functions(*self.readings.read(own / height + added))
 
-                along: Any = partial(torch.func.jvp, of, (clean,))
+                along: Any = partial(torch.func.jvp, of, (parts(clean), heights[0]))
+                tangents = torch.func.vmap(parts)(moved), heights[1]
                 # the values are the same along all directions
-                values, columns = torch.func.vmap(along, out_dims=(None, 0))((moved,))  # type: ignore[arg-type]
+                values, columns = torch.func.vmap(along, out_dims=(None, 0))(tangents)  # type: ignore[arg-type]
                 yield first, values, columns, self.weights[first : first + BLOCK]
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:
