@@ -68,7 +68,13 @@ def test_the_help_does_not_load_torch(words):
     told_without(words, f"torch lh5 lgdo dspeed matplotlib scipy numba{lists}")
 
 
-@pytest.mark.parametrize("name", ["pulses.lh5", "pulses.h5", "pulses.npy", "pulses.npz"])
+PLAIN = ["h5", "npy", "npz"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["pulses.lh5", *(pytest.param(f"pulses.{e}", marks=pytest.mark.thorough) for e in PLAIN)],
+)
 def test_plain_files_load_neither_torch_nor_compiled_loops(stand, tmp_path, name):
     """A look at a file waits for nothing that networks, compressed traces or figures need."""
     file, traces = tmp_path / name, stand.data_waveforms

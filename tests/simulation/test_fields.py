@@ -33,6 +33,7 @@ def same(one: FieldMaps, other: FieldMaps) -> bool:
     return all(np.array_equal(value, getattr(other, key)) for key, value in vars(one).items())
 
 
+@pytest.mark.thorough
 def test_agrees_with_the_reference_simulator(reference_data: Path) -> None:
     detector = read_detector("icpc", ["siggen_conventions=true"])
     maps = compute_fields(detector)

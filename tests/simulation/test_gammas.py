@@ -93,6 +93,7 @@ def test_spectrum_agrees_with_geant4(reference_data: Path) -> None:
         assert seen[low:high].sum() == pytest.approx(expected, rel=0.05 + 3 * error)
 
 
+@pytest.mark.thorough
 def test_sites_agree_with_geant4() -> None:
     hits, _ = run(20, 3_000_000, wanted=LINES)
     sites = cluster_hits(hits, 1.5)

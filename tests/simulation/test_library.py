@@ -77,6 +77,7 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: FieldMaps) -> None:
     [((10, 20), 60, 360), pytest.param((40, 96), 0, 1800, marks=pytest.mark.slow)],
     ids=["of a part", "of the crystal"],
 )
+@pytest.mark.thorough
 def test_library_agrees_with_the_exact_drift(
     reference_maps: FieldMaps, size: tuple[float, float], above: float, n_hits: int
 ) -> None:

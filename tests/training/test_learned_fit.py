@@ -99,6 +99,7 @@ def fitted(problem: Unpaired):
     return learned(problem)
 
 
+@pytest.mark.thorough
 def test_pulses_are_those_of_the_true_chain(problem, fitted):
     """From unpaired pulses: others, which were not in the fit, have the shape of the truth."""
     response, fit = fitted

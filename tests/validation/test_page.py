@@ -286,6 +286,7 @@ def two_methods() -> Figure:
     return figure
 
 
+@pytest.mark.thorough
 def test_a_click_hides_a_method_in_all_figures(tmp_path):
     browser()  # skips without one
     write_report(

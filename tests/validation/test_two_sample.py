@@ -52,6 +52,7 @@ def test_equal_distributions_cannot_be_told_apart(draws):
 
 
 @pytest.mark.parametrize("draws", [30, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.thorough
 def test_error_is_the_spread_over_repeated_samples(draws):
     rng = np.random.default_rng(17)
     results = [

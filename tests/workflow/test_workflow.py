@@ -148,6 +148,7 @@ def test_dry_run(place):
     assert not (place.folder / "all results").exists()
 
 
+@pytest.mark.thorough
 def test_a_dry_run_of_seeds(place):
     place.configure(two_detectors() | {"seeds": [0, 7]})
     done = place.run("--dry-run", "--printshellcmds", "seeds")
@@ -343,8 +344,8 @@ DEFECTS = {
 }
 
 
-# each starts snakemake; of those that the schema finds, and that are found after it, one
-QUICK = {"misspelt", "energies of one"}
+# each starts snakemake
+QUICK = {"misspelt"}
 
 
 @pytest.mark.parametrize(
