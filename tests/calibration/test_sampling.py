@@ -1,6 +1,7 @@
 """Fits to a finite number of simulated events, many times over."""
 
 import numpy as np
+import pytest
 
 from cpunet.calibration.sampling import of_parts, of_weights
 
@@ -49,3 +50,18 @@ def test_weights_from_few_pulses_make_errors_larger():
         pulls.append(found * information**0.5)
     assert np.var(pulls) > 2
     assert 0.8 < np.var(pulls) / of_weights(n, d, 1) < 1.2
+
+
+def test_what_pulses_do_not_determine_has_the_error_of_its_prior():
+    rng = np.random.default_rng(2)
+    slopes = np.zeros((PARTS, FUNCTIONS, 2))
+    slopes[:, :, 0] = 1 + 0.1 * rng.normal(size=(PARTS, FUNCTIONS))
+    priors = np.diag([1e-3, 1 / 0.7])
+    deviations = rng.normal(size=(PARTS, FUNCTIONS))
+    jacobian = np.concatenate([slopes.mean(axis=0), priors])
+    errors = [
+        np.sqrt(of_parts(jacobian, slopes, deviations, factor)[1].diagonal())
+        for factor in (1.0, 1.44)
+    ]
+    np.testing.assert_allclose([one[1] for one in errors], 0.7, rtol=1e-9)
+    assert errors[1][0] == pytest.approx(1.2 * errors[0][0], rel=1e-3)

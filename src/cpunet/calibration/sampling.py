@@ -9,8 +9,9 @@ both. With priors :math:`P` and :math:`H = J^T J - N_J + P`, a fit is moved by
 :math:`H^{-1} N_r`, and its covariance is :math:`H^{-1} (J^T J + P) H^{-1}`.
 
 The weights have sampling errors, too: they are the inverse covariance of :math:`d` functions,
-from :math:`n` pulses. They scatter :math:`p` parameters further, and make errors too small
-(Dodelson and Schneider, Phys. Rev. D 88 (2013) 063537; Percival et al., MNRAS 439 (2014) 2531).
+from :math:`n` pulses. They scatter :math:`p` parameters further, and make errors too small: the
+covariance's :math:`J^T J`, but not its :math:`P`, grows by a factor (Dodelson and Schneider,
+Phys. Rev. D 88 (2013) 063537; Percival et al., MNRAS 439 (2014) 2531).
 """
 
 from __future__ import annotations
@@ -41,33 +42,41 @@ def of_events(problem: JointProblem) -> tuple[Values, Values]:
         residuals = part.residuals(vector)
         deviations.append(residuals[: problem.moments])
         slopes.append(part.jacobian(vector, residuals)[: problem.moments])
-    move, covariance = of_parts(jacobian, np.array(slopes), np.array(deviations))
     n = sum(len(band.sim) + len(band.moments.data) for band in problem.bands)
-    return move, covariance * of_weights(n, problem.by_chance[0], len(vector))
+    factor = of_weights(n, problem.by_chance[0], len(vector))
+    return of_parts(jacobian, np.array(slopes), np.array(deviations), factor)
 
 
-def of_parts(jacobian: Values, slopes: Values, deviations: Values) -> tuple[Values, Values]:
+def of_parts(
+    jacobian: Values, slopes: Values, deviations: Values, factor: float = 1.0
+) -> tuple[Values, Values]:
     """Move of fitted parameters without sampling noise, and their covariance.
 
     Parameters
     ----------
     jacobian
-        Derivatives of all residuals and priors, shape (residuals, parameters).
+        Derivatives of all residuals and priors, shape (residuals, parameters); those of means
+        over events first.
     slopes
         Derivatives of the residuals that are means over events, from each of several equal
         parts of the events, shape (parts, means, parameters).
     deviations
         These residuals from each part, shape (parts, means).
+    factor
+        Of the variances that these residuals have (`of_weights`), but not the priors.
     """
     parts = len(slopes)
     slopes, deviations = slopes - slopes.mean(axis=0), deviations - deviations.mean(axis=0)
     noise = np.einsum("kij,kil->jl", slopes, slopes) / (parts * (parts - 1))
     gradient = np.einsum("kij,ki->j", slopes, deviations) / (parts * (parts - 1))
-    inverse = np.linalg.inv(np.linalg.cholesky(jacobian.T @ jacobian))
+    means, whole = jacobian[: slopes.shape[1]], jacobian.T @ jacobian
+    inverse = np.linalg.inv(np.linalg.cholesky(whole))
     share, axes = np.linalg.eigh(inverse @ noise @ inverse.T)
     linear = share < MOST
-    root = inverse.T @ axes / np.where(linear, 1 - share, 1)
-    return root @ (linear * (axes.T @ (inverse @ gradient))), root @ root.T
+    root, back = inverse.T @ axes / np.where(linear, 1 - share, 1), axes.T @ inverse
+    solve = root @ back  # the inverse of H
+    covariance = solve @ (whole + (factor - 1) * means.T @ means) @ solve.T
+    return root @ (linear * (back @ gradient)), covariance
 
 
 def of_weights(n: float, d: float, p: int) -> float:

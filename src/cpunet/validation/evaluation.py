@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.processes import one_thread_for_matrices
+from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import EnergySelection, parse_selection
@@ -108,9 +110,9 @@ def evaluate(
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
-    with stage("Scoring", len(sets)) as bar:
-        for peak in sets:
-            found, peaks[peak.name] = score_peak(peak, recipe, seed)
+    with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
+        scored = pool.map(partial(score_peak, recipe=recipe, seed=seed), sets)
+        for peak, (found, peaks[peak.name]) in zip(sets, scored, strict=True):
             if found:
                 values[peak.name] = found
                 rise = {method: v["rise_01_90"] for method, v in found.items()}
