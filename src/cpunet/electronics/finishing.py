@@ -6,7 +6,6 @@ anew once noise is added.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import blocks as blocks
 from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -77,13 +77,6 @@ def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> F
 
 RecordNoise = BaselineNoise | TraceNoise
 
-BLOCK = 512  # pulses at a time, to bound memory
-
-
-def blocks(n: int) -> Iterator[slice]:
-    """Slices of `BLOCK` rows that cover `n` pulses."""
-    return (slice(first, first + BLOCK) for first in range(0, n, BLOCK))
-
 
 class Finished(NamedTuple):
     """Windows, float32, shape ``(n, config.length)``; a row that cannot be prepared is NaN.
@@ -118,7 +111,7 @@ def finish(
     Noise is added to the whole record once its tail is at the level of the data's. The
     record is then prepared again, so that noise affects alignment, baseline and scale as it
     does in the data. A pulse without decay cannot be aligned once noise is added: finish
-    `Raw` without noise.
+    it without noise.
 
     Parameters
     ----------
