@@ -69,10 +69,12 @@ def extended(
     return result
 
 
-def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
-    """Extend prepared windows to records, see `record_length`."""
+def with_room(
+    windows: FloatArray, config: PreparationConfig, dt_ns: float, reach: int = 0
+) -> FloatArray:
+    """Extend prepared windows to records (see `record_length`) that are longer by `reach`."""
     before = PADDING_BEFORE + config.samples_before
-    return extended(windows, config, dt_ns, record_length(config.length), before)
+    return extended(windows, config, dt_ns, record_length(config.length) + reach, before)
 
 
 RecordNoise = BaselineNoise | TraceNoise
