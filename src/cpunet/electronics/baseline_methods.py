@@ -19,15 +19,9 @@ import scipy.fft
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.finishing import (
-    PADDING_AFTER,
-    PADDING_BEFORE,
-    blocks,
-    finish,
-    record_length,
-)
+from cpunet.electronics.finishing import PADDING_BEFORE, finish, record_length
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray
+from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.parameters import current_amplitude, tail_slope
 from cpunet.recipes.schema import PreparationConfig
 
@@ -168,18 +162,13 @@ def fitted_decay(
     CpunetError
         If a side has too few pulses, or no tail is positive.
     """
-    require_enough(sim, data)
-    slope = fitted_tail_slope(data, dt_ns, align)
-    return slope, without_decay(data[:most], slope, dt_ns, align).astype(np.float32)
-
-
-def require_enough(sim: FloatArray, data: FloatArray) -> None:
-    """Raise a `CpunetError` unless a response can be fitted to the two datasets."""
     for side, windows in (("simulated", sim), ("measured", data)):
         if len(windows) < MIN_PULSES:
             raise CpunetError(
                 f"{len(windows)} {side} pulses; give {MIN_PULSES} or more to fit a response to"
             )
+    slope = fitted_tail_slope(data, dt_ns, align)
+    return slope, without_decay(data[:most], slope, dt_ns, align).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -239,25 +228,6 @@ class BaselineMethod(ABC):
             records = self.translate(waveforms[rows])
             windows[rows] = finish(records, config, dt_ns=self.dt_ns).windows
         return windows
-
-
-@dataclass(frozen=True)
-class Raw(BaselineMethod):
-    """No electronics: the window with padding."""
-
-    name: ClassVar[str] = "raw"
-
-    @classmethod
-    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit nothing, see `BaselineMethod.fit`."""
-        require_enough(sim, data)
-        return cls(dt_ns)
-
-    def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Pad the windows to records, see `BaselineMethod.translate`."""
-        before = np.zeros((len(waveforms), PADDING_BEFORE), np.float32)
-        after = np.repeat(waveforms[:, -1:], PADDING_AFTER, axis=1)
-        return np.concatenate([before, waveforms, after], axis=1, dtype=np.float32)
 
 
 LONGEST = 64  # maximum tau, in samples

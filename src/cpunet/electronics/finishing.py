@@ -6,7 +6,6 @@ anew once noise is added.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import blocks as blocks
 from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -69,20 +69,15 @@ def extended(
     return result
 
 
-def with_room(windows: FloatArray, config: PreparationConfig, dt_ns: float) -> FloatArray:
-    """Extend prepared windows to records, see `record_length`."""
+def with_room(
+    windows: FloatArray, config: PreparationConfig, dt_ns: float, reach: int = 0
+) -> FloatArray:
+    """Extend prepared windows to records (see `record_length`) that are longer by `reach`."""
     before = PADDING_BEFORE + config.samples_before
-    return extended(windows, config, dt_ns, record_length(config.length), before)
+    return extended(windows, config, dt_ns, record_length(config.length) + reach, before)
 
 
 RecordNoise = BaselineNoise | TraceNoise
-
-BLOCK = 512  # pulses at a time, to bound memory
-
-
-def blocks(n: int) -> Iterator[slice]:
-    """Slices of `BLOCK` rows that cover `n` pulses."""
-    return (slice(first, first + BLOCK) for first in range(0, n, BLOCK))
 
 
 class Finished(NamedTuple):
@@ -118,7 +113,7 @@ def finish(
     Noise is added to the whole record once its tail is at the level of the data's. The
     record is then prepared again, so that noise affects alignment, baseline and scale as it
     does in the data. A pulse without decay cannot be aligned once noise is added: finish
-    `Raw` without noise.
+    it without noise.
 
     Parameters
     ----------

@@ -26,7 +26,6 @@ import scipy.optimize
 from cpunet.electronics.baseline_methods import (
     RC,
     BaselineMethod,
-    Raw,
     Spectrum,
     Values,
     currents,
@@ -213,10 +212,8 @@ def _mean_currents(spectra: Spectrum, groups: Groups, length: int) -> Values:
     """Superpulses of currents around the half maximum, shape ``(slices, 2 * EDGE)``."""
     steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
     means = superpulses(spectra, steps, groups)
-    return np.asarray(
-        np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)[:, : 2 * EDGE],
-        float,
-    )
+    around = np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)
+    return np.asarray(around[:, : 2 * EDGE], float)
 
 
 # the same of the free kernel, whose iterations take half maxima of the response found so far
@@ -316,5 +313,5 @@ def _transfer(kernel: Values, length: int) -> Spectrum:
 
 
 BASELINE_METHODS: dict[str, type[BaselineMethod]] = {
-    method.name: method for method in (Raw, RC, GaussExp, SuperpulseKernel)
+    method.name: method for method in (RC, GaussExp, SuperpulseKernel)
 }

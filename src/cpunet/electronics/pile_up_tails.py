@@ -183,7 +183,6 @@ class TailsInfo(InfoPart):
     told_by: str = ""
     energies: str = ""
     traces: int = 0
-    not_told: int = 0
     percent_above: dict[str, dict[str, float]] = Field(default_factory=dict)
     missing: str | None = None
 
@@ -367,7 +366,6 @@ class PileUpTails:
             told_by="level and slope" if self.coupled else "slope",
             energies="recorded" if self.fit.recorded else "learned from the tails",
             traces=len(told),
-            not_told=len(self.kev) - len(told),
             percent_above={
                 f"{kev:g}_kev": {
                     "measured": round(100 * float((told > kev).mean()), 2),

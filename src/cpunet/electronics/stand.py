@@ -315,7 +315,19 @@ def stand_sides(
     for window, number in events.items():
         if number < 1:
             raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
-    settings = _finely_sampled(settings, electronics)
+    ratio = electronics.dt_ns / _FINE_NS
+    if abs(ratio - round(ratio)) > 1e-9:
+        raise CpunetError(
+            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
+            f"{_FINE_NS:g}, the pulses' period; choose another"
+        )
+    if "dt_ns" in settings.model_fields_set and settings.dt_ns != _FINE_NS:
+        raise CpunetError(
+            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
+            "period; leave dt_ns out"
+        )
+    values = settings.model_dump() | {"dt_ns": _FINE_NS}
+    settings = checked(SimulationSettings, values, f"settings, for a stand's {_FINE_NS:g} ns")
     # seeds of the events of both sides and of the readout
     sim_seed, data_seed, readout_seed = map(
         int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
@@ -335,25 +347,6 @@ def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindo
         inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
         labels[inside] = LABELS.get(window.name, OTHER)
     return labels
-
-
-def _finely_sampled(
-    settings: SimulationSettings, electronics: Electronics
-) -> SimulationSettings:
-    """Settings with the period of the pulses of a stand, of which the chain's is a multiple."""
-    ratio = electronics.dt_ns / _FINE_NS
-    if abs(ratio - round(ratio)) > 1e-9:
-        raise CpunetError(
-            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
-            f"{_FINE_NS:g}, the pulses' period; choose another"
-        )
-    if "dt_ns" in settings.model_fields_set and settings.dt_ns != _FINE_NS:
-        raise CpunetError(
-            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
-            "period; leave dt_ns out"
-        )
-    values = settings.model_dump() | {"dt_ns": _FINE_NS}
-    return checked(SimulationSettings, values, f"settings, for a stand's {_FINE_NS:g} ns")
 
 
 def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: Stand) -> None:

@@ -10,18 +10,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.legend.library_files import put_array, put_column
 from cpunet.outputs import refuse_existing
-from cpunet.progress import Stage, stage
+from cpunet.progress import stage
 from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import Set
-from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
-from cpunet.simulation.settings import SimulationSettings, detector_and_settings
+from cpunet.simulation.settings import detector_and_settings
 from cpunet.simulation.signals import hit_signals
 
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
@@ -120,14 +119,30 @@ def make_library(
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
     counts = MadeLibrary(out)
     total = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
+    shape = (len(r_mm), len(z_mm))
     with written_hdf5(out) as (made, _), stage("Templates", total) as bar:
         library = made.create_group(detector.name or "detector")
         put_column(library, "r", r_mm, "mm")
         put_column(library, "z", z_mm, "mm")
         put_column(library, "dt", wanted.dt_ns, "ns")
         put_column(library, "t0", 0.0, "ns")
-        for angle in ANGLES_DEG:
-            _fill(library, angle, fields, wanted, counts, bar)
+        for angle_deg in ANGLES_DEG:
+            angle, whole = f"{angle_deg:03d}_deg", (*shape, wanted.n_samples)
+            waveforms = put_array(library, f"waveform_{angle}", whole, np.float32, "")
+            drift_times = put_array(library, f"drift_time_{angle}", shape, np.float64, "ns")
+            phi = math.radians(angle_deg)
+            for i, r in enumerate(r_mm):
+                x, y = r * math.cos(phi), r * math.sin(phi)
+                signals = hit_signals(fields, x, y, z_mm, ENERGY_KEV, wanted)
+                good = signals.valid & signals.collected
+                template = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
+                waveforms[i] = template
+                drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
+                counts.templates += len(z_mm)
+                counts.written += int(good.sum())
+                counts.outside += int((~signals.valid).sum())
+                counts.late += int((signals.valid & ~signals.collected).sum())
+                bar.update(len(z_mm))
         library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
         if not counts.written:
             raise CpunetError(f"{counts}; give a finer grid or longer records")
@@ -137,31 +152,3 @@ def make_library(
 def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:
     """Multiples of the grid spacing within the axis."""
     return np.asarray(np.arange(int(axis_mm[-1] / grid_mm + 1e-6) + 1) * grid_mm)
-
-
-def _fill(
-    library: h5py.Group,
-    angle_deg: int,
-    fields: FieldMaps,
-    settings: SimulationSettings,
-    counts: MadeLibrary,
-    bar: Stage,
-) -> None:
-    """Simulate the grid points of one azimuth, row by row in r."""
-    r_mm, z_mm = library["r"][()], library["z"][()]
-    shape = (len(r_mm), len(z_mm))
-    angle, whole = f"{angle_deg:03d}_deg", (*shape, settings.n_samples)
-    waveforms = put_array(library, f"waveform_{angle}", whole, np.float32, "")
-    drift_times = put_array(library, f"drift_time_{angle}", shape, np.float64, "ns")
-    phi = math.radians(angle_deg)
-    for i, r in enumerate(r_mm):
-        x, y = r * math.cos(phi), r * math.sin(phi)
-        signals = hit_signals(fields, x, y, z_mm, ENERGY_KEV, settings)
-        good = signals.valid & signals.collected
-        waveforms[i] = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
-        drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
-        counts.templates += len(z_mm)
-        counts.written += int(good.sum())
-        counts.outside += int((~signals.valid).sum())
-        counts.late += int((signals.valid & ~signals.collected).sum())
-        bar.update(len(z_mm))

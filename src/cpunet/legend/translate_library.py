@@ -49,7 +49,7 @@ from cpunet.legend.library_files import (
 from cpunet.networks.response_layer import PADDING_BEFORE
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
-from cpunet.pulses.container import FloatArray
+from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.writing import written_hdf5
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.translator import BATCH, REN
@@ -91,8 +91,7 @@ class TemplateTranslator:
         results = np.empty(templates.shape, np.float32)
         inside = slice(PADDING_BEFORE, PADDING_BEFORE + templates.shape[1])
         with torch.inference_mode():
-            for first in range(0, len(templates), BATCH):
-                rows = slice(first, first + BATCH)
+            for rows in blocks(len(templates), BATCH):
                 charge = torch.from_numpy(np.ascontiguousarray(templates[rows], np.float32))
                 records = self._chain(charge.to(self._device))
                 results[rows] = records[:, inside].cpu().numpy()

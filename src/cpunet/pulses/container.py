@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FloatArray = npt.NDArray[np.float32]
+
+BLOCK = 512  # pulses at a time, to bound memory
 
 _PER_PULSE = ("waveforms", "energy_kev", "event_number", "peak")
 
@@ -158,3 +160,8 @@ class Pulses:
                 )
         joined = {n: np.concatenate([getattr(s, n) for s in sets]) for n in _PER_PULSE}
         return Pulses(dt_ns=first.dt_ns, **joined)
+
+
+def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:
+    """Slices of `size` rows that cover `n` pulses."""
+    return (slice(first, first + size) for first in range(0, n, size))

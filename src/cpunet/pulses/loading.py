@@ -31,6 +31,7 @@ from cpunet.pulses.preparation import (
     apply_cuts,
     fit_cuts,
     prepare,
+    rejections_of,
 )
 from cpunet.pulses.provenance import recorded_detector
 from cpunet.pulses.reading.files import PulseFile
@@ -173,9 +174,7 @@ def _nothing_left(source: PulseSource, sets: list[Prepared]) -> CpunetError:
     if not len(codes):
         return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")
     counts = np.bincount(codes)
-    reasons = ", ".join(
-        f"{counts[c]} {Rejection(int(c)).label}" for c in np.flatnonzero(counts)
-    )
+    reasons = ", ".join(f"{n} {reason}" for reason, n in rejections_of(codes).items())
     text = f"{source.path}: none of {len(codes)} pulses can be used ({reasons})"
     # of pulses of the wanted energies, if there are any, since these are what is missed
     wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)

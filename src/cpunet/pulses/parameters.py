@@ -20,7 +20,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.pulses import _parameter_kernels as kernels
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
 Values = npt.NDArray[np.float64]
@@ -257,8 +257,7 @@ def _by_blocks(
     """Apply `function` to blocks of pulses of at least `shortest` samples."""
     require_pulses(waveforms, shortest)
     values = np.empty(len(waveforms))
-    for first in range(0, len(waveforms), BLOCK):
-        rows = slice(first, first + BLOCK)
+    for rows in blocks(len(waveforms), BLOCK):
         values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
     return values
 
@@ -341,7 +340,6 @@ def _shifted(coefficients, times, pad, n_before, moved):  # type: ignore[no-unty
 
 
 BISECTIONS = 30  # of one sample: a precision of 1e-9
-ALIGNED_BLOCK = 512  # pulses per block: bounds memory
 PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
 
 
@@ -448,8 +446,7 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
     """
     require_pulses(waveforms, 2)
     aligned = np.empty((len(waveforms), n_before + n_after), np.float32)
-    for first in range(0, len(waveforms), ALIGNED_BLOCK):
-        rows = slice(first, first + ALIGNED_BLOCK)
+    for rows in blocks(len(waveforms)):
         aligned[rows] = aligned_block(waveforms[rows], n_before, n_after)
     return aligned
 

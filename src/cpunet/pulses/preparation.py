@@ -67,6 +67,12 @@ class Rejection(IntEnum):
         return self.name.lower()
 
 
+def rejections_of(codes: Codes) -> dict[str, int]:
+    """Number of rejected pulses by reason, for the reasons that occurred."""
+    counts = np.bincount(codes).tolist()
+    return {Rejection(code).label: n for code, n in enumerate(counts) if code and n}
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """Prepared pulses, how each was prepared, and why others were rejected.
@@ -119,12 +125,7 @@ class Prepared:
     @property
     def rejections(self) -> dict[str, int]:
         """Number of rejected pulses by reason, for the reasons that occurred."""
-        counts = np.bincount(self.codes, minlength=1)
-        return {
-            Rejection(int(code)).label: int(counts[code])
-            for code in np.flatnonzero(counts)
-            if code
-        }
+        return rejections_of(self.codes)
 
     def __getitem__(
         self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]

@@ -11,7 +11,7 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.pulses import _parameter_kernels as kernels
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.parameters import (
     BLOCK,
     PARAMETERS,
@@ -100,34 +100,24 @@ def all_parameters(
             f"{preparation.length}; prepare them first"
         )
     values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
-    for first in range(0, len(pulses), BLOCK):
-        rows = slice(first, first + BLOCK)
+    for rows in blocks(len(pulses), BLOCK):
         block = np.array(pulses.waveforms[rows], dtype=np.float32, order="C")
         damaged = ~np.isfinite(block).all(axis=1)
         block[damaged] = np.nan  # treat infinities as NaN
-        known = None if amplitudes is None else np.where(damaged, np.nan, amplitudes[rows])
         # overflows become NaN below
         with np.errstate(all="ignore"):
-            found = _of_block(block, pulses.dt_ns, preparation, scores, known)
+            found = {
+                "current_amplitude": current_amplitude(block)
+                if amplitudes is None
+                else np.where(damaged, np.nan, amplitudes[rows]),
+                "drift_time": drift_time(block, pulses.dt_ns, scores.drift_start_fraction),
+                **_times(block, pulses.dt_ns, preparation.samples_before),
+                "tail_slope": tail_slope(block, pulses.dt_ns, preparation.decay_fit_samples),
+                "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
+            }
         for name, column in found.items():
             values[name][rows] = np.where(np.isfinite(column), column, np.nan)
     return values
-
-
-def _of_block(
-    block: FloatArray,
-    dt_ns: float,
-    preparation: PreparationConfig,
-    scores: ScoreConfig,
-    amplitudes: Values | None,
-) -> dict[str, Values]:
-    return {
-        "current_amplitude": current_amplitude(block) if amplitudes is None else amplitudes,
-        "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
-        **_times(block, dt_ns, preparation.samples_before),
-        "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
-        "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
-    }
 
 
 def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:

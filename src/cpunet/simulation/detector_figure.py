@@ -103,8 +103,8 @@ def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
     margin = 0.05 * detector.crystal_radius
     inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
     r, z = r[inside], z[inside]
-    tracks = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS)
-    for carrier, colour in ((tracks.electrons, _ELECTRON), (tracks.holes, _HOLE)):
+    electrons, holes = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS)
+    for carrier, colour in ((electrons, _ELECTRON), (holes, _HOLE)):
         for track in carrier:
             # a light outline keeps the line visible everywhere on the map
             radius, height = np.hypot(track[:, 0], track[:, 1]), track[:, 2]

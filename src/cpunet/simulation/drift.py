@@ -8,7 +8,6 @@ takes to enter the contact.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -191,14 +190,6 @@ _COLLECTED = 5e-5
 _AT_CONTACT, _CREEPING = 0.999, 2e-4
 
 
-@dataclass(frozen=True, eq=False)
-class DriftPaths:
-    """Positions (n, steps, 3) in mm of both carriers at each step; NaN after collection."""
-
-    electrons: FloatArray
-    holes: FloatArray
-
-
 @kernel
 def drift(
     maps: DriftMaps,
@@ -316,7 +307,7 @@ def drift_paths(
     y_mm: npt.ArrayLike,
     z_mm: npt.ArrayLike,
     settings: SimulationSettings,
-) -> DriftPaths:
+) -> tuple[FloatArray, FloatArray]:
     """Trajectories of both carriers from each starting point, one position per step.
 
     Parameters
@@ -330,15 +321,15 @@ def drift_paths(
 
     Returns
     -------
-    DriftPaths
-        Positions (n, steps, 3) in mm of both carriers.
+    electrons, holes
+        Positions (n, steps, 3) in mm at each step; NaN after collection.
     """
     start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
     start = start.reshape(-1, 3)
     maps = drift_maps(fields, settings)
     paths = np.full((2, len(start), settings.n_steps, 3), np.nan)
     _fill_paths(maps, start, settings.step_ns, paths)
-    return DriftPaths(electrons=paths[ELECTRON], holes=paths[HOLE])
+    return paths[ELECTRON], paths[HOLE]
 
 
 @kernel

@@ -134,13 +134,6 @@ def kept_parts(key: str) -> tuple[Grid, Potentials, float] | None:
         return None  # solved again and overwritten
 
 
-def keep_parts(key: str, grid: Grid, potentials: Potentials, depletion_V: float) -> None:
-    """Write to the cache atomically. A cache that cannot be written is ignored."""
-    with suppress(CpunetError), written_aside(cache_file(key)) as aside:
-        arrays = vars(grid) | vars(potentials) | {"depletion_V": depletion_V}
-        np.savez(aside, allow_pickle=False, **arrays)
-
-
 # fields that do not affect the parts of the potential
 NOT_IN_PARTS = (
     "name",
@@ -253,7 +246,10 @@ def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     fixed = potentials.impurities + potentials.surface
     depletion = depletion_voltage(potentials.bias, fixed, grid.region)
     if cache:
-        keep_parts(key, grid, potentials, depletion)
+        # atomically; a cache that cannot be written is ignored
+        with suppress(CpunetError), written_aside(cache_file(key)) as aside:
+            arrays = vars(grid) | vars(potentials) | {"depletion_V": depletion}
+            np.savez(aside, allow_pickle=False, **arrays)
     return Superposition(unit, grid, potentials, depletion)
 
 

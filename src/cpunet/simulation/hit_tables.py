@@ -314,15 +314,10 @@ def _csv_table(path: Path) -> StepTable:
 
     with path.open(encoding="utf-8", errors="replace") as lines:
         head = list(takewhile(lambda line: line.startswith("#"), lines))
-    title, names, separator = "", [], ","
-    for line in head:
-        key, _, value = line[1:].strip().partition(" ")
-        if key == "title":
-            title = value
-        elif key == "column":
-            names.append(value.partition(" ")[2])
-        elif key == "separator":
-            separator = chr(int(value))
+    told = [line[1:].strip().partition(" ")[::2] for line in head]
+    names = [value.partition(" ")[2] for key, value in told if key == "column"]
+    about = {"title": "", "separator": str(ord(","))} | dict(told)
+    separator = chr(int(about["separator"]))
     try:
         # the columns of one file can be numbers, text or both
         cells: DataFrame = read_csv(
@@ -336,4 +331,4 @@ def _csv_table(path: Path) -> StepTable:
     if cells[n - 1].isna().any():
         raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
     columns = {name: cells[at].to_numpy() for at, name in enumerate(names)}
-    return StepTable(path, columns, g4simple=title == _G4SIMPLE_TITLE)
+    return StepTable(path, columns, g4simple=about["title"] == _G4SIMPLE_TITLE)

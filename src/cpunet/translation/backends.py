@@ -12,13 +12,7 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
-from cpunet.electronics.finishing import (
-    PADDING_BEFORE,
-    extended,
-    finish,
-    record_length,
-    with_room,
-)
+from cpunet.electronics.finishing import finish, with_room
 from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
@@ -189,9 +183,7 @@ class NetworkBackend(Backend):
         return self.finished(clean, with_room(clean, self.config, self.dt_ns), drawn)
 
     def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
-        length = record_length(self.config.length) + reach
-        before = PADDING_BEFORE + self.config.samples_before
-        return extended(windows, self.config, self.dt_ns, length, before)
+        return with_room(windows, self.config, self.dt_ns, reach)
 
 
 class ResponseBackend(Backend):
@@ -221,9 +213,8 @@ class ResponseBackend(Backend):
         source = source.clip(0, records.shape[1] - 1)
         level = np.take_along_axis(records[clean.index], source, axis=1)
         levels = np.full((len(windows), length), np.nan, np.float32)
-        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / clean.scale[
-            :, np.newaxis
-        ]
+        height = clean.scale[:, np.newaxis]
+        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / height
         return levels, clean.codes
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:

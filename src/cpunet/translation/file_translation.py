@@ -31,13 +31,7 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import other_columns
 from cpunet.pulses.writing import PulseWriter
 from cpunet.training.run import RunLike, as_run, resolve_device
-from cpunet.translation.forms import (
-    AdcTraces,
-    Windows,
-    adc_scale,
-    wanted_pile_up,
-    wanted_tails,
-)
+from cpunet.translation.forms import form_of
 from cpunet.translation.options import TranslateOptions
 from cpunet.translation.translator import IREN, REN, TranslatedPulses, Translator
 
@@ -104,7 +98,7 @@ class FileTranslation:
         self.run, self.options = as_run(run), options
         self.kind: type[Translator] = IREN if options.inverse else REN
         self.translator = self.kind.of(self.run, resolve_device("auto"))
-        self.form = self._form()
+        self.form = form_of(self.run, self.translator, options)
         identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
         self._print = hashlib.sha256(identity.encode()).hexdigest()
 
@@ -219,15 +213,6 @@ class FileTranslation:
             samples=self.form.samples,
             force=force,
         )
-
-    def _form(self) -> Windows:
-        adc = self.options.adc
-        tails = wanted_tails(self.translator, self.options.tails, raw=adc is not None)
-        pile_up = wanted_pile_up(self.translator, self.options.pile_up_khz)
-        if adc is None:
-            return Windows(self.translator, tails, pile_up)
-        scale = adc_scale(self.run, self.translator, adc)
-        return AdcTraces(self.translator, *scale, adc, tails, pile_up)
 
     def _require_some(self, source: PulseFile, counts: Counts) -> None:
         if not counts.translated:

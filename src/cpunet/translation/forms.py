@@ -24,7 +24,7 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.training.run import Run
 from cpunet.translation.backends import Drawn
-from cpunet.translation.options import LEARNED, NONE, Adc
+from cpunet.translation.options import LEARNED, NONE, Adc, TranslateOptions
 from cpunet.translation.translator import TranslatedPulses, Translator
 
 HIGHEST = int(np.iinfo(np.uint16).max)
@@ -190,6 +190,22 @@ class AdcTraces(Windows):
             shapes, _ = backend.levels(windows[piled.partner], self.n_pre, reached)
             levels += piled.added(np.nan_to_num(shapes), energies, dt_ns, self.length)
         return levels, codes
+
+
+def form_of(run: Run, translator: Translator, options: TranslateOptions) -> Windows:
+    """The form that options ask for.
+
+    Raises
+    ------
+    CpunetError
+        If the run lacks information for it.
+    """
+    adc = options.adc
+    tails = wanted_tails(translator, options.tails, raw=adc is not None)
+    pile_up = wanted_pile_up(translator, options.pile_up_khz)
+    if adc is None:
+        return Windows(translator, tails, pile_up)
+    return AdcTraces(translator, *adc_scale(run, translator, adc), adc, tails, pile_up)
 
 
 def to_adc(

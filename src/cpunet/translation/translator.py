@@ -20,7 +20,7 @@ import torch
 from cpunet.electronics.drawn_pile_up import Columns, DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare
+from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejections_of
 from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
 from cpunet.training.run import Run
@@ -70,8 +70,7 @@ class TranslatedPulses:
     @property
     def rejections(self) -> dict[str, int]:
         """Numbers of rejected rows by reason."""
-        counts = np.bincount(self.codes).tolist()
-        return {Rejection(code).label: n for code, n in enumerate(counts) if code and n}
+        return rejections_of(self.codes)
 
     @property
     def columns(self) -> Columns:

@@ -293,31 +293,27 @@ def compared(
     failed
         Reports to list as missing: what is in their folders is of an earlier validation.
     """
-    places: list[Path] = []
-    metrics: list[Metrics | None] = []
-    folders: list[Path | None] = []
+    found: list[tuple[Path, Metrics | None, Path | None]] = []
     for report in reports:
         if isinstance(report, Report):
             # one in memory is named by its run
-            places.append(report.folder or Path(report.metrics["compared"]["run"]))
-            metrics.append(report.metrics)
-            folders.append(report.folder)
+            place = report.folder or Path(report.metrics["compared"]["run"])
+            found.append((place, report.metrics, report.folder))
             continue
         path = Path(report)
         files = (path, path / METRICS, path / "report" / METRICS)  # the last one of a demo
         file = next((f for f in files if f.is_file() and path not in failed), None)
-        places.append(path)
-        metrics.append(read_metrics(file) if file else None)
-        folders.append(file and file.parent)
-    names = _names(places)
-    runs = {n: found for n, found in zip(names, metrics, strict=True) if found is not None}
+        found.append((path, read_metrics(file) if file else None, file and file.parent))
+    names = _names([place for place, _, _ in found])
+    folders = {name: folder for name, (_, _, folder) in zip(names, found, strict=True)}
+    runs = {n: metrics for n, (_, metrics, _) in zip(names, found, strict=True) if metrics}
     if not runs:
         raise CpunetError(
             f"none of the {len(reports)} reports is there",
             "give folders of cpunet validate or cpunet demo",
         )
     missing = tuple(name for name in names if name not in runs)
-    made = Comparison(method, runs, dict(zip(names, folders, strict=True)), missing)
+    made = Comparison(method, runs, folders, missing)
     if not made.rows:
         known = _union(methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks"))
         raise CpunetError(

@@ -538,8 +538,16 @@ def compare(
     del null
     for method, values in methods.items():
         draws = (own, Resampled.of(sizes[method], sizes[method], scores.bootstraps, rng))
-        for name in data:
-            _add_method(found[name], method, data[name], values[name], axes.get(name), draws)
+        for name, one in found.items():
+            both = data[name], values[name]
+            one["wasserstein"][method] = wasserstein(*both)
+            one["ks"][method] = kolmogorov_smirnov(*both)
+            errors = distance_errors(*both, draws)
+            one["wasserstein_std"][method], one["ks_std"][method] = errors
+            one["missing"][method] = int(np.isnan(values[name]).sum())
+            axis = axes.get(name)
+            one["iou"][method] = np.nan if axis is None else iou(*both, axis)
+            one["iou_std"][method] = np.nan if axis is None else iou_error(*both, axis, draws)
     return found
 
 
@@ -562,25 +570,6 @@ def _of_data(data: Values, null: Draws, axis: hist.axis.Regular | None) -> Compa
         missing={"data": int(np.isnan(data).sum())},
         axis={"low": low, "high": high, "bins": None if axis is None else axis.size},
     )
-
-
-def _add_method(
-    result: Compared,
-    method: str,
-    data: Values,
-    values: Values,
-    axis: hist.axis.Regular | None,
-    draws: Draws,
-) -> None:
-    """Add the scores of one method."""
-    w1_error, ks_error = distance_errors(data, values, draws)
-    result["wasserstein"][method] = wasserstein(data, values)
-    result["wasserstein_std"][method] = w1_error
-    result["ks"][method] = kolmogorov_smirnov(data, values)
-    result["ks_std"][method] = ks_error
-    result["missing"][method] = int(np.isnan(values).sum())
-    result["iou"][method] = np.nan if axis is None else iou(data, values, axis)
-    result["iou_std"][method] = np.nan if axis is None else iou_error(data, values, axis, draws)
 
 
 def _overlap(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> Values:

@@ -24,14 +24,14 @@ import torch
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
-from cpunet.electronics.finishing import blocks, finish
+from cpunet.electronics.finishing import finish
 from cpunet.electronics.fitted_kernels import BASELINE_METHODS
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.parameters import ALIGNED_BLOCK, Values, aligned_block, current_amplitude
+from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
@@ -105,8 +105,7 @@ def pair_squares(
         around the crossing; all 0 where a pulse cannot be aligned.
     """
     found = {method: np.zeros((len(truth), 4)) for method in methods}
-    for first in range(0, len(truth), ALIGNED_BLOCK):
-        rows = slice(first, first + ALIGNED_BLOCK)
+    for rows in blocks(len(truth)):
         half = truth.shape[1]
         aligned = aligned_block(truth[rows], half, half)
         edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
@@ -213,8 +212,7 @@ def fit_baseline_methods(
         Methods that cannot be fitted are listed as missing, with the reason.
     """
     config, result = recipe.preparation, FittedBaselineMethods()
-    # all but the untranslated simulation, which is scored anyway
-    kinds = {name: kind for name, kind in BASELINE_METHODS.items() if fitted and name != "raw"}
+    kinds = BASELINE_METHODS if fitted else {}
     there = tails is not None and tails.law.rate_khz > 0
     found = tails_of(data)[0] if there else None
     try:

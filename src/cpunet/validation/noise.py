@@ -152,9 +152,7 @@ def _band_powers(baselines: FloatArray, edges: Values) -> Values:
     if samples % 2 == 0:
         power[:, -1] /= 2  # the highest frequency occurs only once
     starts = edges[:-1].astype(int)
-    return (
-        np.asarray(np.add.reduceat(power, starts, axis=1)) if len(known) else power[:, starts]
-    )
+    return np.asarray(np.add.reduceat(power, starts, axis=1))
 
 
 def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float | None]:

@@ -163,13 +163,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
     if paired := scores.get("paired", {}):
         head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
         rows = [
-            [
-                label(method),
-                *(
-                    NO_VALUE if found[key] is None else f"{1e3 * found[key]:#.3g}".rstrip(".")
-                    for key in ("rmse", "edge_rmse")
-                ),
-            ]
+            [label(method), _thousandths(found["rmse"]), _thousandths(found["edge_rmse"])]
             for method, found in paired.items()
         ]
         tables.append(part("table", head, rows))
@@ -275,6 +269,10 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
         rows.append([title, "Ceiling", ceiling, moved, apart])
     head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS"]
     return part("table", head, rows, {0, 1})
+
+
+def _thousandths(value: float | None) -> str:
+    return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
 
 
 def _sigma(value: float | None) -> str:

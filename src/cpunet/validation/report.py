@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import UserDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -292,17 +293,8 @@ def as_stored(results: Any) -> Any:
     return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
 
 
-class _Figures(Mapping[str, "Figure"]):
+class _Figures(UserDict[str, Any]):
     """Figures that exist only while they are used: drawn on every access."""
 
-    def __init__(self, drawn: Mapping[str, Callable[[], Figure]]) -> None:
-        self._drawn = drawn
-
-    def __getitem__(self, name: str) -> Figure:
-        return self._drawn[name]()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._drawn)
-
-    def __len__(self) -> int:
-        return len(self._drawn)
+    def __getitem__(self, name: str) -> Any:
+        return self.data[name]()

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray
+from cpunet.pulses.container import FloatArray, blocks
 
 Values = npt.NDArray[np.float64]
 Parameters = Mapping[str, Values]
@@ -230,8 +230,7 @@ def _components(windows: Values) -> tuple[Values, Values]:
     vectors = vectors[:, ::-1]
     components = centred @ vectors
     sizes = np.empty((len(windows), 2))
-    for first in range(0, len(windows), BLOCK):
-        rows = slice(first, first + BLOCK)
+    for rows in blocks(len(windows), BLOCK):
         rest = centred[rows] - components[rows] @ vectors.T
         for column, values in enumerate((rest, np.diff(rest, axis=1))):
             sizes[rows, column] = np.sqrt(np.mean(values**2, axis=1))
