@@ -14,8 +14,7 @@ import numpy.typing as npt
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.container import blocks as blocks
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig

@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.finishing import blocks
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import LinearInverse, ResponseGenerator, stretch
 from cpunet.networks.response_layer import PADDING_BEFORE
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.moments import MIN_PULSES, Values
