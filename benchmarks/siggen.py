@@ -62,9 +62,9 @@ def compare(folder: Path, fields: FieldMaps) -> None:
     print(f"  cloud: width within 5 %: {(width < 0.05).sum()} of {len(width)}", end="")
     print(f", worst {width.max():.1%} (one step); RMS {rms.max():.1e} at most")
     with np.load(folder / "drift_paths_A_grid0.1.npz") as reference:
-        paths = drift_paths(fields, *reference["positions"].T, PLAIN)
+        _, paths = drift_paths(fields, *reference["positions"].T, PLAIN)
         theirs = reference["paths"][:, : PLAIN.n_steps]
-        holes = np.nanmax(np.linalg.norm(paths.holes - theirs[..., 3:], axis=2))
+        holes = np.nanmax(np.linalg.norm(paths - theirs[..., 3:], axis=2))
     print(f"  paths of holes within {holes:.3f} mm")
 
 

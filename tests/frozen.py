@@ -119,7 +119,7 @@ def results(path: Path) -> Iterator[tuple[str, Any]]:
             yield from ((f"{path.name}:{name}", digest(arrays[name])) for name in arrays)
     elif path.name == "metrics.json":
         metrics = json.loads(path.read_text())
-        for key in metrics.keys() - {"training"}:  # holds seconds
+        for key in metrics.keys() - {"training", "compared"}:  # hold seconds, and the day
             yield f"{path.name}:{key}", digest(json.dumps(metrics[key], sort_keys=True))
         for peak, scores in metrics["peaks"].items():
             for name, comparison in scores["parameters"].items():
