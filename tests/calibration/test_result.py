@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cpunet.calibration import result
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
@@ -19,6 +20,13 @@ from cpunet.simulation.settings import SimulationSettings
 SHORT = ("temperature", "impurity", "cloud", "self_repulsion", "diffusion")
 NUISANCES = tuple(named(name) for name in SHORT)
 PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
+
+
+@pytest.fixture(autouse=True)
+def unprofiled(monkeypatch):
+    """No fits along the profiles."""
+    none = SimpleNamespace(cost=0.0)
+    monkeypatch.setattr(result, "levenberg_marquardt", lambda *_, **__: none)
 
 
 def calibrated(values=(), given=None) -> Calibrated:
@@ -40,7 +48,7 @@ def calibrated(values=(), given=None) -> Calibrated:
         by_chance=(2.0, 0.5),
         pulls=lambda: np.zeros(2),
         residuals=lambda at: at - vector,
-        jacobian=lambda at, residuals: np.eye(len(at)),
+        without=lambda i, at: None,
     )
     return Calibrated(
         problem=problem,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -216,13 +217,28 @@ class JointProblem:
 
     def of_chain(self, response: ElectronicsResponse) -> JointProblem:
         """The same comparison, weights included, for another chain and fixed physics."""
-        physics, own = self.nearby.simulator.physics, self.parameters
-        fixed = JointParameters(response, physics, own.coordinates, [], own.given, own.start)
-        problem = replace(self, parameters=fixed, held=True)  # needs no weights of its own
-        problem.held, problem.few = False, None
-        problem.weigh_like(self)
+        problem = self._of(response, self.parameters.coordinates, [])
         problem.known = lambda _: np.empty(0)
         return problem
+
+    def without(self, i: int, vector: Values) -> JointProblem:
+        """The same comparison from another point, with one more coordinate fixed there."""
+        own = self.parameters
+        there = self._of(copy.deepcopy(own.chain.response), own.coordinates, own.free)
+        there.parameters.set(np.clip(vector, own.low, own.high))
+        chain, at = there.parameters.chain.response, there.parameters.coordinates
+        return self._of(chain, at, [j for j in own.free if j != i])
+
+    def _of(
+        self, response: ElectronicsResponse, coordinates: Values, free: Sequence[int]
+    ) -> JointProblem:
+        """The same comparison, weights included, for other parameters."""
+        physics, own = self.nearby.simulator.physics, self.parameters
+        parameters = JointParameters(response, physics, coordinates, free, own.given, own.start)
+        other = replace(self, parameters=parameters, held=True)  # needs no weights of its own
+        other.held, other.few = False, None
+        other.weigh_like(self)
+        return other
 
     def of_bands(self, bands: Sequence[Band]) -> JointProblem:
         """The same comparison, weights included, of parts of these bands, wholly used."""

@@ -13,10 +13,10 @@ from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.levenberg_marquardt import levenberg_marquardt
 
-# Offsets of a profile in errors, steps in which the other parameters are minimised, at most,
-# and the change of chi-square that ends them.
-OFFSETS, STEPS, STILL = (-1.5, 0.0, 1.5), 12, 0.02
+# Offsets of a profile in errors, and steps in which the other parameters are minimised.
+OFFSETS, STEPS = (-1.5, 0.0, 1.5), 6
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
 # Advice where a parameter is unexpected, besides the general one.
@@ -265,7 +265,7 @@ def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
     problem, physics = calibrated.problem, calibrated.physics
     parameters = problem.parameters
     here, n = parameters.vector(), parameters.n_chain
-    jacobian = problem.jacobian(here, problem.residuals(here))
+    residuals = problem.residuals(here)
     found = {}
     for k, i in enumerate(parameters.free, n):
         error = float(np.sqrt(calibrated.covariance[k, k]))
@@ -277,24 +277,11 @@ def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
             x = float(here[k] + offset * error)
             added = nuisance.kind == "added"  # told without bounds
             values.append(nominal + x if added else nuisance.value(nominal, x))
-            costs.append(_lowest(problem, here + offset * valley, jacobian, k))
+            cost = float(residuals @ residuals)
+            if offset:
+                rest = problem.without(i, here + offset * valley)
+                cost = levenberg_marquardt(rest, STEPS, None, coarse=False).cost
+                cost += ((x - parameters.centre[k]) / parameters.widths[k]) ** 2
+            costs.append(cost)
         found[nuisance.name] = {"value": values, "chi_square": costs}
-    parameters.set(here)
     return found
-
-
-def _lowest(problem: JointProblem, vector: Values, jacobian: Values, fixed: int) -> float:
-    """Lowest chi-square with one parameter fixed, near a minimum of known derivatives.
-
-    Valleys are curved: a step may lead up before the next ones lead down.
-    """
-    parameters, free = problem.parameters, np.arange(len(vector)) != fixed
-    costs: list[float] = []
-    for _ in range(STEPS):
-        residuals = problem.residuals(vector)
-        costs.append(float(residuals @ residuals))
-        if len(costs) > 1 and abs(costs[-1] - costs[-2]) < STILL:
-            break
-        vector[free] -= np.linalg.lstsq(jacobian[:, free], residuals)[0]
-        vector = np.clip(vector, parameters.low, parameters.high)
-    return min(costs)
