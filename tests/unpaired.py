@@ -70,15 +70,15 @@ class Unpaired(NamedTuple):
     noise: BaselineNoise
 
 
-def measured_with(chain: Electronics, n: int = N) -> Unpaired:
-    clean = linear_response(charge(n, seed=2), chain)
+def measured_with(chain: Electronics) -> Unpaired:
+    clean = linear_response(charge(N, seed=2), chain)
     rng = np.random.default_rng(3)
-    noise = coloured_noise(chain.noise.spectrum, n, chain.length, DT_NS, rng)
+    noise = coloured_noise(chain.noise.spectrum, N, chain.length, DT_NS, rng)
     adc = 15_000 + chain.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
-    raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(n, KEV))
+    raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(N, KEV))
     data = prepare(raw, RECIPE.preparation, "measured").pulses
     measured = BaselineNoise.of(Baselines.of([raw], RECIPE.preparation))
-    return Unpaired(simulated(charge(n, seed=1)), data, measured)
+    return Unpaired(simulated(charge(N, seed=1)), data, measured)
 
 
 def faster(fine: Pulses, factor: float) -> Pulses:

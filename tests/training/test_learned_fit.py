@@ -34,7 +34,7 @@ DECAY_US = CHAIN.decays[0].tau_us
 
 @pytest.fixture(scope="module")
 def problem() -> Unpaired:
-    return measured_with(CHAIN, n=300)
+    return measured_with(CHAIN)
 
 
 @pytest.fixture(scope="module")

@@ -306,7 +306,8 @@ def compared(
         found.append((path, read_metrics(file) if file else None, file and file.parent))
     names = _names([place for place, _, _ in found])
     folders = {name: folder for name, (_, _, folder) in zip(names, found, strict=True)}
-    runs = {n: metrics for n, (_, metrics, _) in zip(names, found, strict=True) if metrics}
+    each = zip(names, found, strict=True)
+    runs = {name: metrics for name, (_, metrics, _) in each if metrics is not None}
     if not runs:
         raise CpunetError(
             f"none of the {len(reports)} reports is there",
