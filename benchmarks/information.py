@@ -126,7 +126,7 @@ def bound(
     """Error of the shift in percent, from the best function that a network finds."""
     parameters = Parameters(response)
     vector, shifted = parameters.vector(), []
-    for i, step in enumerate(parameters.steps):
+    for i, step in enumerate(0.01 * parameters.widths):
         ends = []
         for sign in (1, -1):
             moved = vector.copy()
@@ -220,7 +220,7 @@ def main() -> None:
     parameters = Parameters(start)
     vector, here = parameters.vector(), shift(start, windows, wanted)
     direction = []
-    for i, step in enumerate(parameters.steps):
+    for i, step in enumerate(0.01 * parameters.widths):
         moved = vector.copy()
         moved[i] += step
         parameters.set(moved)

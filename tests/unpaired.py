@@ -56,9 +56,13 @@ def charge(n: int, seed: int, longest: float = 100, steepest: float = 5) -> Puls
     return Pulses.of(pulses, dt_ns=FINE_NS, energy_kev=np.full(n, KEV))
 
 
+def coarse(fine: Pulses) -> np.ndarray:
+    """Means over the samples of the digitiser."""
+    return fine.waveforms.reshape(len(fine), -1, FINE_PER_SAMPLE).mean(axis=2)
+
+
 def simulated(fine: Pulses) -> Pulses:
-    means = fine.waveforms.reshape(len(fine), -1, FINE_PER_SAMPLE).mean(axis=2)
-    pulses = Pulses.of(means, dt_ns=DT_NS, energy_kev=fine.energy_kev)
+    pulses = Pulses.of(coarse(fine), dt_ns=DT_NS, energy_kev=fine.energy_kev)
     return prepare(pulses, RECIPE.preparation, "simulated").pulses
 
 
@@ -70,15 +74,15 @@ class Unpaired(NamedTuple):
     noise: BaselineNoise
 
 
-def measured_with(chain: Electronics) -> Unpaired:
-    clean = linear_response(charge(N, seed=2), chain)
+def measured_with(chain: Electronics, n: int = N) -> Unpaired:
+    clean = linear_response(charge(n, seed=2), chain)
     rng = np.random.default_rng(3)
-    noise = coloured_noise(chain.noise.spectrum, N, chain.length, DT_NS, rng)
+    noise = coloured_noise(chain.noise.spectrum, n, chain.length, DT_NS, rng)
     adc = 15_000 + chain.gain_adc_per_kev * (KEV * clean + NOISE_KEV * noise)
-    raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(N, KEV))
+    raw = Pulses.of(np.round(adc), dt_ns=DT_NS, energy_kev=np.full(n, KEV))
     data = prepare(raw, RECIPE.preparation, "measured").pulses
     measured = BaselineNoise.of(Baselines.of([raw], RECIPE.preparation))
-    return Unpaired(simulated(charge(N, seed=1)), data, measured)
+    return Unpaired(simulated(charge(n, seed=1)), data, measured)
 
 
 def faster(fine: Pulses, factor: float) -> Pulses:

@@ -12,10 +12,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cpunet.calibration import joint_problem
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import HOLD, RIDGE, JointParameters, JointProblem
 from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
 from cpunet.calibration.nuisances import Physics, named
+from cpunet.calibration.sliced_functions import SlicedFunctions
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
@@ -23,12 +25,15 @@ from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.moments import Readings
+from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.response_starts import set_decay
+from unpaired import CHAIN, DT_NS, charge, coarse, faster, measured_with
 
 RECIPE = load_recipe("fast")
 PHYSICS = Physics(
     read_detector("ppc"), SimulationSettings(), (named("temperature"), named("impurity"))
 )
-N, SLOPES = 400, {0: np.array([0.02, -0.01]), 1: np.array([1.0, 3.0])}
+PAIRS, SLOPES = 400, {0: np.array([0.02, -0.01]), 1: np.array([1.0, 3.0])}
 
 
 @dataclass
@@ -47,6 +52,22 @@ class Pairs:
     def sums(self, response, of, *, cut=True, draws=None):
         readings = Readings(self.sim, np.zeros(len(self)), self.weights)
         return of(readings), float(self.weights.sum())
+
+
+class ReadExactly:
+    """The derivatives of these numbers: no readout changes them, but the physics do."""
+
+    def __init__(self, side):
+        self.side = side
+
+    def slopes(self, readout, functions, *, draws=None):
+        of_chain = np.zeros((len(readout.chain.labels), self.side.sim.shape[1]))
+        return np.concatenate([of_chain, readout.changes.mean(axis=1)]).T
+
+
+@pytest.fixture
+def read_exactly(monkeypatch):
+    monkeypatch.setattr(joint_problem, "DifferentiableSet", ReadExactly)
 
 
 class Plain(JointProblem):
@@ -92,7 +113,7 @@ def problem(sim, data, *, free=(0, 1), held=False, known=None, centre=(0.0, 0.0)
 def sides():
     rng = np.random.default_rng(3)
     mixed = np.array([[1.0, 0.6], [0.0, 0.8]])
-    return 2 * rng.normal(size=(N, 2)) @ mixed, 0.3 + rng.normal(size=(N, 2)) @ mixed
+    return 2 * rng.normal(size=(PAIRS, 2)) @ mixed, 0.3 + rng.normal(size=(PAIRS, 2)) @ mixed
 
 
 def whitened(deviation, covariance):
@@ -106,7 +127,7 @@ def whitened(deviation, covariance):
 def test_chi_square_is_that_of_the_definition(sides):
     sim, data = sides
     both = problem(sim, data)
-    covariance = 0.5 * (np.cov(sim.T, bias=True) + np.cov(data.T)) / (N / 2)
+    covariance = 0.5 * (np.cov(sim.T, bias=True) + np.cov(data.T)) / (PAIRS / 2)
     deviation = sim.mean(axis=0) - data.mean(axis=0)
     assert both.chi_square() == pytest.approx(whitened(deviation, covariance))
     assert both.pulls() == pytest.approx(deviation / np.sqrt(covariance.diagonal()))
@@ -128,34 +149,11 @@ def test_chance_gives_less_than_one_per_function_because_of_the_ridge(sides):
     assert spread == pytest.approx(chi_square.std(), rel=0.01)
 
 
-def test_derivatives_are_of_steps_in_which_the_functions_are_linear(sides):
-    """A function that saturates far within the step first taken."""
-
-    class Saturates(Numbers):
-        def __call__(self, readings, clip=None):
-            return np.tanh(300 * (readings.linear - 1e-9)) / 300
-
-    sim, data = (1e-4 * side for side in sides)
-    both = problem(sim, data)
-    both.functions = (Saturates(),)
-    both._weigh(None)
-    vector = both.parameters.vector()
-    first = both.parameters.steps.copy()
-    found = both.jacobian(vector, both.residuals(vector))[:2, -1]
-    shorter = both.parameters.steps
-    assert shorter[-1] < 0.1 * first[-1]
-    assert (shorter <= first).all()
-    moved = vector.copy()
-    moved[-1] += 1e-3 * shorter[-1]
-    true = (both.residuals(moved) - both.residuals(vector))[:2] / (1e-3 * shorter[-1])
-    assert found == pytest.approx(true, rel=0.05)
-
-
 def test_far_from_the_data_only_their_covariance_counts(sides):
     sim, data = sides
     held = problem(sim, data, held=True)
     deviation = sim.mean(axis=0) - data.mean(axis=0)
-    expected = whitened(deviation, np.cov(data.T) / (N / 2))
+    expected = whitened(deviation, np.cov(data.T) / (PAIRS / 2))
     assert held.chi_square() == pytest.approx(expected)
     near = problem(sim, data)
     near.weigh_like(held)
@@ -175,12 +173,11 @@ def test_priors_and_further_knowledge_follow_the_deviations(sides):
     assert parameters.coordinates.tolist() == [1.5, 0.02]
 
 
-def test_what_else_is_known_makes_errors_smaller(sides):
+def test_what_else_is_known_makes_errors_smaller(sides, read_exactly):
     plain = problem(*sides)
     known = problem(*sides, known=lambda coordinates: 500 * coordinates[1:])
     before, after = (
-        Information.of(one, one.jacobian(one.parameters.vector(), np.empty(0)))
-        for one in (plain, known)
+        Information.of(one, one.jacobian(one.parameters.vector())) for one in (plain, known)
     )
     own = before.errors([1])[0]
     assert after.errors([1])[0] == pytest.approx((own**-2 + 500**2) ** -0.5, rel=1e-6)
@@ -197,10 +194,10 @@ def test_steps_from_far_away_are_held_within_reach(sides):
     assert held.residuals(vector)[-2:] == pytest.approx([HOLD, -0.5 * HOLD])
 
 
-def test_derivatives_are_those_of_the_pulses(sides):
+def test_derivatives_are_those_of_the_pulses(sides, read_exactly):
     both = problem(*sides)
     vector = both.parameters.vector()
-    jacobian = both.jacobian(vector, both.residuals(vector))
+    jacobian = both.jacobian(vector)
     n, sigma = both.parameters.n_chain, both._sigma[0]
     for column, slope in SLOPES.items():
         expected = both._whiten[0] @ (slope / sigma)
@@ -209,6 +206,38 @@ def test_derivatives_are_those_of_the_pulses(sides):
     priors = jacobian[2:].diagonal()
     assert priors == pytest.approx(1 / both.parameters.widths)
     assert both.parameters.vector() == pytest.approx(vector, rel=1e-12)
+
+
+def test_derivatives_are_those_of_wide_differences():
+    """Of chain and physics: a drift that takes longer, and a wider cloud.
+
+    Noise makes the readings of single pulses jump; over wide steps of many that is a motion.
+    """
+    n = 3000
+    sides = measured_with(CHAIN, n)
+    sets = PulseSets(*sides, RECIPE, np.random.default_rng(0))
+    (band,) = sets.bands()
+    fine = charge(n, seed=1)
+    base = coarse(fine)
+    half = half_maxima(base, np.zeros(n))
+    wider = sum(np.roll(base, shift, axis=1) for shift in (-1, 1)) - 2 * base
+    slopes, at = (coarse(faster(fine, 0.9)) - base, wider), np.zeros(2)
+    derivatives = {i: Derivative(np.float32(s), at, half) for i, s in enumerate(slopes)}
+    nearby = Nearby(SimpleNamespace(physics=PHYSICS), at, base, derivatives)
+    response = ElectronicsResponse(RECIPE.matching[0], DT_NS)
+    set_decay(response, band.moments.slope)
+    parameters = JointParameters(response, PHYSICS, at, [0, 1], {}, response)
+    functions = [SlicedFunctions(band.moments)]
+    both = JointProblem(parameters, [band], functions, nearby, RECIPE)
+    vector = parameters.vector()
+    for i, slope in enumerate(both.jacobian(vector).T):
+        step, ends = 3 / np.linalg.norm(slope), []  # by three standard deviations in all
+        for sign in (1, -1):
+            there = vector.copy()
+            there[i] += sign * step
+            ends.append(both.residuals(there))
+        wanted = (ends[0] - ends[1]) / (2 * step)
+        assert np.linalg.norm(slope - wanted) < 0.1 * np.linalg.norm(wanted)
 
 
 def test_windows_do_not_jump_where_the_alignment_of_pulses_does(sides):

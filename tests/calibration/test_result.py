@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cpunet.calibration import result
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
@@ -20,13 +19,6 @@ from cpunet.simulation.settings import SimulationSettings
 SHORT = ("temperature", "impurity", "cloud", "self_repulsion", "diffusion")
 NUISANCES = tuple(named(name) for name in SHORT)
 PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
-
-
-@pytest.fixture(autouse=True)
-def unprofiled(monkeypatch):
-    """No fits along the profiles."""
-    none = SimpleNamespace(cost=0.0)
-    monkeypatch.setattr(result, "levenberg_marquardt", lambda *_, **__: none)
 
 
 def calibrated(values=(), given=None) -> Calibrated:
@@ -48,7 +40,7 @@ def calibrated(values=(), given=None) -> Calibrated:
         by_chance=(2.0, 0.5),
         pulls=lambda: np.zeros(2),
         residuals=lambda at: at - vector,
-        without=lambda i, at: None,
+        jacobian=lambda at: np.eye(len(at)),
     )
     return Calibrated(
         problem=problem,

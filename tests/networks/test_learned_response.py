@@ -71,16 +71,6 @@ def test_a_record_is_the_step_response_summed_over_the_current(step):
     np.testing.assert_allclose(record[at[60:]], wanted[60:], atol=2e-5)
 
 
-def test_slopes_of_the_transfer_are_those_of_differences(step):
-    slopes = step.transfer_slopes(2304)
-    here = step.transfer(2304).detach()
-    for number in (0, 5, 20):
-        step.coordinates.data[number] = 1e-5
-        moved = (step.transfer(2304).detach() - here) / 1e-5
-        step.coordinates.data[number] = 0.0
-        assert (moved - slopes[number]).norm() < 1e-3 * slopes[number].norm()
-
-
 def edges(n: int = 8) -> torch.Tensor:
     """Pulses whose current is a Gaussian of 6 to 20 samples."""
     width = torch.linspace(6, 20, n)[:, None]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
+import torch
+from torch import Tensor
 
 from cpunet.calibration.nearby import FloatArray, Nearby, cut
 from cpunet.calibration.nuisances import Physics, Values
@@ -18,6 +20,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
+from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import Readings
 from cpunet.training.response_problem import Band, SmoothParameters
 from cpunet.training.translated import SimulatedSide
@@ -29,11 +32,8 @@ HOLD = 4.0
 FOR_DERIVATIVES, OF_BAND = 1536, 100
 # Simulated pulses of a band for the covariance of the functions.
 FOR_COVARIANCE = 4096
-# Step of a finite difference as a fraction of the reach of a derivative. A step that changes
-# the residuals by more standard deviations than this is replaced by one of a single one: tail
-# slopes are clipped and cut, and fast decays make them so precise that a step of 1 % is nowhere
-# near linear.
-FINITE, LONGEST = 0.1, 3.0
+# Step in the physics, in which pulses are linear, as a fraction of the reach of a derivative.
+STEP = 0.1
 
 
 class JointParameters:
@@ -66,19 +66,16 @@ class JointParameters:
         given: Mapping[str, tuple[float, float]],
         start: ElectronicsResponse,
     ) -> None:
-        self.chain, self.given, self.start = SmoothParameters(response), given, start
+        self.chain, self.given, self.start = SmoothParameters(response, start), given, start
         self.coordinates, self.free = coordinates.copy(), list(free)
         self.n_chain = len(self.chain.labels)
         chosen = [physics.nuisances[i] for i in self.free]
         centres, widths = physics.priors(given)
-        nominal, current = (p.by_name(p.centre) for p in (SmoothParameters(start), self.chain))
-        of_chain = [nominal.get(name, value) for name, value in current.items()]
-        self.centre = np.concatenate([of_chain, centres[self.free]])
+        self.centre = np.concatenate([self.chain.centre, centres[self.free]])
         self.widths = np.concatenate([self.chain.widths, widths[self.free]])
         # a prior may lie far from what was simulated, and its centre must be reached
         self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
         self.reach = np.array([nuisance.reach for nuisance in chosen])
-        self.steps = np.concatenate([self.chain.steps, FINITE * self.reach])
         self.names = tuple(nuisance.name for nuisance in chosen)
         bounds = [n.bounds(physics.nominal(n)) for n in chosen]
         low, high = np.reshape(bounds, (len(chosen), 2)).T
@@ -95,6 +92,33 @@ class JointParameters:
         self.coordinates = self.coordinates.copy()
         n = self.n_chain
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
+
+
+@dataclass(frozen=True, eq=False)
+class _BandSlopes:
+    """How records change with the parameters of a chain, and how pulses do with the physics.
+
+    The latter has the shape (coordinates, pulses, samples).
+    """
+
+    chain: SmoothParameters
+    changes: FloatArray
+
+    @property
+    def response(self) -> ElectronicsResponse:
+        """The chain."""
+        response: ElectronicsResponse = self.chain.response
+        return response
+
+    def transfer_slopes(self, padded: int) -> Tensor:
+        """Derivatives of the chain."""
+        return self.chain.transfer_slopes(padded)
+
+    def pulse_slopes(self, pulses: FloatArray, rows: slice) -> Tensor:
+        """Derivatives of pulses in a stretch of the drift, if there is one, and the physics."""
+        return torch.cat(
+            [self.chain.pulse_slopes(pulses, rows), torch.from_numpy(self.changes[:, rows])]
+        )
 
 
 @dataclass(eq=False)
@@ -217,26 +241,12 @@ class JointProblem:
 
     def of_chain(self, response: ElectronicsResponse) -> JointProblem:
         """The same comparison, weights included, for another chain and fixed physics."""
-        problem = self._of(response, self.parameters.coordinates, [])
-        problem.known = lambda _: np.empty(0)
-        return problem
-
-    def without(self, i: int, vector: Values) -> JointProblem:
-        """The same comparison from another point, with one more coordinate fixed there."""
-        own = self.parameters
-        there = self._of(copy.deepcopy(own.chain.response), own.coordinates, own.free)
-        there.parameters.set(np.clip(vector, own.low, own.high))
-        chain, at = there.parameters.chain.response, there.parameters.coordinates
-        return self._of(chain, at, [j for j in own.free if j != i])
-
-    def _of(
-        self, response: ElectronicsResponse, coordinates: Values, free: Sequence[int]
-    ) -> JointProblem:
-        """The same comparison, weights included, for other parameters."""
         physics, own = self.nearby.simulator.physics, self.parameters
-        parameters = JointParameters(response, physics, coordinates, free, own.given, own.start)
-        other = replace(self, parameters=parameters, held=True)  # needs no weights of its own
-        other.held, other.few = False, None
+        parameters = JointParameters(
+            response, physics, own.coordinates, [], own.given, own.start
+        )
+        other = replace(self, parameters=parameters, known=lambda _: np.empty(0), held=True)
+        other.held, other.few = False, None  # held ones need no weights of their own
         other.weigh_like(self)
         return other
 
@@ -257,41 +267,64 @@ class JointProblem:
 
         While steps are held, accuracy matters less and only some of the pulses are used.
         """
-        return self._residuals(vector, self.few if self.held else None)
-
-    def _residuals(self, vector: Values, most: int | None) -> Values:
         parameters = self.parameters
         prior = (vector - parameters.centre) / parameters.widths
-        deviations = self._deviations(vector, most)
+        deviations = self._deviations(vector, self.few if self.held else None)
         rows = [deviations, prior, self.known(parameters.coordinates)]
         if self.held:
             moved = (parameters.coordinates - self.nearby.centre)[parameters.free]
             rows.append(HOLD * moved / parameters.reach)
         return np.concatenate(rows)
 
-    def jacobian(self, vector: Values, residuals: Values) -> Values:
+    def jacobian(self, vector: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters).
 
         If `few` is set, they are of that many pulses and one draw of noise.
         """
-        here, steps = self._residuals(vector, self.few), self.parameters.steps
-        columns = []
-        for i in range(len(steps)):
-            change = self._change(vector, here, i)
-            size = float(np.linalg.norm(change))
-            if size > LONGEST and not self.held:
-                steps[i] /= size
-                change = self._change(vector, here, i)
-            columns.append(change / steps[i])
-        self.parameters.set(vector)
-        return np.stack(columns, axis=1)
+        parameters = self.parameters
+        parameters.set(vector)
+        rows = [*self._slopes(), np.diag(1 / parameters.widths)]
+        n, at, physics = parameters.n_chain, parameters.coordinates, []
+        for i, step in zip(parameters.free, STEP * parameters.reach, strict=True):
+            there = at + step * np.eye(len(at))[i]
+            physics.append((self.known(there) - self.known(at)) / step)
+        columns = np.reshape(physics, (len(physics), -1)).T
+        if self.held:
+            columns = np.concatenate([columns, np.diag(HOLD / parameters.reach)])
+        rows.append(np.pad(columns, ((0, 0), (n, 0))))
+        return np.concatenate(rows)
 
-    def _change(self, vector: Values, here: Values, i: int) -> Values:
-        """Change of the residuals by one step of a parameter, backwards at its upper bound."""
-        moved, step = vector.copy(), self.parameters.steps[i]
-        sign = -1.0 if vector[i] + step > self.parameters.high[i] else 1.0
-        moved[i] += sign * step
-        return sign * (self._residuals(moved, self.few) - here)
+    def _slopes(self) -> list[Values]:
+        """Derivatives of the uncorrelated deviations of each band."""
+        at, free, steps = (
+            self.parameters.coordinates,
+            self.parameters.free,
+            STEP * self.parameters.reach,
+        )
+        windows = self._entering(at)
+        changes = [
+            (self._entering(at + step * np.eye(len(at))[i]) - windows) / np.float32(step)
+            for i, step in zip(free, steps, strict=True)
+        ]
+        found = []
+        for k, side in enumerate(self._simulated(at, self.few)):
+            rows = self.bands[k].rows[: len(side)]
+            own = np.reshape(
+                [change[rows] for change in changes], (len(changes), *side.sim.shape)
+            )
+            mean = DifferentiableSet(side).slopes(
+                _BandSlopes(self.parameters.chain, own.astype(np.float32)),
+                partial(self.functions[k], clip=self._clip),
+                draws=None if self.few is None else 1,
+            )
+            found.append(self._whiten[k] @ (mean.T / self._sigma[k]).T)
+        return found
+
+    def _entering(self, coordinates: Values) -> FloatArray:
+        """Simulated pulses of some events at some coordinates as they enter the readout."""
+        windows = torch.from_numpy(self.windows(coordinates, self.few))
+        entering: FloatArray = self.parameters.chain.response.drifted(windows).detach().numpy()
+        return entering
 
     def windows(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Prepared simulated pulses of the first `most` events, as input of a readout.
@@ -362,8 +395,8 @@ class JointProblem:
     def _simulated(self, coordinates: Values, most: int | None) -> list[SimulatedSide]:
         """Pulses of each band at some coordinates, from the first `most` events.
 
-        The last ones are kept: all derivatives of the chain use the same pulses, whose
-        preparation and Fourier transform take longer than the chain.
+        The last ones are kept: their preparation and Fourier transform take longer than a
+        chain, and derivatives use the same.
         """
         kept = self._translated.get(most)
         if kept is not None:

@@ -7,16 +7,18 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy.optimize
 
 from cpunet.calibration.alternatives import BEYOND_CHANCE
 from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.levenberg_marquardt import levenberg_marquardt
 
-# Offsets of a profile in errors, and steps in which the other parameters are minimised.
-OFFSETS, STEPS = (-1.5, 0.0, 1.5), 6
+# Offsets of a profile in errors. Steps in which the other parameters are minimised, at
+# most, and the fall of chi-square below which they end.
+OFFSETS, STEPS, FLAT = (-1.5, 0.0, 1.5), 6, 0.02
+AT_BOUND = 1e-9  # by which bounds are wider, since they must not coincide
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
 # Advice where a parameter is unexpected, besides the general one.
@@ -265,7 +267,7 @@ def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
     problem, physics = calibrated.problem, calibrated.physics
     parameters = problem.parameters
     here, n = parameters.vector(), parameters.n_chain
-    residuals = problem.residuals(here)
+    jacobian = problem.jacobian(here)
     found = {}
     for k, i in enumerate(parameters.free, n):
         error = float(np.sqrt(calibrated.covariance[k, k]))
@@ -277,11 +279,27 @@ def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
             x = float(here[k] + offset * error)
             added = nuisance.kind == "added"  # told without bounds
             values.append(nominal + x if added else nuisance.value(nominal, x))
-            cost = float(residuals @ residuals)
-            if offset:
-                rest = problem.without(i, here + offset * valley)
-                cost = levenberg_marquardt(rest, STEPS, None, coarse=False).cost
-                cost += ((x - parameters.centre[k]) / parameters.widths[k]) ** 2
-            costs.append(cost)
+            costs.append(_lowest(problem, here + offset * valley, jacobian, k))
         found[nuisance.name] = {"value": values, "chi_square": costs}
+    parameters.set(here)
     return found
+
+
+def _lowest(problem: JointProblem, vector: Values, jacobian: Values, fixed: int) -> float:
+    """Chi-square with all parameters but one at their best.
+
+    Steps are made with the derivatives at the minimum: the valley is nearly a parabola.
+    """
+    parameters, cost = problem.parameters, np.inf
+    free = np.arange(len(vector)) != fixed
+    low, high = parameters.low[free], parameters.high[free]
+    for _ in range(STEPS):
+        vector[free] = np.clip(vector[free], low, high)
+        residuals = problem.residuals(vector)
+        cost, before = min(cost, float(residuals @ residuals)), cost
+        if cost > before - FLAT:
+            break
+        bounds = low - vector[free] - AT_BOUND, high - vector[free] + AT_BOUND
+        step = scipy.optimize.lsq_linear(jacobian[:, free], -residuals, bounds, method="bvls")
+        vector[free] += step.x
+    return cost

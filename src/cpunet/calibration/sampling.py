@@ -32,16 +32,15 @@ MOST = 0.5
 def of_events(problem: JointProblem) -> tuple[Values, Values]:
     """Move of the fitted parameters of a problem, and their covariance; see `of_parts`."""
     vector = problem.parameters.vector()
-    jacobian = problem.jacobian(vector, problem.residuals(vector))
+    jacobian = problem.jacobian(vector)
     deviations, slopes = [], []
     for k in range(PARTS):
         some = slice(k, None, PARTS)
         part = problem.of_bands(
             [replace(b, sim=b.sim.of(some), rows=b.rows[some]) for b in problem.bands]
         )
-        residuals = part.residuals(vector)
-        deviations.append(residuals[: problem.moments])
-        slopes.append(part.jacobian(vector, residuals)[: problem.moments])
+        deviations.append(part.residuals(vector)[: problem.moments])
+        slopes.append(part.jacobian(vector)[: problem.moments])
     n = sum(len(band.sim) + len(band.moments.data) for band in problem.bands)
     factor = of_weights(n, problem.by_chance[0], len(vector))
     return of_parts(jacobian, np.array(slopes), np.array(deviations), factor)

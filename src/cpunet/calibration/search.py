@@ -229,7 +229,7 @@ class Search:
         """What all pulses, and each half of them, tell of the free parameters."""
         parameters, vector = problem.parameters, problem.parameters.vector()
         residuals = problem.residuals(vector)
-        jacobian = problem.jacobian(vector, residuals)
+        jacobian = problem.jacobian(vector)
         halves = [
             problem.of_bands([_half(band, k) for band in problem.bands]).residuals(vector)
             for k in range(2)

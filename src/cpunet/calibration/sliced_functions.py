@@ -11,7 +11,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from cpunet.training.moments import Moments, Readings, Values
+from cpunet.training.moments import (
+    Moments,
+    Readings,
+    Values,
+    gaussian_bins,
+    joined,
+    products,
+)
 
 # Bins of the drift time; slices of drift time; components and current amplitude bins in each.
 # For few pulses, half as many.
@@ -81,20 +88,23 @@ class SlicedFunctions:
         """
         values = self.moments.functions(readings, clip)
         wider = 1.0 if clip is None else max(1.0, clip / self.moments.config.clip)
-        drift = values[:, self._first]
-        slices = _bins(drift, self._slices, wider)
-        begin = self._first + 1
+        density, of_drift, of_amplitude = (
+            (centres, wider * widths)
+            for centres, widths in (self._density, self._slices, self._amplitudes)
+        )
+        drift, begin = values[:, self._first], self._first + 1
+        slices = gaussian_bins(drift, *of_drift)
         components = values[:, begin : begin + self._components]
-        amplitudes = _bins(readings.log_amplitude, self._amplitudes, wider)
-        return np.concatenate(
+        amplitudes = gaussian_bins(readings.log_amplitude, *of_amplitude)
+        all_of_them: Values = joined(
             [
                 values,
-                _bins(drift, self._density, wider),
-                _products(components, slices),
-                _products(amplitudes, slices),
-            ],
-            axis=1,
+                gaussian_bins(drift, *density),
+                products(components, slices),
+                products(amplitudes, slices),
+            ]
         )
+        return all_of_them
 
 
 def _points(
@@ -105,17 +115,3 @@ def _points(
     gaps = np.diff(centres)
     between = np.concatenate([gaps[:1], np.minimum(gaps[1:], gaps[:-1]), gaps[-1:]])
     return centres, np.maximum(factor * between, least)
-
-
-def _bins(values: Values, points: tuple[Values, Values], wider: float) -> Values:
-    centres, widths = points
-    return np.asarray(
-        np.exp(-0.5 * ((values[:, np.newaxis] - centres) / (wider * widths)) ** 2)
-    )
-
-
-def _products(values: Values, slices: Values) -> Values:
-    # the number of columns is given, since a block of pulses can be empty
-    columns = values.shape[1] * slices.shape[1]
-    products = values[:, :, np.newaxis] * slices[:, np.newaxis, :]
-    return np.asarray(products.reshape(len(values), columns))

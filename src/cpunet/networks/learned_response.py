@@ -121,10 +121,9 @@ class StepResponse(Readout):
         early, late = (_crossing(step / step.max(), level) for level in (0.1, 0.5))
         return float(late - early) * float(self.dt_ns) / POLES_RISE
 
-    def step(self, samples: int, coordinates: Tensor | None = None) -> Tensor:
+    def step(self, samples: int) -> Tensor:
         """Response to a step at sample 0, from `FIRST` on, shape (samples - first,)."""
-        own = self.coordinates if coordinates is None else coordinates
-        early = self.base + self.basis @ own
+        early = self.base + self.basis @ self.coordinates
         lever = len(early) - 1 - self.last
         rate = torch.log((early[-1] / early[self.last]).clamp(0.5, 1.2)) / lever
         first = int(self.lags[0])
@@ -132,24 +131,14 @@ class StepResponse(Readout):
         late = early[-1] * torch.exp(rate * after)
         return torch.cat([early, late])[: samples - first]
 
-    def kernel(self, padded: int, coordinates: Tensor | None = None) -> Tensor:
-        """The same for a transform of `padded` samples: times before 0 stand at its end."""
-        step = self.step(int(padded / MIN_FACTOR) - PADDING_BEFORE, coordinates)
-        before = -int(self.lags[0])
-        gap = step.new_zeros(padded - len(step))
-        return torch.cat([step[before:], gap, step[:before]])
-
     def transfer(self, padded: int) -> Tensor:
         """Response to a step of charge at sample 0, as a spectrum of `padded` samples."""
-        spectrum: Tensor = torch.fft.rfft(self.kernel(padded))
+        step = self.step(int(padded / MIN_FACTOR) - PADDING_BEFORE)
+        before = -int(self.lags[0])
+        gap = step.new_zeros(padded - len(step))
+        # times before 0 stand at the end
+        spectrum: Tensor = torch.fft.rfft(torch.cat([step[before:], gap, step[:before]]))
         return spectrum
-
-    def transfer_slopes(self, padded: int) -> Tensor:
-        """Derivatives of `transfer` in the coordinates, shape (coordinates, frequencies)."""
-        here = self.coordinates.detach()
-        columns = torch.func.jacfwd(lambda c: self.kernel(padded, c))(here)
-        spectra: Tensor = torch.fft.rfft(columns.T.contiguous())
-        return spectra
 
     @torch.no_grad()
     def describe(self) -> dict[str, float]:

@@ -357,8 +357,8 @@ def _spline(frequency: Tensor) -> Tensor:
 
 
 def current_spectrum(windows: Tensor, padded: int) -> Tensor:
-    """Spectra of the current of windows (batch, samples) within records."""
-    current = torch.diff(windows, dim=1, prepend=torch.zeros_like(windows[:, :1]))
+    """Spectra of the current of windows (..., samples) within records."""
+    current = torch.diff(windows, dim=-1, prepend=torch.zeros_like(windows[..., :1]))
     current = nn.functional.pad(current, (PADDING_BEFORE, 0))
     spectrum: Tensor = torch.fft.rfft(current, padded)
     return spectrum

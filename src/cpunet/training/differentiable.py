@@ -1,18 +1,19 @@
 """The moments of translated pulses with exact derivatives.
 
-A fit of many parameters, and a network, need derivatives that differences do not give: noise
-moves a half maximum by a sample here and there, and each such jump is as large as what is
-looked for.  Here the samples at which a record is read are found first, by the rules of
-`cpunet.training._record_kernels` and without derivatives.  What is read there is linear in a
-record, so its derivatives are read alike; what follows from it is in the graph.  Where a window
-moves with the half maximum, by whole samples, the derivative is that of its mean position.
+Fits and networks need derivatives that differences do not give: records have seven digits, and
+noise moves a half maximum by a sample here and there.  Weak directions of a fit, in which large
+changes nearly cancel, would be lost in that.  Here the samples at which a record is read are
+found first, by the rules of `cpunet.training._record_kernels` and without derivatives.  What is
+read there is linear in a record, so its derivatives are read alike; what follows from it is in
+the graph.  Where a window moves with the half maximum, by whole samples, the derivative is that
+of its mean position.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,31 +21,62 @@ import torch
 from torch import Tensor
 
 from cpunet.networks.generators import stretch
-from cpunet.networks.learned_response import StepResponse
-from cpunet.networks.response_layer import PADDING_AFTER, Readout, padded_length
+from cpunet.networks.response_layer import (
+    PADDING_AFTER,
+    Readout,
+    current_spectrum,
+    padded_length,
+)
+from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
-from cpunet.training.moments import Moments
-from cpunet.training.translated import PLATEAU, SimulatedSide
+from cpunet.training.dual_numbers import Dual
+from cpunet.training.moments import Moments, Readings
+from cpunet.training.translated import PLATEAU, SimulatedSide, in_threads
 
+T = TypeVar("T")
 BLOCK = 128  # pulses at a time: each has a record for every parameter
 AGAIN = 20  # samples after the half maximum from which it is searched for again
 
-# Functions of each pulse, from its linear readings and the logarithm of its current amplitude.
-Functions = Callable[[Tensor, Tensor], Tensor]
+NO_WEIGHTS = np.empty(0)  # of the readings of tensors; those of the set count
+# Functions of each pulse, as of `Moments`; these take tensors, too.
+Functions = Callable[[Readings], Any]
+
+
+class Slopes(Protocol):
+    """A readout, and how it changes with each of its coordinates."""
+
+    @property
+    def response(self) -> Readout:
+        """The readout."""
+
+    def transfer_slopes(self, padded: int) -> Tensor:
+        """Derivatives of its transfer, shape (coordinates, frequencies)."""
+
+    def pulse_slopes(self, pulses: FloatArray, rows: slice) -> Tensor:
+        """Derivatives of pulses that enter it, shape (further coordinates, pulses, samples).
+
+        Parameters
+        ----------
+        pulses
+            All pulses as simulated, shape (pulses, samples).
+        rows
+            Those to look at.
+        """
 
 
 class Samples(NamedTuple):
     """Samples at which records are read, each of shape (pulses,)."""
 
     level: Tensor  # half maximum that baseline and level refer to
-    half: Tensor  # half maximum of the normalised record
+    half: Tensor  # half maximum of the normalised record, and the time after this sample
+    time: Tensor
     tail: Tensor  # start of the tail
     steepest: Tensor  # centre of the current amplitude, and its phase
     phase: Tensor
 
 
 class DifferentiableReadings:
-    """`Moments.read` and `Moments.functions` in the graph of PyTorch.
+    """`Moments.read` in the graph of PyTorch.
 
     Parameters
     ----------
@@ -55,91 +87,100 @@ class DifferentiableReadings:
     """
 
     def __init__(self, moments: Moments, last: int) -> None:
-        self.moments, self.config = moments, moments.config
         self.window = w = moments.window(last)
         self.matrix = torch.from_numpy(moments.quantities)
         self.offset = torch.zeros(self.matrix.shape[1])
         self.offset[-len(moments.offset) :] = torch.from_numpy(moments.offset)
-        self.centres, self.spreads, self.bins, self.bin_widths = (
-            torch.from_numpy(values).float()
-            for values in (
-                moments.centres,
-                moments.spreads,
-                moments.amplitude_centres,
-                moments.amplitude_widths,
-            )
+        self.centres, self.spreads = (
+            torch.from_numpy(values).float() for values in (moments.centres, moments.spreads)
         )
         self.weights = torch.from_numpy(np.asarray(current_amplitude_kernel(), np.float32))
         lever = torch.arange(w.fit_samples) - 0.5 * (w.fit_samples - 1)
         self.lever = lever / (lever @ lever)
-        n = self.matrix.shape[1]
-        self.sizes = [2, 2, 2, 2, 2, n, n, w.fit_samples + 1]
+        self.sum = self.matrix.sum(dim=0)
+        self.sizes = [1, 1, 2, 1, self.matrix.shape[1], w.fit_samples]
 
-    def __call__(self, records: Tensor) -> tuple[Tensor, Tensor]:
-        """Read noisy records (pulses, samples): linear readings, and log current amplitudes."""
-        return self.read(self.parts(records, self.samples(records.detach())))
+    def __call__(self, records: Tensor) -> Readings:
+        """Read noisy records (pulses, samples)."""
+        fixed = records.detach()
+        at = self.samples(fixed)
+        parts, moving = self.parts(fixed, at), self.moving(fixed, at)
+        # 0, but has derivatives
+        change = self.slopes(parts, moving, (self.parts(records, at) - parts)[None])
+        values = self.read(parts)
+        linear, amplitude = (a + b[0] for a, b in zip(values, change, strict=True))
+        return Readings(linear, amplitude, NO_WEIGHTS)
 
     def parts(self, records: Tensor, at: Samples) -> Tensor:
-        """All of the records that is read, shape (pulses, parts); it is linear in them.
+        """All of the records that is read, shape (pulses, parts); it is linear in them."""
+        w, width = self.window, self.weights.shape[1]
+        base = stretch(records, at.level, -w.base_first, -w.base_stop)
+        top = stretch(records, at.level, w.after - w.level_samples, w.after)
+        time = at.time[:, None]
 
-        Of what is read between two samples, both are there.
-        """
-        w, half = self.window, self.weights.shape[1] // 2
-        base = stretch(records, at.level, -w.base_first, -w.base_stop + 1)
-        top = stretch(records, at.level, w.after - w.level_samples, w.after + 1)
-        means = [
-            torch.stack([x[:, :-1].mean(dim=1), (x[:, -1] - x[:, 0]) / (x.shape[1] - 1)], dim=1)
-            for x in (base, top)
-        ]
-        halves = [stretch(records, sample, 0, 2) for sample in (at.level, at.half)]
+        def between(samples: Tensor) -> Tensor:
+            return torch.lerp(samples[:, :-1], samples[:, 1:], time)
+
         centre = at.half - w.before + at.steepest
-        current = torch.diff(stretch(records, centre, -half, half + 3)).unfold(1, 2, 1)
-        steepest = (current * self.weights[at.phase][:, :, None]).sum(dim=1)
-        around = stretch(records, at.half, -w.before, w.after + 1)
-        quantities = [around[:, :-1] @ self.matrix, around[:, 1:] @ self.matrix]
-        tail = stretch(records, at.tail, 0, w.fit_samples + 1)
-        return torch.cat([*means, *halves, steepest, *quantities, tail], dim=1)
+        current = torch.diff(between(stretch(records, centre, -(width // 2), width // 2 + 3)))
+        around = between(stretch(records, at.half, -w.before, w.after + 1))
+        return torch.cat(
+            [
+                base.mean(dim=1, keepdim=True),
+                top.mean(dim=1, keepdim=True),
+                stretch(records, at.half, 0, 2),
+                (current * self.weights[at.phase]).sum(dim=1, keepdim=True),
+                around @ self.matrix,
+                stretch(records, at.tail, 0, w.fit_samples),
+            ],
+            dim=1,
+        )
 
-    def read(self, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Linear readings, and log current amplitudes, of the parts of records."""
-        base, top, first, half, current, early, late, tail = torch.split(parts, self.sizes, 1)
-        # 0, but has the derivative of the time of the half maximum
-        moved = self._time(self._normalised(first, base[:, 0], top[:, 0]))
-        moved = moved - moved.detach()
-        zero, level = ((x[:, 0] + moved * x[:, 1]) for x in (base, top))
-        time = self._time(self._normalised(half, zero, level))[:, None]
-        linear = torch.lerp(early, late, time) - zero[:, None] * self.matrix.sum(dim=0)
-        scale = (self.window.tail_level / (level - zero))[:, None]
-        logs = self._normalised(tail, zero, level).clamp_min(1e-3).log()
-        slope = logs[:, :-1] @ self.lever
-        slope = slope + moved * (logs[:, 1:] @ self.lever - slope)
-        amplitude = torch.lerp(current[:, :1], current[:, 1:], time) * scale
-        whole = torch.cat([linear * scale - self.offset, slope[:, None]], dim=1)
-        return (whole - self.centres) / self.spreads, amplitude[:, 0].clamp_min(1e-4).log()
+    def moving(self, records: Tensor, at: Samples) -> Tensor:
+        """Changes of the parts of records if they are read a sample later."""
+        early, late = torch.zeros_like(at.time), torch.ones_like(at.time)
+        later = at._replace(level=at.level + 1, tail=at.tail + 1, time=late)
+        return self.parts(records, later) - self.parts(records, at._replace(time=early))
 
-    def functions(self, linear: Tensor, amplitude: Tensor, clip: float | None = None) -> Tensor:
-        """Functions of each pulse as `Moments.functions`, shape (pulses, moments)."""
-        density = _density(amplitude, self.bins, self.bin_widths)
-        if self.moments.balance is not None:
-            return density @ torch.from_numpy(self.moments.balance).float()
-        config, limit = self.config, clip or self.config.clip
-        linear = linear.clamp(-limit, limit)
-        first = len(config.segments) - 1
-        squared = torch.cat([linear[:, first : first + config.squares], linear[:, -1:]], dim=1)
-        return torch.cat([linear, squared.square(), density], dim=1)
+    def read(self, parts: Tensor) -> tuple[Any, Any]:
+        """Linear readings and logarithms of the current amplitude of the parts of records."""
+        base, top, _, current, linear, tail = torch.split(parts, self.sizes, dim=-1)
+        scale = self.window.tail_level / (top - base)
+        linear = (linear - base * self.sum) * scale - self.offset
+        slope = ((tail - base) * scale).clamp_min(1e-3).log() @ self.lever
+        whole = torch.cat([linear, slope[:, None]], dim=-1)
+        amplitude = (current * scale).clamp_min(1e-4).log()
+        return (whole - self.centres) / self.spreads, amplitude[:, 0]
 
-    def conditional(self, centres: Tensor, widths: Tensor) -> Functions:
-        """Functions as `ConditionalFunctions`, for its bins."""
+    def slopes(self, parts: Tensor, moving: Tensor, changes: Tensor) -> tuple[Any, Any]:
+        """Derivatives of these, from those of the parts (coordinates, pulses, parts)."""
+        base, top, half, current, linear, tail = torch.split(parts, self.sizes, dim=-1)
+        of_base, of_top, of_half, of_current, of_linear, of_tail = torch.split(
+            changes, self.sizes, dim=-1
+        )
+        later_base, later_top, _, later_current, later_linear, later_tail = torch.split(
+            moving, self.sizes, dim=-1
+        )
+        height, rise = top - base, (half[:, 1:] - half[:, :1]).clamp_min(1e-6)
+        level = self.window.level / self.window.tail_level
+        time = (level * height + base - half[:, :1]) / rise
+        of_half = torch.lerp(of_half[..., :1], of_half[..., 1:], time)
 
-        def functions(linear: Tensor, amplitude: Tensor) -> Tensor:
-            values = self.functions(linear, amplitude)
-            first = len(self.config.segments) - 1
-            components = values[:, first : first + self.config.components]
-            bins = _density(amplitude, centres, widths)
-            both = components[:, :, None] * bins[:, None, :]
-            return torch.cat([values, bins, both.flatten(1)], dim=1)
+        def of_time(of_zero: Tensor, of_level: Tensor) -> Tensor:
+            """Derivatives of the time at which a record is half as high."""
+            return (torch.lerp(of_zero, of_level, level) - of_half) / rise
 
-        return functions
+        moved = of_time(of_base, of_top)  # the windows of base, top and tail move, too
+        of_zero, of_level = of_base + moved * later_base, of_top + moved * later_top
+        of_time_again = of_time(of_zero, of_level)
+        of_scale = (of_zero - of_level) / height
+        scale = self.window.tail_level / height
+        of_linear = of_linear + of_time_again * later_linear - of_zero * self.sum
+        of_linear = (of_linear + (linear - base * self.sum) * of_scale) * scale
+        of_slope = ((of_tail + moved * later_tail - of_zero) / (tail - base)) @ self.lever
+        of_amplitude = (of_current + of_time_again * later_current) / current + of_scale
+        whole = torch.cat([of_linear, of_slope[..., None]], dim=-1)
+        return whole / self.spreads, of_amplitude[..., 0]
 
     def samples(self, records: Tensor) -> Samples:
         """Samples at which noisy records are read."""
@@ -154,7 +195,7 @@ class DifferentiableReadings:
         below = (top < w.align_fraction * top.amax(dim=1, keepdim=True)) & before
         tail = begin + _last(below) + 1 + w.align_after - w.fit_samples
         around = stretch(normal, half, -w.before, w.after + 1)
-        time = self._time(stretch(normal, half, 0, 2))[:, None]
+        time = self._time(stretch(normal, half, 0, 2))
         current = torch.diff(torch.lerp(around[:, :-1], around[:, 1:], time))
         from_sample = max(w.before - w.edge, 0)
         steepest = from_sample + current[:, from_sample : w.before + w.edge].argmax(dim=1)
@@ -163,7 +204,7 @@ class DifferentiableReadings:
         best = (around.unfold(1, width, 1) @ self.weights.T).flatten(1).argmax(dim=1)
         phases = len(self.weights)
         centre = steepest - near + torch.div(best, phases, rounding_mode="floor")
-        return Samples(level, half, tail, centre, best % phases)
+        return Samples(level, half, time[:, 0], tail, centre, best % phases)
 
     def _crossing(self, records: Tensor, last: Tensor) -> Tensor:
         """Sample before the last upward crossing of the half height before `last`."""
@@ -174,22 +215,22 @@ class DifferentiableReadings:
     def _about(self, records: Tensor, sample: Tensor) -> Tensor:
         """Records with baseline 0 and nominal level about their half maxima."""
         w = self.window
-        zero = stretch(records, sample, -w.base_first, -w.base_stop).mean(dim=1)
-        level = stretch(records, sample, w.after - w.level_samples, w.after).mean(dim=1)
-        return self._normalised(records, zero, level)
+        zero = stretch(records, sample, -w.base_first, -w.base_stop)
+        level = stretch(records, sample, w.after - w.level_samples, w.after)
+        means = (part.mean(dim=1, keepdim=True) for part in (zero, level))
+        return self._normalised(records, *means)
 
     def _normalised(self, values: Tensor, zero: Tensor, level: Tensor) -> Tensor:
-        scale = self.window.tail_level / (level - zero)
-        return (values - zero[:, None]) * scale[:, None]
+        return (values - zero) * (self.window.tail_level / (level - zero))
 
     def _time(self, pair: Tensor) -> Tensor:
-        """Time of the half maximum after the first of two samples."""
-        low, high = pair.unbind(dim=1)
+        """Time of the half maximum after the first of two samples, shape (pulses, 1)."""
+        low, high = pair[:, :1], pair[:, 1:]
         return (self.window.level - low) / (high - low).clamp_min(1e-6)
 
 
 class DifferentiableSet:
-    """A set of simulated pulses whose functions have derivatives in the step response.
+    """A set of simulated pulses whose functions have derivatives.
 
     Parameters
     ----------
@@ -212,9 +253,12 @@ class DifferentiableSet:
         return records / self.height(records)
 
     def height(self, records: Tensor) -> Tensor:
-        """Mean long after the pulse over the nominal level, shape (pulses, 1)."""
-        plateau = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER].mean(dim=1, keepdim=True)
-        return plateau / self.sim.moments.preparation.tail_level
+        """Mean long after the pulse over the nominal level, shape (..., pulses, 1)."""
+        plateau = records[..., -PADDING_AFTER : PLATEAU - PADDING_AFTER]
+        over: Tensor = (
+            plateau.mean(dim=-1, keepdim=True) / self.sim.moments.preparation.tail_level
+        )
+        return over
 
     @torch.no_grad()
     def values(self, response: Readout) -> npt.NDArray[np.float64]:
@@ -224,9 +268,9 @@ class DifferentiableSet:
         for first in range(0, len(self.sim), BLOCK):
             spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
             clean = self.scaled(self.records(spectra, transfer))
-            draws = [
-                self.readings.functions(
-                    *self.readings(clean + self.noise(d, first, len(clean)))
+            draws: list[Any] = [
+                self.sim.moments.functions(
+                    self.readings(clean + self.noise(d, first, len(clean)))
                 )
                 for d in range(len(self.sim.noise.factor))
             ]
@@ -234,37 +278,71 @@ class DifferentiableSet:
         return torch.cat(out).double().numpy()
 
     def blocks(
-        self, response: StepResponse, functions: Functions, *, draws: int | None = None
-    ) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
-        """Functions of each pulse and their derivatives, block by block, draw by draw.
+        self,
+        readout: Slopes,
+        functions: Functions,
+        of: Callable[[int, Tensor, Tensor, Tensor], T],
+        *,
+        draws: int | None = None,
+    ) -> list[T]:
+        """What is made of functions and derivatives of each block of pulses and draw of noise.
 
-        Yields
-        ------
-        tuple
-            First pulse; functions (pulses, functions); derivatives (coordinates, pulses,
-            functions); weights of the pulses.
+        Parameters
+        ----------
+        readout
+            Readout and its derivatives.
+        functions
+            Functions of each pulse.
+        of
+            Called in several threads with the first pulse, the functions (pulses, functions),
+            derivatives (coordinates, pulses, functions), and the weights of the pulses.
+        draws
+            Number of draws to use; None for all.
         """
+        response = readout.response
+        self.sim.forget_unless(response)
         with torch.no_grad():
             transfer = response.transfer(self.padded).to(torch.complex64)
-        slopes = response.transfer_slopes(self.padded).to(torch.complex64)[:, None]
-        for first in range(0, len(self.sim), BLOCK):
+        of_transfer = readout.transfer_slopes(self.padded).to(torch.complex64)[:, None]
+
+        def one(first: int) -> list[T]:
             spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
-            clean, moved = self.records(spectra, transfer), self.records(spectra, slopes)
-            heights = self.height(clean), torch.func.vmap(self.height)(moved)
+            rows = slice(first, first + len(spectra))
+            clean, moved = self.records(spectra, transfer), self.records(spectra, of_transfer)
+            if len(further := readout.pulse_slopes(self.sim.sim, rows)):
+                changes = current_spectrum(further, self.padded)
+                moved = torch.cat([moved, self.records(changes, transfer)])
+            heights = self.height(clean), self.height(moved)
+            clean = clean / heights[0]
+            found = []
             for draw in range(len(self.sim.noise.factor))[:draws]:
-                noise = self.noise(draw, first, len(clean))
-                at = self.readings.samples(clean / heights[0] + noise)
-                parts = partial(self.readings.parts, at=at)
-                added = parts(noise)
+                noisy = clean + self.noise(draw, first, len(clean))
+                at = self.readings.samples(noisy)
+                parts, moving = self.readings.parts(noisy, at), self.readings.moving(noisy, at)
+                of_moved = torch.func.vmap(partial(self.readings.parts, at=at))(moved)
+                changes = of_moved - self.readings.parts(clean, at) * heights[1]
+                slopes = self.readings.slopes(parts, moving, changes / heights[0])
+                values = self.readings.read(parts)
+                read: list[Any] = [Dual(*one) for one in zip(values, slopes, strict=True)]
+                made = functions(Readings(read[0], read[1], NO_WEIGHTS))
+                found.append(of(first, made.value, made.slopes, self.weights[rows]))
+            return found
 
-                def of(own: Tensor, height: Tensor, added: Tensor = added) -> Tensor:
-                    return functions(*self.readings.read(own / height + added))
+        blocks = in_threads(one, range(0, len(self.sim), BLOCK))
+        return [part for block in blocks for part in block]
 
-                along: Any = partial(torch.func.jvp, of, (parts(clean), heights[0]))
-                tangents = torch.func.vmap(parts)(moved), heights[1]
-                # the values are the same along all directions
-                values, columns = torch.func.vmap(along, out_dims=(None, 0))(tangents)  # type: ignore[arg-type]
-                yield first, values, columns, self.weights[first : first + BLOCK]
+    def slopes(
+        self, readout: Slopes, functions: Functions, *, draws: int | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Derivatives of the means of the functions, shape (functions, coordinates)."""
+
+        def of(
+            first: int, values: Tensor, moved: Tensor, weights: Tensor
+        ) -> tuple[Tensor, float]:
+            return (weights @ moved).double(), float(weights.sum())
+
+        sums, n = zip(*self.blocks(readout, functions, of, draws=draws), strict=True)
+        return np.asarray(torch.stack(sums).sum(dim=0).T / sum(n))
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:
         """Noise of `n` pulses from the first one on, shape (n, samples)."""
@@ -275,7 +353,3 @@ class DifferentiableSet:
 def _last(where: Tensor) -> Tensor:
     """Last sample of each row for which a condition holds; -1 for none."""
     return (where * torch.arange(1, where.shape[1] + 1)).amax(dim=1) - 1
-
-
-def _density(log_amplitude: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
-    return torch.exp(-0.5 * ((log_amplitude[:, None] - centres) / widths).square())

@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -216,7 +217,7 @@ class _Trained:
         clean = batch.scaled(batch.records(spectra, transfer))
         draw = int(rng.integers(len(sim.noise.factor)))
         noisy = clean + batch.noise(draw, 0, len(rows))
-        values = batch.readings.functions(*batch.readings(noisy))
+        values: Any = self.band.moments.functions(batch.readings(noisy))
         mean = (batch.weights @ values / batch.weights.sum()).double()
         now = mean.detach()
         self.mean = now if self.mean is None else MEMORY * self.mean + (1 - MEMORY) * now

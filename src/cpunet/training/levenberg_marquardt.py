@@ -49,7 +49,7 @@ class Problem(Protocol):
 
     def residuals(self, vector: Values) -> Values: ...
 
-    def jacobian(self, vector: Values, residuals: Values) -> Values: ...
+    def jacobian(self, vector: Values) -> Values: ...
 
 
 class Minimum(NamedTuple):
@@ -102,7 +102,7 @@ def levenberg_marquardt(
         problem.clip = clip
         residuals, damping = problem.residuals(vector), DAMPING
         cost = float(residuals @ residuals)
-        jacobian, updates, stalled = problem.jacobian(vector, residuals), 0, False
+        jacobian, updates, stalled = problem.jacobian(vector), 0, False
         for _ in range(max(1, most)):
             fresh = not updates
             converged = fresh and _gain(parameters, vector, jacobian, residuals) < CONVERGED
@@ -111,7 +111,7 @@ def levenberg_marquardt(
             )
             if step is None and not fresh:
                 # the derivatives may be outdated
-                jacobian, updates, fresh = problem.jacobian(vector, residuals), 0, True
+                jacobian, updates, fresh = problem.jacobian(vector), 0, True
                 step = _step(problem, jacobian, vector, residuals, damping)
             if step is None:
                 break
@@ -123,7 +123,7 @@ def levenberg_marquardt(
             if converged:
                 updates += 1  # the derivatives are those before this step
             elif small or updates == UPDATES:
-                jacobian, updates = problem.jacobian(tried, found), 0
+                jacobian, updates = problem.jacobian(tried), 0
             else:
                 # Broyden's update: correct the derivatives by the change in this step
                 way = (tried - vector) / parameters.widths
@@ -141,7 +141,7 @@ def levenberg_marquardt(
             "detector (cpunet info), or train on other energies (`peak`)"
         )
     if updates:  # the last derivatives are those before some step
-        jacobian = problem.jacobian(vector, residuals)
+        jacobian = problem.jacobian(vector)
     parameters.set(vector)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), float)
     return Minimum(cost, covariance)

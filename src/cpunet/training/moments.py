@@ -11,19 +11,23 @@ four times better than its mean.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
+import torch
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.schema import MatchingConfig, PreparationConfig
 from cpunet.training._record_kernels import RecordWindow, project, read_records
+from cpunet.training.dual_numbers import Dual
 
 Values = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
@@ -256,19 +260,22 @@ class Moments:
         Parameters
         ----------
         readings
-            Readings of the pulses.
+            Readings of the pulses, as arrays, tensors, or tensors with derivatives (`Dual`).
         clip
             Replaces the clip of the recipe: wider far from the data, where all is clipped.
         """
         limit = clip or self.config.clip
-        linear = np.clip(readings.linear, -limit, limit)
-        first = len(self.config.segments) - 1
-        squared = [linear[:, first : first + self.config.squares], linear[:, -1:]]
-        distance = readings.log_amplitude[:, np.newaxis] - self.amplitude_centres
-        density = np.exp(-0.5 * (distance / self.amplitude_widths) ** 2)
+        density = gaussian_bins(
+            readings.log_amplitude, self.amplitude_centres, self.amplitude_widths
+        )
         if self.balance is not None:
-            return np.asarray(density @ self.balance)
-        return np.concatenate([linear, np.concatenate(squared, axis=1) ** 2, density], axis=1)
+            of_bins: Values = density @ like(density, self.balance)
+            return of_bins
+        linear = readings.linear.clip(-limit, limit)
+        first = len(self.config.segments) - 1
+        squared = linear[:, first : first + self.config.squares] ** 2
+        all_of_them: Values = joined([linear, squared, linear[:, -1:] ** 2, density])
+        return all_of_them
 
     @property
     def model_errors(self) -> Values:
@@ -322,6 +329,35 @@ class Moments:
             log_amplitude.append(logs[usable])
         logs = np.concatenate(log_amplitude)
         return Readings(np.concatenate(linear), logs, np.ones(len(logs)))
+
+
+# The functions take arrays, tensors, and tensors with derivatives (`Dual`).
+
+
+def like(values: Any, constant: Values) -> Any:
+    """Constants of the kind and precision of other values."""
+    return constant if isinstance(values, np.ndarray) else values.new_tensor(constant)
+
+
+def joined(columns: Sequence[Any]) -> Any:
+    """Columns side by side."""
+    if isinstance(columns[0], Dual):
+        return Dual.joined(columns)
+    of_arrays = isinstance(columns[0], np.ndarray)
+    return np.concatenate(columns, axis=1) if of_arrays else torch.cat(tuple(columns), dim=1)
+
+
+def gaussian_bins(values: Any, centres: Values, widths: Values) -> Any:
+    """Bins with smooth edges, shape (pulses, bins)."""
+    distance = (values[:, np.newaxis] - like(values, centres)) / like(values, widths)
+    exponent = distance**2 * -0.5
+    return np.exp(exponent) if isinstance(exponent, np.ndarray) else exponent.exp()
+
+
+def products(values: Any, bins: Any) -> Any:
+    """Each of some values times each bin, shape (pulses, products)."""
+    columns = values.shape[1] * bins.shape[1]  # given, since a block of pulses can be empty
+    return (values[:, :, np.newaxis] * bins[:, np.newaxis, :]).reshape(len(values), columns)
 
 
 def spread(n: int, most: int) -> Rows:

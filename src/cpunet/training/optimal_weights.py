@@ -35,12 +35,21 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-import torch
+from torch import Tensor
 
 from cpunet.networks.learned_response import StepResponse
 from cpunet.networks.response_layer import Readout
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.moments import BLOCK, Moments, Readings, Values, spread
+from cpunet.training.moments import (
+    BLOCK,
+    Moments,
+    Readings,
+    Values,
+    gaussian_bins,
+    joined,
+    products,
+    spread,
+)
 from cpunet.training.response_problem import Band, ResponseProblem, SmoothParameters
 from cpunet.training.translated import SimulatedSide
 
@@ -230,9 +239,8 @@ class ConditionalFunctions:
     def __call__(self, readings: Readings) -> Values:
         """Functions of each pulse, shape (pulses, functions)."""
         values, components, bins = self._parts(readings)
-        both = components[:, :, np.newaxis] * bins[:, np.newaxis, :]
-        columns = components.shape[1] * bins.shape[1]  # given: a block of pulses can be empty
-        return np.concatenate([values, bins, both.reshape(len(values), columns)], axis=1)
+        all_of_them: Values = joined([values, bins, products(components, bins)])
+        return all_of_them
 
     def sum(self, readings: Readings) -> Values:
         """Weighted sum of the functions over pulses, without storing them for each pulse."""
@@ -250,8 +258,8 @@ class ConditionalFunctions:
 
     def density(self, log_amplitude: Values) -> Values:
         """Bins of the current amplitude, shape (pulses, bins)."""
-        distance = (log_amplitude[:, np.newaxis] - self.centres) / self.widths
-        return np.asarray(np.exp(-0.5 * distance**2))
+        bins: Values = gaussian_bins(log_amplitude, self.centres, self.widths)
+        return bins
 
 
 def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
@@ -276,7 +284,7 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     """
     smooth = near.parameters
     place = smooth.vector()
-    weighted = [_Weighted(band, smooth, near.response, bins) for band in bands]
+    weighted = [_Weighted(band, smooth, bins) for band in bands]
     slopes = np.concatenate([w.whole.slopes for w in weighted])
 
     def residuals(place: Values) -> Values:
@@ -332,9 +340,7 @@ def _descend(
 class _Weighted:
     """Optimally weighted functions of one band."""
 
-    def __init__(
-        self, band: Band, smooth: SmoothParameters, response: Readout, bins: int
-    ) -> None:
+    def __init__(self, band: Band, smooth: SmoothParameters, bins: int) -> None:
         self.band, self.functions = band, ConditionalFunctions.of(band.moments, bins)
         data = band.moments.data
         # all parts are spread over the files, where neighbours may be alike
@@ -344,13 +350,10 @@ class _Weighted:
         )
         measured = [Sums.of(self.functions(data[rows])) for rows in of_data]
         sim = band.sim.of(np.concatenate(of_sim))
-        if isinstance(response, StepResponse):
-            simulated = _exactly_simulated(sim, self.functions, response)
-        else:
-            simulated = _simulated(sim, self.functions, smooth, response)
+        simulated = _simulated(sim, self.functions, smooth)
         counts = (sum(part.n for part in side) for side in (simulated, measured))
         self.pairs = 1 / sum(1 / n for n in counts)
-        ridge = RIDGE if isinstance(response, StepResponse) else 0.0
+        ridge = RIDGE if isinstance(smooth.response, StepResponse) else 0.0
         self.parts = Parts(simulated, measured, band.pairs, ridge)
         self.whole = self.parts.whole
         rows = (slice(first, first + BLOCK) for first in range(0, len(data), BLOCK))
@@ -366,57 +369,20 @@ class _Weighted:
 
 
 def _simulated(
-    sim: SimulatedSide,
-    functions: ConditionalFunctions,
-    smooth: SmoothParameters,
-    response: Readout,
+    sim: SimulatedSide, functions: ConditionalFunctions, smooth: SmoothParameters
 ) -> list[Sums]:
     """Sums over each part of the simulated pulses, including those of derivatives."""
-
-    def of(readings: Readings) -> tuple[Values, ...]:
-        values = functions(readings)
-        return readings.weights @ values, (readings.weights * values.T) @ values
-
-    def of_moved(readings: Readings) -> tuple[Values, ...]:
-        return (functions.sum(readings),)
-
     size = -(-len(sim) // PARTS)
-    here = sim.sums_of_blocks(response, of, size=size, draws=1)
-    place, slopes = smooth.vector(), []
-    for i, step in enumerate(smooth.steps):
-        moved = place.copy()
-        moved[i] += step
-        smooth.set(moved)
-        there = sim.sums_of_blocks(response, of_moved, size=size, draws=1)
-        slopes.append(
-            [
-                (after / max(count, 1e-9) - before / max(n, 1e-9)) * n / step
-                for ((after,), count), ((before, _), n) in zip(there, here, strict=True)
-            ]
-        )
-    smooth.set(place)
-    columns = np.moveaxis(np.array(slopes), 0, -1)  # (parts, functions, coordinates)
-    return [
-        Sums(n, total, products, column)
-        for ((total, products), n), column in zip(here, columns, strict=True)
-    ]
 
-
-def _exactly_simulated(
-    sim: SimulatedSide, functions: ConditionalFunctions, response: StepResponse
-) -> list[Sums]:
-    """The same with exact derivatives."""
-    exact, size = DifferentiableSet(sim), -(-len(sim) // PARTS)
-    centres, widths = (
-        torch.from_numpy(values).float() for values in (functions.centres, functions.widths)
-    )
-    of = exact.readings.conditional(centres, widths)
-    parts = [Sums() for _ in range(PARTS)]
-    for first, values, moved, weights in exact.blocks(response, of, draws=1):
+    def of(first: int, values: Tensor, moved: Tensor, weights: Tensor) -> dict[int, Sums]:
+        found = {}
         # a block can lie in two parts
         for part in range(first // size, (first + len(values) - 1) // size + 1):
             rows = slice(max(part * size - first, 0), (part + 1) * size - first)
             v, w = values[rows].double().numpy(), weights[rows].double().numpy()
             column = (weights[rows] @ moved[:, rows]).double().numpy().T
-            parts[part] += Sums(w.sum(), w @ v, (w * v.T) @ v, column)
-    return parts
+            found[part] = Sums(w.sum(), w @ v, (w * v.T) @ v, column)
+        return found
+
+    blocks = DifferentiableSet(sim).blocks(smooth, functions, of, draws=1)
+    return [sum((b[k] for b in blocks if k in b), Sums()) for k in range(PARTS)]

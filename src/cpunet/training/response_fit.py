@@ -2,7 +2,7 @@
 
 The parameters of a response are those for which the moments of the translated simulation,
 including noise, agree best with those of the data: a chi-square fit of about ten parameters by
-the Levenberg–Marquardt method, with derivatives by finite differences at fixed random numbers.
+the Levenberg–Marquardt method, with exact derivatives at fixed random numbers.
 Some of the pulses are enough to find the valley of chi-square; all of them, optimally weighted,
 then determine the response within it.
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,27 +13,23 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from cpunet.networks.learned_response import StepResponse
 from cpunet.networks.response_layer import Readout
-from cpunet.training.differentiable import DifferentiableSet
+from cpunet.pulses.container import FloatArray
+from cpunet.training.differentiable import DifferentiableSet, Slopes
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
 
-# Widths of the priors around the start, and steps of the finite differences: wide for times (in
-# their logarithm).
-TIME_WIDTH, TIME_STEP, WEIGHT_STEP = 1.0, 0.01, 0.002
+POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"
+# Widths of the priors around the start: wide for times (in their logarithm).
+TIME_WIDTH = 1.0
 # The same for the stretch of the drift, and for its change per us.
-STRETCH_WIDTHS, STRETCH_STEPS = (0.1, 0.05), (0.003, 0.002)
-STRETCH = "drift.stretch"
+STRETCH, STRETCH_WIDTHS = "drift.stretch", (0.1, 0.05)
 # Of a learned step response, whose coordinates have priors of width 1 around 0.
 COORDINATES, LONGEST = "coordinates", 2.0
 # The same of what is no time: half of the charge may be slow, and the main decay dominates.
-SCALES = {
-    "decay_weights": (0.03, WEIGHT_STEP),
-    "ringing": (0.3, WEIGHT_STEP),
-    "slow_weights": (0.1, WEIGHT_STEP),
-    COORDINATES: (1.0, WEIGHT_STEP),
-}
+SCALES = {DECAY_WEIGHTS: 0.03, "ringing": 0.3, "slow_weights": 0.1, COORDINATES: 1.0}
+# Step of differences in widths of the priors, for what is computed in double precision.
+STEP = 1e-5
 
 
 class Parameters:
@@ -53,10 +50,9 @@ class Parameters:
         self.labels = [n for n, p in named for _ in range(p.numel())]
         self._names = [f"{n}.{i + 1}" for n, p in named for i in range(p.numel())]
         self.centre = self.vector()
-        scales = [SCALES.get(name, (TIME_WIDTH, TIME_STEP)) for name in self.labels]
-        self.widths, self.steps = np.array(scales).T.copy()
+        self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
         if response.decay_known is not None:
-            self.widths[self.labels.index("log_decay_us")] = response.decay_known
+            self.widths[self.labels.index(DECAY)] = response.decay_known
         learned = np.array([name == COORDINATES for name in self.labels])
         self.centre[learned] = 0.0
         self.longest = np.where(learned, LONGEST, self.widths)
@@ -64,7 +60,7 @@ class Parameters:
         self.high = -self.low
         stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
         self.widths[stretched] = STRETCH_WIDTHS[: len(stretched)]
-        self.steps[stretched] = STRETCH_STEPS[: len(stretched)]
+        self.of_readout = len(self.labels) - len(stretched)  # a stretch comes last
 
     def vector(self) -> Values:
         """Parameters as one vector."""
@@ -77,37 +73,93 @@ class Parameters:
         for part, own in zip(self._parts, values, strict=True):
             part.data.copy_(own.view_as(part))
 
+    def transfer_slopes(self, padded: int) -> Tensor:
+        """Derivatives of the transfer, shape (coordinates but of a stretch, frequencies)."""
+        columns = range(self.of_readout)
+        return torch.stack([self._slope(i, partial(self._transfer, padded)) for i in columns])
+
+    def pulse_slopes(self, pulses: FloatArray, rows: slice) -> Tensor:
+        """Derivatives of pulses in a stretch, shape (coordinates of it, pulses, samples)."""
+        columns = range(self.of_readout, len(self.labels))
+        simulated = torch.from_numpy(pulses[rows]).double()
+        drifted = partial(self.response.drifted, simulated)
+        if not columns:
+            return torch.empty((0, *simulated.shape))
+        return torch.stack([self._slope(i, drifted) for i in columns]).float()
+
+    def _transfer(self, padded: int) -> Tensor:
+        transfer: Tensor = self.response.transfer(padded)
+        return transfer
+
+    @torch.no_grad()
+    def _slope(self, i: int, of: Callable[[], Tensor]) -> Tensor:
+        """Derivative in one coordinate of what is computed in double precision."""
+        here, step = self.vector(), STEP * self.widths[i]
+        low, high = max(here[i] - step, self.low[i]), here[i] + step
+        ends = []
+        for end in (low, high):
+            there = here.copy()
+            there[i] = end
+            self.set(there)
+            ends.append(of())
+        self.set(here)
+        slope: Tensor = (ends[1] - ends[0]) / (high - low)
+        return slope
+
     def by_name(self, values: Values) -> dict[str, float]:
         """Values of the parameters by name and number."""
         return dict(zip(self._names, values.tolist(), strict=True))
 
 
-POLES = "log_poles_ns"
-# For the square of half the difference of two logarithms: width of the prior, and step of the
-# finite differences (times of 44 and 36 ns instead of 40 ns twice).
-SQUARE_WIDTH, SQUARE_STEP = 0.25, 0.01
+SLOWEST = -0.99  # rate of the slowest decay: a hundred times slower than at the start
+SQUARE_WIDTH = 0.25  # of the prior for the square of half the difference of two logarithms
 
 
 class SmoothParameters(Parameters):
-    """The parameters, with mean and squared half difference in place of each pair of poles.
+    r"""The parameters in coordinates on which pulses depend nearly linearly.
 
-    Pulses depend nearly linearly on these.  Two poles act alike: pulses depend on the mean of
-    their logarithms and on the *square* of their difference.  Where they are equal, derivatives
-    with respect to the difference vanish, and steps along it go astray.
+    Two poles act alike: pulses depend on the mean of their logarithms and on the *square* of
+    their difference, and each pair is replaced by these.  Where two poles are equal,
+    derivatives with respect to the difference vanish, and steps along it go astray.
+
+    Tails depend on the rate of the main decay times its share.  With the shares :math:`a_i` of
+    the faster ones, its time :math:`\tau` is replaced by
+
+    .. math:: r = \Big(1 - \sum_i a_i\Big) \left(\frac{\tau_0}{\tau} - 1\right).
+
+    Tails determine all these together a hundred times better than each.  In other coordinates,
+    a step from one to another would curve out of this valley.
+
+    Parameters
+    ----------
+    response
+        Response with the parameters.
+    start
+        Response on whose values the priors of the same parameters are centred; those of others
+        on the current ones.  Its decay is :math:`\tau_0`.
     """
 
     _pairs: Sequence[tuple[int, int]] = ()
+    _decay: int | None = None
 
-    def __init__(self, response: Readout) -> None:
+    def __init__(self, response: Readout, start: Readout | None = None) -> None:
         super().__init__(response)
+        known = {} if start is None else (own := Parameters(start)).by_name(own.centre)
+        current = self.by_name(self.centre)
+        centre = np.array([known.get(name, value) for name, value in current.items()])
         poles = [i for i, label in enumerate(self.labels) if label == POLES]
         self._pairs = list(zip(poles[::2], poles[1::2], strict=False))
         self._plain_widths = self.widths.copy()
         for mean, square in self._pairs:
             self.widths[mean] /= np.sqrt(2)
-            self.widths[square], self.steps[square] = SQUARE_WIDTH, SQUARE_STEP
-            self.longest[square], self.low[square] = SQUARE_WIDTH, 0.0
-        self.centre = self._of(self.centre)
+            self.widths[square] = self.longest[square] = SQUARE_WIDTH
+            self.low[square] = 0.0
+        self._shares = np.array([label == DECAY_WEIGHTS for label in self.labels])
+        if DECAY in self.labels:
+            self._decay = self.labels.index(DECAY)
+            self._log_reference = centre[self._decay]
+            self.low[self._decay] = SLOWEST
+        self.centre = self._of(centre)
 
     def vector(self) -> Values:
         """Coordinates of the current response."""
@@ -119,6 +171,9 @@ class SmoothParameters(Parameters):
         for mean, square in self._pairs:
             half = np.sqrt(max(vector[square], 0.0))
             plain[mean], plain[square] = vector[mean] + half, vector[mean] - half
+        if (i := self._decay) is not None:
+            rate = 1 + vector[i] / self._main_share(vector)
+            plain[i] = self._log_reference - np.log(max(rate, 1 + SLOWEST))
         super().set(plain)
 
     def covariance(self, information: Values) -> Values:
@@ -130,11 +185,15 @@ class SmoothParameters(Parameters):
             What the data alone tell of the coordinates: products of the derivatives of all
             residuals but those of the priors.
         """
-        turn = np.eye(len(information))
+        turn, here = np.eye(len(information)), self.vector()
         for mean, square in self._pairs:
-            half = np.sqrt(max(self.vector()[square], 0.0))
+            half = np.sqrt(max(here[square], 0.0))
             turn[mean, [mean, square]] = 0.5
             turn[square, [mean, square]] = half, -half
+        if (i := self._decay) is not None:
+            share = self._main_share(here)
+            turn[i, self._shares] = -here[i] / share
+            turn[i, i] = -(share + here[i])
         plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
         return np.asarray(np.linalg.inv(plain), float)
 
@@ -144,7 +203,14 @@ class SmoothParameters(Parameters):
         for mean, square in self._pairs:
             first, second = plain[mean], plain[square]
             place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
+        if (i := self._decay) is not None:
+            rate = np.expm1(self._log_reference - plain[i])
+            place[i] = self._main_share(plain) * rate
         return place
+
+    def _main_share(self, plain: Values) -> float:
+        """Share of the main decay."""
+        return float(1 - plain[self._shares].sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,29 +333,15 @@ class ResponseProblem:
         residuals = self.residuals(self.parameters.vector())
         return float(residuals @ residuals)
 
-    def jacobian(self, vector: Values, residuals: Values) -> Values:
+    def jacobian(self, vector: Values) -> Values:
         """Derivatives of all residuals, shape (residuals, parameters)."""
-        derivatives = self.derivatives(vector, residuals[: self.moments], range(len(vector)))
-        return np.concatenate([derivatives, np.diag(1 / self.parameters.widths)])
+        return np.concatenate([self.derivatives(vector), np.diag(1 / self.parameters.widths)])
 
-    def derivatives(
-        self, vector: Values, deviations: Values, parameters: Iterable[int]
-    ) -> Values:
-        """Derivatives of the deviations, one column per parameter.
-
-        Those of a learned step response are exact, others are finite differences.
-        """
-        if isinstance(self.response, StepResponse):
-            self.parameters.set(vector)
-            found = [c.derivatives(self.response, self.clip) for c in self._comparisons]
-            return np.concatenate(found)[:, list(parameters)]
-        columns = []
-        for i in parameters:
-            moved = vector.copy()
-            moved[i] += self.parameters.steps[i]
-            columns.append((self.deviations(moved) - deviations) / self.parameters.steps[i])
+    def derivatives(self, vector: Values) -> Values:
+        """Derivatives of the deviations, shape (moments, parameters)."""
         self.parameters.set(vector)
-        return np.stack(columns, axis=1)
+        found = [c.derivatives(self.parameters, self.clip) for c in self._comparisons]
+        return np.concatenate(found)
 
 
 class BandComparison:
@@ -310,18 +362,11 @@ class BandComparison:
             correlation = correlation + np.diag(model_errors**2)
         self.whiten = scipy.linalg.cholesky(np.linalg.inv(correlation))
 
-    def derivatives(self, response: StepResponse, clip: float | None) -> Values:
-        """Exact derivatives of the uncorrelated deviations, shape (moments, coordinates)."""
-        exact = DifferentiableSet(self.sim)
-
-        def functions(linear: Tensor, amplitude: Tensor) -> Tensor:
-            return exact.readings.functions(linear, amplitude, clip)
-
-        total, n = torch.zeros(()), 0.0
-        for _, _, moved, weights in exact.blocks(response, functions, draws=self.draws):
-            total = total + (weights @ moved).double()  # (coordinates, moments)
-            n += float(weights.sum())
-        return np.asarray(self.whiten @ (total.numpy() / n / self.sigma).T)
+    def derivatives(self, readout: Slopes, clip: float | None) -> Values:
+        """Derivatives of the uncorrelated deviations, shape (moments, coordinates)."""
+        functions = partial(self.moments.functions, clip=clip)
+        slopes = DifferentiableSet(self.sim).slopes(readout, functions, draws=self.draws)
+        return np.asarray(self.whiten @ (slopes.T / self.sigma).T)
 
     def pulls(self, response: Readout, clip: float | None) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:

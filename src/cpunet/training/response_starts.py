@@ -248,17 +248,16 @@ def most_promising_ringing(
     vector = problem.parameters.vector()
     problem.clip = None
     deviations = problem.deviations(vector)
-    known = problem.derivatives(vector, deviations, range(len(vector)))
+    known = problem.derivatives(vector)
     best: tuple[ElectronicsResponse | None, float] = (None, float(deviations @ deviations))
     for frequency in frequencies_mhz:
         response = with_settings(problem.response, ringing_mhz=frequency)
         tried = problem.of(response)
-        weights = [i for i, label in enumerate(tried.parameters.labels) if label == "ringing"]
-        slopes = tried.derivatives(tried.parameters.vector(), deviations, weights)
-        columns = np.concatenate([known, slopes], axis=1)
+        rings = np.array([label == "ringing" for label in tried.parameters.labels])
+        slopes = tried.derivatives(tried.parameters.vector())
+        columns = np.concatenate([known, slopes[:, rings]], axis=1)
         move = np.linalg.lstsq(columns, deviations)[0]
         left = deviations - columns @ move
-        response.ringing.data.zero_()  # the derivatives moved it
         if float(left @ left) < best[1]:
             best = response, float(left @ left)
     return best

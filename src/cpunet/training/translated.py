@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +46,7 @@ MAX_CUT = 0.2
 # Weighted sums over a block of pulses; sums over pulses, and the total weight of these.
 Summed = Callable[[Readings], tuple[Values, ...]]
 Total = tuple[tuple[Values, ...], float]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,15 @@ class Noise:
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     """Threads for blocks, which are kept: to start them takes a tenth of the time of these."""
-    return ThreadPoolExecutor(threads)
+    return ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+
+
+def in_threads(of: Callable[[int], T], starts: range) -> list[T]:
+    """What is made of blocks of pulses, in their order, whichever thread finishes first."""
+    threads = torch.get_num_threads()
+    if threads == 1 or len(starts) == 1:
+        return [of(first) for first in starts]
+    return list(_pool(threads).map(of, starts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,12 +225,7 @@ class SimulatedSide:
         padded = padded_length(self.length)
         with torch.no_grad():
             transfer = np.asarray(response.transfer(padded).numpy(), np.complex64)
-        drift = response.drift
-        stretch = drift.stretch.tolist() if isinstance(drift, DriftClock) else []
-        if stretch != self._stretch:
-            self._spectra.clear()
-            self._stretch[:] = stretch
-        threads = torch.get_num_threads()
+        self.forget_unless(response)
 
         def one(first: int) -> tuple[list[Total], list[Total], int]:
             """Totals of each draw, within the data's range and beyond it, and pulses beyond."""
@@ -240,18 +245,21 @@ class SimulatedSide:
                 within.append((of(readings), float(readings.weights.sum())))
             return within, outside, n
 
-        starts = range(0, len(self), size)
-        if threads == 1 or len(starts) == 1:
-            blocks = [one(first) for first in starts]
-        else:
-            # in the order of the pulses, whichever thread finishes first
-            blocks = list(_pool(threads).map(one, starts))
+        blocks = in_threads(one, range(0, len(self), size))
         # decided for all pulses together, so that it does not depend on the blocks
         n_read = len(self) * len(range(len(self.noise.factor))[:draws])
         exclude = sum(n for _, _, n in blocks) < MAX_CUT * n_read
         return [
             _added(within if exclude else within + outside) for within, outside, _ in blocks
         ]
+
+    def forget_unless(self, response: Readout) -> None:
+        """Forget the spectra of another stretch of the drift than that of a response."""
+        drift = response.drift
+        stretch = drift.stretch.tolist() if isinstance(drift, DriftClock) else []
+        if stretch != self._stretch:
+            self._spectra.clear()
+            self._stretch[:] = stretch
 
     def spectrum(self, response: Readout, first: int, size: int) -> npt.NDArray[np.complex64]:
         """Fourier transform of the currents of one block, cached up to `SPECTRA_BYTES`."""
