@@ -42,6 +42,7 @@ class Pairs:
 
     sim: np.ndarray
     weights: np.ndarray
+    length = 800
 
     def __len__(self):
         return len(self.sim)
@@ -60,9 +61,10 @@ class ReadExactly:
     def __init__(self, side):
         self.side = side
 
-    def slopes(self, readout, functions, *, draws=None):
-        of_chain = np.zeros((len(readout.chain.labels), self.side.sim.shape[1]))
-        return np.concatenate([of_chain, readout.changes.mean(axis=1)]).T
+    def slopes(self, ways, functions, *, draws=None):
+        changes = ways.of_pulses(slice(None)).numpy()
+        of_chain = np.zeros((len(ways.of_transfer), self.side.sim.shape[1]))
+        return np.concatenate([of_chain, changes.mean(axis=1)]).T
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.differentiable import DifferentiableSet
-from cpunet.training.moments import Readings
+from cpunet.training.moments import Readings, Rows
 from cpunet.training.response_problem import Band, SmoothParameters
 from cpunet.training.translated import SimulatedSide
 
@@ -32,6 +32,7 @@ HOLD = 4.0
 FOR_DERIVATIVES, OF_BAND = 1536, 100
 # Simulated pulses of a band for the covariance of the functions.
 FOR_COVARIANCE = 4096
+OfPulses = Callable[[slice], Tensor]
 # Step in the physics, in which pulses are linear, as a fraction of the reach of a derivative.
 STEP = 0.1
 
@@ -92,33 +93,6 @@ class JointParameters:
         self.coordinates = self.coordinates.copy()
         n = self.n_chain
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
-
-
-@dataclass(frozen=True, eq=False)
-class _BandSlopes:
-    """How records change with the parameters of a chain, and how pulses do with the physics.
-
-    The latter has the shape (coordinates, pulses, samples).
-    """
-
-    chain: SmoothParameters
-    changes: FloatArray
-
-    @property
-    def response(self) -> ElectronicsResponse:
-        """The chain."""
-        response: ElectronicsResponse = self.chain.response
-        return response
-
-    def transfer_slopes(self, padded: int) -> Tensor:
-        """Derivatives of the chain."""
-        return self.chain.transfer_slopes(padded)
-
-    def pulse_slopes(self, pulses: FloatArray, rows: slice) -> Tensor:
-        """Derivatives of pulses in a stretch of the drift, if there is one, and the physics."""
-        return torch.cat(
-            [self.chain.pulse_slopes(pulses, rows), torch.from_numpy(self.changes[:, rows])]
-        )
 
 
 @dataclass(eq=False)
@@ -296,24 +270,26 @@ class JointProblem:
 
     def _slopes(self) -> list[Values]:
         """Derivatives of the uncorrelated deviations of each band."""
-        at, free, steps = (
-            self.parameters.coordinates,
-            self.parameters.free,
-            STEP * self.parameters.reach,
-        )
-        windows = self._entering(at)
+        parameters, at = self.parameters, self.parameters.coordinates
+        windows, found = self._entering(at), []
+        steps = (STEP * parameters.reach).astype(np.float32)
         changes = [
-            (self._entering(at + step * np.eye(len(at))[i]) - windows) / np.float32(step)
-            for i, step in zip(free, steps, strict=True)
+            (self._entering(at + step * np.eye(len(at))[i]) - windows) / step
+            for i, step in zip(parameters.free, steps, strict=True)
         ]
-        found = []
         for k, side in enumerate(self._simulated(at, self.few)):
-            rows = self.bands[k].rows[: len(side)]
-            own = np.reshape(
-                [change[rows] for change in changes], (len(changes), *side.sim.shape)
-            )
+            ways = parameters.chain.ways(side)
+
+            def of_pulses(
+                rows: slice,
+                of_chain: OfPulses = ways.of_pulses,
+                band: Rows = self.bands[k].rows,
+            ) -> Tensor:
+                own = [torch.from_numpy(change[band[rows]])[None] for change in changes]
+                return torch.cat([of_chain(rows), *own])
+
             mean = DifferentiableSet(side).slopes(
-                _BandSlopes(self.parameters.chain, own.astype(np.float32)),
+                ways._replace(of_pulses=of_pulses),
                 partial(self.functions[k], clip=self._clip),
                 draws=None if self.few is None else 1,
             )

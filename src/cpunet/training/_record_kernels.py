@@ -94,7 +94,7 @@ def _slope(tail: Any, logs: Any) -> Any:  # pragma: no cover - compiled
 
 @kernel(error_model="numpy")
 def _tail_slope(record: Any, w: RecordWindow, tail: Any, logs: Any) -> Any:  # pragma: no cover
-    """Tail slope of the window that the preparation would cut from the record."""
+    """Tail slope of the window that the preparation would cut, and where this begins."""
     first, stop = w.last - w.align_before, min(w.last + w.align_after, len(record))
     highest = _highest(record, first, stop)
     at = first
@@ -107,15 +107,15 @@ def _tail_slope(record: Any, w: RecordWindow, tail: Any, logs: Any) -> Any:  # p
     start = align + 1 + w.align_after - w.fit_samples
     for i in range(w.fit_samples):
         tail[i] = record[min(start + i, len(record) - 1)]
-    return _slope(tail, logs)
+    return _slope(tail, logs), start
 
 
 @kernel(error_model="numpy", fastmath=FAST)
 def _amplitude(current: Any, first: int, stop: int, weights: Any) -> Any:  # pragma: no cover
-    """Largest weighted mean of the current on its fine grid."""
+    """Largest weighted mean of the current on its fine grid, its centre and phase."""
     phases, width = weights.shape
     half, n = width // 2, len(current)
-    best = np.float32(-np.inf)
+    best, at, best_phase = np.float32(-np.inf), first, 0
     for centre in range(first, stop):
         for phase in range(phases):
             total = np.float32(0)
@@ -125,8 +125,9 @@ def _amplitude(current: Any, first: int, stop: int, weights: Any) -> Any:  # pra
             else:
                 for k in range(width):
                     total += weights[phase, k] * current[min(max(centre - half + k, 0), n - 1)]
-            best = max(best, total)
-    return best
+            if total > best:
+                best, at, best_phase = total, centre, phase
+    return best, at, best_phase
 
 
 @kernel(error_model="numpy", fastmath=FAST)
@@ -161,7 +162,13 @@ def _window(
 
 @kernel(error_model="numpy")
 def read_records(
-    records: Any, w: RecordWindow, weights: Any, aligned: Any, slopes: Any, amplitudes: Any
+    records: Any,
+    w: RecordWindow,
+    weights: Any,
+    aligned: Any,
+    slopes: Any,
+    amplitudes: Any,
+    places: Any,
 ) -> None:  # pragma: no cover - compiled
     """Align and read each record; the records are normalised in place.
 
@@ -174,6 +181,10 @@ def read_records(
     aligned, slopes, amplitudes
         Outputs: (pulses, before + after) float32, and two of (pulses,) float64. NaN for a
         record that contains NaN.
+    places
+        Output, (pulses, 6) float64: where it was read. Sample before the half maximum about
+        which baseline and level are, that of the normalised record, time of the half maximum
+        after it, first sample of the tail, centre of the current amplitude and its phase.
     """
     tail = np.empty(w.fit_samples, np.float32)
     logs = np.empty(w.fit_samples, np.float32)
@@ -188,19 +199,26 @@ def read_records(
             # baseline and level are taken relative to the crossing of the normalised record:
             # with a decay of 50 us, one sample off is many standard deviations of a mean
             _normalise(record, again, w)
-            time, _ = _crossing(record, w.level, again + 20)
+            time, half = _crossing(record, w.level, again + 20)
+        else:
+            half = again
         if not math.isfinite(time):
             aligned[row], slopes[row], amplitudes[row] = math.nan, math.nan, math.nan
+            places[row] = 0
             continue
         _window(record, time, w, aligned[row])
-        slopes[row] = _tail_slope(record, w, tail, logs)
+        slopes[row], start = _tail_slope(record, w, tail, logs)
         for i in range(len(current)):
             current[i] = aligned[row, i + 1] - aligned[row, i]
         steepest = max(w.before - w.edge, 0)
         for i in range(steepest, min(w.before + w.edge, len(current))):
             if current[i] > current[steepest]:
                 steepest = i
-        amplitudes[row] = _amplitude(current, steepest - near, steepest + near + 1, weights)
+        amplitudes[row], centre, phase = _amplitude(
+            current, steepest - near, steepest + near + 1, weights
+        )
+        places[row, 0], places[row, 1], places[row, 2] = again, half, time - half
+        places[row, 3], places[row, 4], places[row, 5] = start, centre, phase
 
 
 @kernel(error_model="numpy")

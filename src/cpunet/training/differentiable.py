@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,52 +27,47 @@ from cpunet.networks.response_layer import (
     current_spectrum,
     padded_length,
 )
-from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.training.dual_numbers import Dual
-from cpunet.training.moments import Moments, Readings
+from cpunet.training.moments import Moments, Readings, aligned_records
 from cpunet.training.translated import PLATEAU, SimulatedSide, in_threads
 
 T = TypeVar("T")
 BLOCK = 128  # pulses at a time: each has a record for every parameter
-AGAIN = 20  # samples after the half maximum from which it is searched for again
 
 NO_WEIGHTS = np.empty(0)  # of the readings of tensors; those of the set count
 # Functions of each pulse, as of `Moments`; these take tensors, too.
 Functions = Callable[[Readings], Any]
 
 
-class Slopes(Protocol):
-    """A readout, and how it changes with each of its coordinates."""
+class Ways(NamedTuple):
+    """A readout, and how records change with its coordinates.
 
-    @property
-    def response(self) -> Readout:
-        """The readout."""
+    Parameters
+    ----------
+    response
+        The readout.
+    of_transfer
+        Derivatives of its transfer, shape (coordinates, frequencies).
+    of_pulses
+        Derivatives of some of the pulses that enter it, shape (further coordinates, pulses,
+        samples), for their rows.
+    """
 
-    def transfer_slopes(self, padded: int) -> Tensor:
-        """Derivatives of its transfer, shape (coordinates, frequencies)."""
-
-    def pulse_slopes(self, pulses: FloatArray, rows: slice) -> Tensor:
-        """Derivatives of pulses that enter it, shape (further coordinates, pulses, samples).
-
-        Parameters
-        ----------
-        pulses
-            All pulses as simulated, shape (pulses, samples).
-        rows
-            Those to look at.
-        """
+    response: Readout
+    of_transfer: Tensor
+    of_pulses: Callable[[slice], Tensor]
 
 
 class Samples(NamedTuple):
     """Samples at which records are read, each of shape (pulses,)."""
 
     level: Tensor  # half maximum that baseline and level refer to
-    half: Tensor  # half maximum of the normalised record, and the time after this sample
-    time: Tensor
+    half: Tensor  # half maximum of the normalised record
     tail: Tensor  # start of the tail
     steepest: Tensor  # centre of the current amplitude, and its phase
     phase: Tensor
+    time: Tensor  # of the half maximum after its sample
 
 
 class DifferentiableReadings:
@@ -183,50 +178,11 @@ class DifferentiableReadings:
         return whole / self.spreads, of_amplitude[..., 0]
 
     def samples(self, records: Tensor) -> Samples:
-        """Samples at which noisy records are read."""
-        w = self.window
-        first = self._crossing(records, torch.full_like(records[:, 0], w.last))
-        level = self._crossing(self._about(records, first), first + AGAIN)
-        normal = self._about(records, level)
-        half = self._crossing(normal, level + AGAIN)
-        begin = w.last - w.align_before
-        top = normal[:, begin : w.last + w.align_after]
-        before = torch.arange(top.shape[1]) < top.argmax(dim=1, keepdim=True)
-        below = (top < w.align_fraction * top.amax(dim=1, keepdim=True)) & before
-        tail = begin + _last(below) + 1 + w.align_after - w.fit_samples
-        around = stretch(normal, half, -w.before, w.after + 1)
-        time = self._time(stretch(normal, half, 0, 2))
-        current = torch.diff(torch.lerp(around[:, :-1], around[:, 1:], time))
-        from_sample = max(w.before - w.edge, 0)
-        steepest = from_sample + current[:, from_sample : w.before + w.edge].argmax(dim=1)
-        near, width = w.edge // 3, self.weights.shape[1]
-        around = stretch(current, steepest, -near - width // 2, near + width // 2 + 1)
-        best = (around.unfold(1, width, 1) @ self.weights.T).flatten(1).argmax(dim=1)
-        phases = len(self.weights)
-        centre = steepest - near + torch.div(best, phases, rounding_mode="floor")
-        return Samples(level, half, time[:, 0], tail, centre, best % phases)
-
-    def _crossing(self, records: Tensor, last: Tensor) -> Tensor:
-        """Sample before the last upward crossing of the half height before `last`."""
-        low = records[:, :-1]
-        index = torch.arange(low.shape[1])
-        return _last((low < self.window.level) & (index < last[:, None])).clamp_min(0)
-
-    def _about(self, records: Tensor, sample: Tensor) -> Tensor:
-        """Records with baseline 0 and nominal level about their half maxima."""
-        w = self.window
-        zero = stretch(records, sample, -w.base_first, -w.base_stop)
-        level = stretch(records, sample, w.after - w.level_samples, w.after)
-        means = (part.mean(dim=1, keepdim=True) for part in (zero, level))
-        return self._normalised(records, *means)
-
-    def _normalised(self, values: Tensor, zero: Tensor, level: Tensor) -> Tensor:
-        return (values - zero) * (self.window.tail_level / (level - zero))
-
-    def _time(self, pair: Tensor) -> Tensor:
-        """Time of the half maximum after the first of two samples, shape (pulses, 1)."""
-        low, high = pair[:, :1], pair[:, 1:]
-        return (self.window.level - low) / (high - low).clamp_min(1e-6)
+        """Samples at which noisy records are read, by the compiled loops."""
+        *_, places = aligned_records(records.numpy().copy(), self.window)
+        level, half, time, tail, steepest, phase = torch.from_numpy(places).unbind(dim=1)
+        whole = [samples.long() for samples in (level, half, tail, steepest, phase)]
+        return Samples._make([*whole, time.float()])
 
 
 class DifferentiableSet:
@@ -279,7 +235,7 @@ class DifferentiableSet:
 
     def blocks(
         self,
-        readout: Slopes,
+        ways: Ways,
         functions: Functions,
         of: Callable[[int, Tensor, Tensor, Tensor], T],
         *,
@@ -289,7 +245,7 @@ class DifferentiableSet:
 
         Parameters
         ----------
-        readout
+        ways
             Readout and its derivatives.
         functions
             Functions of each pulse.
@@ -299,17 +255,17 @@ class DifferentiableSet:
         draws
             Number of draws to use; None for all.
         """
-        response = readout.response
+        response = ways.response
         self.sim.forget_unless(response)
         with torch.no_grad():
             transfer = response.transfer(self.padded).to(torch.complex64)
-        of_transfer = readout.transfer_slopes(self.padded).to(torch.complex64)[:, None]
+        of_transfer = ways.of_transfer.to(torch.complex64)[:, None]
 
         def one(first: int) -> list[T]:
             spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
             rows = slice(first, first + len(spectra))
             clean, moved = self.records(spectra, transfer), self.records(spectra, of_transfer)
-            if len(further := readout.pulse_slopes(self.sim.sim, rows)):
+            if len(further := ways.of_pulses(rows)):
                 changes = current_spectrum(further, self.padded)
                 moved = torch.cat([moved, self.records(changes, transfer)])
             heights = self.height(clean), self.height(moved)
@@ -332,7 +288,7 @@ class DifferentiableSet:
         return [part for block in blocks for part in block]
 
     def slopes(
-        self, readout: Slopes, functions: Functions, *, draws: int | None = None
+        self, ways: Ways, functions: Functions, *, draws: int | None = None
     ) -> npt.NDArray[np.float64]:
         """Derivatives of the means of the functions, shape (functions, coordinates)."""
 
@@ -341,15 +297,10 @@ class DifferentiableSet:
         ) -> tuple[Tensor, float]:
             return (weights @ moved).double(), float(weights.sum())
 
-        sums, n = zip(*self.blocks(readout, functions, of, draws=draws), strict=True)
+        sums, n = zip(*self.blocks(ways, functions, of, draws=draws), strict=True)
         return np.asarray(torch.stack(sums).sum(dim=0).T / sum(n))
 
     def noise(self, draw: int, first: int, n: int) -> Tensor:
         """Noise of `n` pulses from the first one on, shape (n, samples)."""
         nothing = np.zeros((n, self.sim.length), np.float32)
         return torch.from_numpy(self.sim.noise.add(nothing, draw, first))
-
-
-def _last(where: Tensor) -> Tensor:
-    """Last sample of each row for which a condition holds; -1 for none."""
-    return (where * torch.arange(1, where.shape[1] + 1)).amax(dim=1) - 1

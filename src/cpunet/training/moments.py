@@ -202,7 +202,7 @@ class Moments:
             Readings of the pulses that can be aligned, and whether the tail slope of each is
             outside the range of the data.
         """
-        aligned, slopes, log_amplitude = _aligned(records, self.window(last))
+        aligned, slopes, log_amplitude, _ = aligned_records(records, self.window(last))
         linear = self._linear(aligned, slopes)
         beyond = (slopes < self.slope_range[0]) | (slopes > self.slope_range[1])
         counts = np.isfinite(linear).all(axis=1) & np.isfinite(log_amplitude)
@@ -385,21 +385,24 @@ def _window(
     )
 
 
-def _aligned(records: FloatArray, window: RecordWindow) -> tuple[FloatArray, Values, Values]:
-    """Aligned pulses, tail slopes and logarithms of the current amplitude of records."""
+def aligned_records(
+    records: FloatArray, window: RecordWindow
+) -> tuple[FloatArray, Values, Values, Values]:
+    """Aligned pulses, tail slopes, logarithms of the current amplitude, places where read."""
     n = len(records)
     aligned = np.empty((n, window.before + window.after), np.float32)
-    slopes, amplitudes = np.empty(n), np.empty(n)
-    read_records(records, window, current_amplitude_kernel(), aligned, slopes, amplitudes)
-    return aligned, slopes, np.log(np.maximum(amplitudes, 1e-4))
+    slopes, amplitudes, places = np.empty(n), np.empty(n), np.empty((n, 6))
+    weights = current_amplitude_kernel()
+    read_records(records, window, weights, aligned, slopes, amplitudes, places)
+    return aligned, slopes, np.log(np.maximum(amplitudes, 1e-4)), places
 
 
 def _read_windows(
     windows: FloatArray, window: RecordWindow, preparation: PreparationConfig
 ) -> tuple[FloatArray, Values, Values]:
-    """Like `_aligned`, for prepared windows, whose tails are where the preparation put them."""
+    """The same of prepared windows, whose tails are where the preparation put them."""
     records = np.array(windows, np.float32)  # a copy, to be changed in place
-    aligned, _, log_amplitude = _aligned(records, window)
+    aligned, _, log_amplitude, _ = aligned_records(records, window)
     tails = records[:, -preparation.decay_fit_samples :]
     lever = np.arange(tails.shape[1]) - 0.5 * (tails.shape[1] - 1)
     slopes = np.log(np.maximum(tails, np.float32(1e-3))) @ (lever / (lever @ lever))

@@ -384,5 +384,5 @@ def _simulated(
             found[part] = Sums(w.sum(), w @ v, (w * v.T) @ v, column)
         return found
 
-    blocks = DifferentiableSet(sim).blocks(smooth, functions, of, draws=1)
+    blocks = DifferentiableSet(sim).blocks(smooth.ways(sim), functions, of, draws=1)
     return [sum((b[k] for b in blocks if k in b), Sums()) for k in range(PARTS)]

@@ -13,9 +13,8 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from cpunet.networks.response_layer import Readout
-from cpunet.pulses.container import FloatArray
-from cpunet.training.differentiable import DifferentiableSet, Slopes
+from cpunet.networks.response_layer import Readout, padded_length
+from cpunet.training.differentiable import DifferentiableSet, Ways
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
 
@@ -60,7 +59,6 @@ class Parameters:
         self.high = -self.low
         stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
         self.widths[stretched] = STRETCH_WIDTHS[: len(stretched)]
-        self.of_readout = len(self.labels) - len(stretched)  # a stretch comes last
 
     def vector(self) -> Values:
         """Parameters as one vector."""
@@ -73,23 +71,23 @@ class Parameters:
         for part, own in zip(self._parts, values, strict=True):
             part.data.copy_(own.view_as(part))
 
-    def transfer_slopes(self, padded: int) -> Tensor:
-        """Derivatives of the transfer, shape (coordinates but of a stretch, frequencies)."""
-        columns = range(self.of_readout)
-        return torch.stack([self._slope(i, partial(self._transfer, padded)) for i in columns])
+    def ways(self, sim: SimulatedSide) -> Ways:
+        """How records of some pulses change with each parameter, those of a stretch last."""
+        transfer = partial(self.response.transfer, padded_length(sim.length))
 
-    def pulse_slopes(self, pulses: FloatArray, rows: slice) -> Tensor:
-        """Derivatives of pulses in a stretch, shape (coordinates of it, pulses, samples)."""
-        columns = range(self.of_readout, len(self.labels))
-        simulated = torch.from_numpy(pulses[rows]).double()
-        drifted = partial(self.response.drifted, simulated)
-        if not columns:
-            return torch.empty((0, *simulated.shape))
-        return torch.stack([self._slope(i, drifted) for i in columns]).float()
+        def of_pulses(rows: slice) -> Tensor:
+            pulses = torch.from_numpy(sim.sim[rows]).double()
+            drifted, stretch = (
+                partial(self.response.drifted, pulses),
+                range(n, len(self.labels)),
+            )
+            if not stretch:
+                return torch.empty((0, *pulses.shape))
+            return torch.stack([self._slope(i, drifted) for i in stretch]).float()
 
-    def _transfer(self, padded: int) -> Tensor:
-        transfer: Tensor = self.response.transfer(padded)
-        return transfer
+        n = sum(label != STRETCH for label in self.labels)
+        slopes = torch.stack([self._slope(i, transfer) for i in range(n)])
+        return Ways(self.response, slopes, of_pulses)
 
     @torch.no_grad()
     def _slope(self, i: int, of: Callable[[], Tensor]) -> Tensor:
@@ -362,10 +360,10 @@ class BandComparison:
             correlation = correlation + np.diag(model_errors**2)
         self.whiten = scipy.linalg.cholesky(np.linalg.inv(correlation))
 
-    def derivatives(self, readout: Slopes, clip: float | None) -> Values:
-        """Derivatives of the uncorrelated deviations, shape (moments, coordinates)."""
-        functions = partial(self.moments.functions, clip=clip)
-        slopes = DifferentiableSet(self.sim).slopes(readout, functions, draws=self.draws)
+    def derivatives(self, parameters: Parameters, clip: float | None) -> Values:
+        """Derivatives of the uncorrelated deviations, shape (moments, parameters)."""
+        functions, ways = partial(self.moments.functions, clip=clip), parameters.ways(self.sim)
+        slopes = DifferentiableSet(self.sim).slopes(ways, functions, draws=self.draws)
         return np.asarray(self.whiten @ (slopes.T / self.sigma).T)
 
     def pulls(self, response: Readout, clip: float | None) -> Values:
