@@ -7,18 +7,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import scipy.optimize
 
 from cpunet.calibration.alternatives import BEYOND_CHANCE
 from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.levenberg_marquardt import descend
 
-# Offsets of a profile in errors. Steps in which the other parameters are minimised, at
-# most, and the fall of chi-square below which they end.
-OFFSETS, STEPS, FLAT = (-1.5, 0.0, 1.5), 6, 0.02
-AT_BOUND = 1e-9  # by which bounds are wider, since they must not coincide
+OFFSETS = (-1.5, 0.0, 1.5)  # of a profile, in errors
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
 # Advice where a parameter is unexpected, besides the general one.
@@ -263,7 +260,10 @@ def _together(calibrated: Calibrated) -> list[dict[str, dict[str, float] | float
 
 
 def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
-    """Chi-square including priors along each free coordinate, all others at their best."""
+    """Chi-square including priors along each free coordinate, all others at their best.
+
+    Derivatives are those of the minimum, since the valley is nearly a parabola.
+    """
     problem, physics = calibrated.problem, calibrated.physics
     parameters = problem.parameters
     here, n = parameters.vector(), parameters.n_chain
@@ -279,27 +279,10 @@ def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
             x = float(here[k] + offset * error)
             added = nuisance.kind == "added"  # told without bounds
             values.append(nominal + x if added else nuisance.value(nominal, x))
-            costs.append(_lowest(problem, here + offset * valley, jacobian, k))
+            low, high = parameters.low.copy(), parameters.high.copy()
+            low[k] = high[k] = x
+            there = here + offset * valley
+            costs.append(descend(problem.residuals, there, jacobian, low, high)[1])
         found[nuisance.name] = {"value": values, "chi_square": costs}
     parameters.set(here)
     return found
-
-
-def _lowest(problem: JointProblem, vector: Values, jacobian: Values, fixed: int) -> float:
-    """Chi-square with all parameters but one at their best.
-
-    Steps are made with the derivatives at the minimum: the valley is nearly a parabola.
-    """
-    parameters, cost = problem.parameters, np.inf
-    free = np.arange(len(vector)) != fixed
-    low, high = parameters.low[free], parameters.high[free]
-    for _ in range(STEPS):
-        vector[free] = np.clip(vector[free], low, high)
-        residuals = problem.residuals(vector)
-        cost, before = min(cost, float(residuals @ residuals)), cost
-        if cost > before - FLAT:
-            break
-        bounds = low - vector[free] - AT_BOUND, high - vector[free] + AT_BOUND
-        step = scipy.optimize.lsq_linear(jacobian[:, free], -residuals, bounds, method="bvls")
-        vector[free] += step.x
-    return cost

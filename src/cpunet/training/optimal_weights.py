@@ -27,19 +27,19 @@ where the k-th of K parts of both sides is left out of weights and means.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import add
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 from torch import Tensor
 
 from cpunet.networks.learned_response import StepResponse
 from cpunet.networks.response_layer import Readout
 from cpunet.training.differentiable import DifferentiableSet
+from cpunet.training.levenberg_marquardt import AT_BOUND, descend
 from cpunet.training.moments import (
     BLOCK,
     Moments,
@@ -210,10 +210,6 @@ MIN_BIN = 0.006
 FOR_WEIGHTS = 4096  # maximum number of pulses for the weights, which need not be exact
 RIDGE = 1e-6  # of many coordinates, see `WeightedMeans`
 PARTS = 10  # parts of the pulses, each left out once to estimate the bias
-# Maximum number of passes over all pulses, decrease of the sum of squares below which they end,
-# first damping, and factor by which it changes.
-PASSES, CONVERGED, FIRST_DAMPING, DAMPING_UP = 8, 0.1, 100.0, 10.0
-AT_BOUND = 1e-9  # maximum distance from its bound of a coordinate that counts as at the bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +289,7 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
         return np.concatenate([*found, (place - smooth.centre) / smooth.widths])
 
     columns = np.concatenate([slopes, np.diag(1 / smooth.widths)])
-    end = _descend(residuals, smooth, columns)
+    end, _ = descend(residuals, place, columns, smooth.low, smooth.high)
     # coordinates that end at their bound are held there: jumps to and from it are not a bias
     held = np.where(end > smooth.low + AT_BOUND, np.nan, end - place)
     prior = (place - smooth.centre) / smooth.widths
@@ -303,38 +299,6 @@ def refine(near: ResponseProblem, bands: Sequence[Band], bins: int) -> Values:
     bias *= min(1.0, pairs[0] / pairs[1])
     smooth.set(np.maximum(end - bias, smooth.low))
     return smooth.covariance(slopes.T @ slopes)
-
-
-def _descend(
-    residuals: Callable[[Values], Values], smooth: SmoothParameters, columns: Values
-) -> Values:
-    """Levenberg steps from the current response.
-
-    A pass over all pulses is expensive, so derivatives are not evaluated again: each step,
-    whether or not it lowers the sum of squares, corrects them along its direction (Broyden).
-    """
-    place, damping = smooth.vector(), 0.0
-    left = residuals(place)
-    for _ in range(PASSES):
-        damped = np.concatenate([columns, np.diag(np.sqrt(damping) / smooth.widths)])
-        wanted = np.concatenate([-left, np.zeros(len(place))])
-        bounds = smooth.low - place - 1e-12, np.inf
-        move = scipy.optimize.lsq_linear(damped, wanted, bounds, method="bvls").x
-        promised = left + columns @ move
-        if left @ left - promised @ promised < CONVERGED:
-            break
-        tried = place + move
-        found = residuals(tried)
-        fall = left @ left - found @ found
-        way = move / smooth.widths
-        columns = columns + np.outer(found - promised, way / smooth.widths / (way @ way))
-        if fall <= 0:
-            damping = max(DAMPING_UP * damping, FIRST_DAMPING)
-            continue
-        place, left, damping = tried, found, damping / DAMPING_UP
-        if fall < CONVERGED:
-            break
-    return place
 
 
 class _Weighted:
