@@ -36,7 +36,7 @@ class Calibrated:
     problem
         Comparison at the end of the search: chain, coordinates, functions, pulses.
     covariance
-        Covariance of its parameters, multiplied by the square of `scale`.
+        Covariance of its parameters, with errors of the functions larger by `scale`.
     chi_square_before, pulls_before
         Chi-square and pulls with the chain alone, for the physics as simulated.
     chi_square

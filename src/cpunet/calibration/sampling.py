@@ -29,8 +29,11 @@ PARTS = 8
 MOST = 0.5
 
 
-def of_events(problem: JointProblem) -> tuple[Values, Values]:
-    """Move of the fitted parameters of a problem, and their covariance; see `of_parts`."""
+def of_events(problem: JointProblem, scale: float) -> tuple[Values, Values]:
+    """Move of the fitted parameters of a problem, and their covariance; see `of_parts`.
+
+    The errors of the functions are larger by `scale`, those of the priors are not.
+    """
     vector = problem.parameters.vector()
     jacobian = problem.jacobian(vector)
     deviations, slopes = [], []
@@ -42,7 +45,7 @@ def of_events(problem: JointProblem) -> tuple[Values, Values]:
         deviations.append(part.residuals(vector)[: problem.moments])
         slopes.append(part.jacobian(vector)[: problem.moments])
     n = sum(len(band.sim) + len(band.moments.data) for band in problem.bands)
-    factor = of_weights(n, problem.by_chance[0], len(vector))
+    factor = scale**2 * of_weights(n, problem.by_chance[0], len(vector))
     return of_parts(jacobian, np.array(slopes), np.array(deviations), factor)
 
 
@@ -62,7 +65,7 @@ def of_parts(
     deviations
         These residuals from each part, shape (parts, means).
     factor
-        Of the variances that these residuals have (`of_weights`), but not the priors.
+        Of the variances that these residuals have, but not the priors.
     """
     parts = len(slopes)
     slopes, deviations = slopes - slopes.mean(axis=0), deviations - deviations.mean(axis=0)

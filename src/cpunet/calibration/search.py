@@ -290,22 +290,21 @@ class Search:
             problem, found = best
             promised, information, _ = self._examined(problem)
         before.weigh_like(problem)
-        move, covariance = of_events(problem)
+        mean, spread = problem.by_chance
+        # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
+        scale = float(np.sqrt(max(1.0, problem.chi_square() / (mean + 2 * spread))))
+        move, covariance = of_events(problem, scale)
         parameters = problem.parameters
         moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
         parameters.set(moved)
-        chi_square = problem.chi_square()
-        mean, spread = problem.by_chance
-        # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
-        scale = float(np.sqrt(max(1.0, chi_square / (mean + 2 * spread))))
         rises = [(fit, minimum.cost - found.cost) for fit, minimum in fits]
         rises.sort(key=lambda one: (one[0] is not problem, one[1]))
         return Calibrated(
             problem=problem,
-            covariance=scale**2 * covariance,
+            covariance=covariance,
             chi_square_before=before.chi_square(),
             pulls_before=before.pulls(),
-            chi_square=chi_square,
+            chi_square=problem.chi_square(),
             scale=scale,
             information=information,
             promised=promised,
