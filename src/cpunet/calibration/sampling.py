@@ -24,8 +24,8 @@ from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Values
 
 PARTS = 8
-# Along a direction where more than this share of the information would be noise, parts of the
-# events differ because the functions are not linear, as with fast decays: nothing is corrected.
+# A direction of whose information more than this share would be noise is left as it is: some
+# parts of the events do not tell the noise well enough.
 MOST = 0.5
 
 

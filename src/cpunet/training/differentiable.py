@@ -216,23 +216,6 @@ class DifferentiableSet:
         )
         return over
 
-    @torch.no_grad()
-    def values(self, response: Readout) -> npt.NDArray[np.float64]:
-        """Moments' functions of each pulse, means over the draws, shape (pulses, moments)."""
-        transfer = response.transfer(self.padded).to(torch.complex64)
-        out = []
-        for first in range(0, len(self.sim), BLOCK):
-            spectra = torch.from_numpy(self.sim.spectrum(response, first, BLOCK))
-            clean = self.scaled(self.records(spectra, transfer))
-            draws: list[Any] = [
-                self.sim.moments.functions(
-                    self.readings(clean + self.noise(d, first, len(clean)))
-                )
-                for d in range(len(self.sim.noise.factor))
-            ]
-            out.append(torch.stack(draws).mean(dim=0))
-        return torch.cat(out).double().numpy()
-
     def blocks(
         self,
         ways: Ways,

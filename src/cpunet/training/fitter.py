@@ -17,7 +17,6 @@ import numpy as np
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import Readout
 from cpunet.recipes.schema import MatchingConfig
-from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Rows, Values
 from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
@@ -173,8 +172,8 @@ class HeldOutPulses:
         # functions and weights of both sides
         self.sides = []
         for band in bands:
-            data, sim = band.moments.values, band.sim.of(slice(None))  # of another drift
-            simulated = DifferentiableSet(sim).values(response), sim.weights
+            data, sim = band.moments.values, band.sim
+            simulated = sim.of_each(response, band.moments.functions), sim.weights
             self.sides.append((simulated, (data, np.ones(len(data)))))
         self.comparisons = [BandComparison(band) for band in known]
         self.scales = [held.pairs / band.pairs for held, band in zip(bands, known, strict=True)]

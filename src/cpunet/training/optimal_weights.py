@@ -36,7 +36,6 @@ import numpy as np
 import scipy.linalg
 from torch import Tensor
 
-from cpunet.networks.learned_response import StepResponse
 from cpunet.networks.response_layer import Readout
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.levenberg_marquardt import AT_BOUND, descend
@@ -53,7 +52,9 @@ from cpunet.training.moments import (
 from cpunet.training.response_problem import Band, ResponseProblem, SmoothParameters
 from cpunet.training.translated import SimulatedSide
 
-SHRUNK = 0.05  # share of a diagonal matrix in the correlations of the functions
+# Shares of a diagonal matrix in the correlations of the functions, and of the weighted means,
+# which may be alike for two of many coordinates.
+SHRUNK, RIDGE = 0.05, 1e-6
 
 
 class Sums(NamedTuple):
@@ -110,9 +111,6 @@ class WeightedMeans:
         Sums over the two sides.
     pairs
         Number of pulses that errors refer to.
-    ridge
-        Share of a diagonal matrix in the correlations of the weighted means, for coordinates
-        whose means may be alike.
 
     Attributes
     ----------
@@ -124,17 +122,14 @@ class WeightedMeans:
         Whitened differences of the two sides, and their derivatives in the coordinates.
     """
 
-    def __init__(
-        self, simulated: Sums, measured: Sums, pairs: float, ridge: float = 0.0
-    ) -> None:
+    def __init__(self, simulated: Sums, measured: Sums, pairs: float) -> None:
         slopes = np.asarray(simulated.moved / simulated.n)
         covariance = 0.5 * (simulated.covariance + measured.covariance)
         sigma = np.maximum(np.sqrt(covariance.diagonal()), 1e-12)[:, np.newaxis]
         correlation = (1 - SHRUNK) * covariance / sigma / sigma.T + SHRUNK * np.eye(len(sigma))
         self.weights: Values = np.linalg.solve(correlation, slopes / sigma) / sigma
         spread = self.weights.T @ measured.covariance @ self.weights / pairs
-        if ridge:
-            spread += ridge * np.diag(spread.diagonal())
+        spread += RIDGE * np.diag(spread.diagonal())
         self.whiten = np.asarray(scipy.linalg.cholesky(np.linalg.inv(spread)))
         weighing = self.whiten @ self.weights.T
         self.slopes = weighing @ slopes
@@ -148,7 +143,7 @@ class Parts:
     ----------
     simulated, measured
         Sums over each part of the two sides, with the same number of parts.
-    pairs, ridge
+    pairs
         As of `WeightedMeans`.
     """
 
@@ -157,14 +152,13 @@ class Parts:
         simulated: Sequence[Sums],
         measured: Sequence[Sums],
         pairs: float,
-        ridge: float = 0.0,
     ) -> None:
         def of(left_out: int | None, share: float) -> WeightedMeans:
             sides = [
                 sum((sums for k, sums in enumerate(side) if k != left_out), Sums())
                 for side in (simulated, measured)
             ]
-            return WeightedMeans(sides[0], sides[1], share * pairs, ridge)
+            return WeightedMeans(sides[0], sides[1], share * pairs)
 
         parts = len(measured)
         self.whole = of(None, 1.0)
@@ -208,7 +202,6 @@ def jackknife_bias(
 # Bins of the current amplitude are no narrower than twice its noise.
 MIN_BIN = 0.006
 FOR_WEIGHTS = 4096  # maximum number of pulses for the weights, which need not be exact
-RIDGE = 1e-6  # of many coordinates, see `WeightedMeans`
 PARTS = 10  # parts of the pulses, each left out once to estimate the bias
 
 
@@ -317,8 +310,7 @@ class _Weighted:
         simulated = _simulated(sim, self.functions, smooth)
         counts = (sum(part.n for part in side) for side in (simulated, measured))
         self.pairs = 1 / sum(1 / n for n in counts)
-        ridge = RIDGE if isinstance(smooth.response, StepResponse) else 0.0
-        self.parts = Parts(simulated, measured, band.pairs, ridge)
+        self.parts = Parts(simulated, measured, band.pairs)
         self.whole = self.parts.whole
         rows = (slice(first, first + BLOCK) for first in range(0, len(data), BLOCK))
         total = sum(self.functions.sum(data[some]) for some in rows)

@@ -253,6 +253,12 @@ class SimulatedSide:
             _added(within if exclude else within + outside) for within, outside, _ in blocks
         ]
 
+    def of_each(self, response: Readout, of: Callable[[Readings], Values]) -> Values:
+        """Functions of each pulse, means over the draws, shape (pulses, functions)."""
+        blocks = self.sums_of_blocks(response, lambda readings: (of(readings),), cut=False)
+        sums = np.concatenate([functions for (functions,), _ in blocks])
+        return np.asarray(sums / len(self.noise.factor))
+
     def forget_unless(self, response: Readout) -> None:
         """Forget the spectra of another stretch of the drift than that of a response."""
         drift = response.drift
