@@ -240,6 +240,9 @@ def test_derivatives_are_those_of_wide_differences():
             ends.append(both.residuals(there))
         wanted = (ends[0] - ends[1]) / (2 * step)
         assert np.linalg.norm(slope - wanted) < 0.1 * np.linalg.norm(wanted)
+    of_chain, n = both.of_chain(response), parameters.n_chain
+    whole, chain = (one.jacobian(one.parameters.vector()) for one in (both, of_chain))
+    np.testing.assert_allclose(chain[: both.moments], whole[: both.moments, :n], rtol=1e-6)
 
 
 def test_windows_do_not_jump_where_the_alignment_of_pulses_does(sides):

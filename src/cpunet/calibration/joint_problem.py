@@ -262,7 +262,7 @@ class JointProblem:
         for i, step in zip(parameters.free, STEP * parameters.reach, strict=True):
             there = at + step * np.eye(len(at))[i]
             physics.append((self.known(there) - self.known(at)) / step)
-        columns = np.reshape(physics, (len(physics), -1)).T
+        columns = np.reshape(physics, (len(physics), len(self.known(at)))).T
         if self.held:
             columns = np.concatenate([columns, np.diag(HOLD / parameters.reach)])
         rows.append(np.pad(columns, ((0, 0), (n, 0))))
