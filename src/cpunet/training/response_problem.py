@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -71,38 +72,38 @@ class Parameters:
         for part, own in zip(self._parts, values, strict=True):
             part.data.copy_(own.view_as(part))
 
+    @torch.no_grad()
     def ways(self, sim: SimulatedSide) -> Ways:
         """How records of some pulses change with each parameter, those of a stretch last."""
-        transfer = partial(self.response.transfer, padded_length(sim.length))
+        padded, ends = (
+            padded_length(sim.length),
+            [self._ends(i) for i in range(len(self.labels))],
+        )
+        n = sum(label != STRETCH for label in self.labels)
+        slopes = [(b.transfer(padded) - a.transfer(padded)) / step for a, b, step in ends[:n]]
 
+        @torch.no_grad()
         def of_pulses(rows: slice) -> Tensor:
             pulses = torch.from_numpy(sim.sim[rows]).double()
-            drifted, stretch = (
-                partial(self.response.drifted, pulses),
-                range(n, len(self.labels)),
-            )
-            if not stretch:
-                return torch.empty((0, *pulses.shape))
-            return torch.stack([self._slope(i, drifted) for i in stretch]).float()
+            found = [(b.drifted(pulses) - a.drifted(pulses)) / step for a, b, step in ends[n:]]
+            return torch.stack(found).float() if found else torch.empty((0, *pulses.shape))
 
-        n = sum(label != STRETCH for label in self.labels)
-        slopes = torch.stack([self._slope(i, transfer) for i in range(n)])
-        return Ways(self.response, slopes, of_pulses)
+        return Ways(self.response, torch.stack(slopes), of_pulses)
 
-    @torch.no_grad()
-    def _slope(self, i: int, of: Callable[[], Tensor]) -> Tensor:
-        """Derivative in one coordinate of what is computed in double precision."""
-        here, step = self.vector(), STEP * self.widths[i]
+    def _ends(self, i: int) -> tuple[Readout, Readout, float]:
+        """Copies of the response on both sides of it along one coordinate, and their distance.
+
+        What they compute in double precision differs in proportion.
+        """
+        here, step, ends = self.vector(), STEP * self.widths[i], []
         low, high = max(here[i] - step, self.low[i]), here[i] + step
-        ends = []
         for end in (low, high):
             there = here.copy()
             there[i] = end
             self.set(there)
-            ends.append(of())
+            ends.append(copy.deepcopy(self.response))
         self.set(here)
-        slope: Tensor = (ends[1] - ends[0]) / (high - low)
-        return slope
+        return ends[0], ends[1], high - low
 
     def by_name(self, values: Values) -> dict[str, float]:
         """Values of the parameters by name and number."""
