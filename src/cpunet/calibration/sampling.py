@@ -24,9 +24,9 @@ from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Values
 
 PARTS = 8
-# A direction of whose information more than this share would be noise is left as it is: some
-# parts of the events do not tell the noise well enough.
-MOST = 0.5
+# Largest share of the information along a direction that is taken for noise: the parts of the
+# events do not tell a larger one well enough.
+MOST = 0.9
 
 
 def of_events(problem: JointProblem, scale: float) -> tuple[Values, Values]:
@@ -74,11 +74,10 @@ def of_parts(
     means, whole = jacobian[: slopes.shape[1]], jacobian.T @ jacobian
     inverse = np.linalg.inv(np.linalg.cholesky(whole))
     share, axes = np.linalg.eigh(inverse @ noise @ inverse.T)
-    linear = share < MOST
-    root, back = inverse.T @ axes / np.where(linear, 1 - share, 1), axes.T @ inverse
+    root, back = inverse.T @ axes / (1 - np.minimum(share, MOST)), axes.T @ inverse
     solve = root @ back  # the inverse of H
     covariance = solve @ (whole + (factor - 1) * means.T @ means) @ solve.T
-    return root @ (linear * (back @ gradient)), covariance
+    return solve @ gradient, covariance
 
 
 def of_weights(n: float, d: float, p: int) -> float:
