@@ -21,7 +21,7 @@ from cpunet.electronics.readout import noise_power
 from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.training.response_problem import Parameters
+from cpunet.training.response_problem import SmoothParameters
 
 Numbers = dict[str, float]
 
@@ -220,7 +220,8 @@ def propagated(
     .. math:: \sigma_f^2 = \sum_k \left[ \tfrac{1}{2} \left(
         f(p + \sigma_k e_k) - f(p - \sigma_k e_k) \right) \right]^2
 
-    with the axes :math:`\sigma_k e_k` of the error ellipsoid of the parameters :math:`p`.
+    with the axes :math:`\sigma_k e_k` of the error ellipsoid of the parameters :math:`p`, the
+    decays among them in the coordinates of `SmoothParameters`.
 
     Parameters
     ----------
@@ -238,12 +239,13 @@ def propagated(
         empty if the covariance does not match the parameters.
     """
     moved = copy.deepcopy(response)
-    parameters = Parameters(moved)
+    parameters = SmoothParameters(moved, poles=False)
     centre = parameters.vector()
     matrix = np.asarray(covariance, float)
     if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
         return {}
-    variances, axes = np.linalg.eigh(matrix)
+    turn = parameters.turn()
+    variances, axes = np.linalg.eigh(turn @ matrix @ turn.T)
     ends = []
     for axis in (np.sqrt(np.maximum(variances, 0)) * axes).T:
         for end in (centre + axis, centre - axis):

@@ -136,18 +136,22 @@ class SmoothParameters(Parameters):
     start
         Response on whose values the priors of the same parameters are centred; those of others
         on the current ones.  Its decay is :math:`\tau_0`.
+    poles
+        Whether the poles are replaced, too.
     """
 
     _pairs: Sequence[tuple[int, int]] = ()
     _decay: int | None = None
 
-    def __init__(self, response: Readout, start: Readout | None = None) -> None:
+    def __init__(
+        self, response: Readout, start: Readout | None = None, *, poles: bool = True
+    ) -> None:
         super().__init__(response)
         known = {} if start is None else (own := Parameters(start)).by_name(own.centre)
         current = self.by_name(self.centre)
         centre = np.array([known.get(name, value) for name, value in current.items()])
-        poles = [i for i, label in enumerate(self.labels) if label == POLES]
-        self._pairs = list(zip(poles[::2], poles[1::2], strict=False))
+        of_poles = [i for i, label in enumerate(self.labels) if poles and label == POLES]
+        self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
         self._plain_widths = self.widths.copy()
         for mean, square in self._pairs:
             self.widths[mean] /= np.sqrt(2)
@@ -184,7 +188,14 @@ class SmoothParameters(Parameters):
             What the data alone tell of the coordinates: products of the derivatives of all
             residuals but those of the priors.
         """
-        turn, here = np.eye(len(information)), self.vector()
+        turn = self.turn()
+        plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
+        return np.asarray(np.linalg.inv(plain), float)
+
+    def turn(self) -> Values:
+        """Derivatives of the coordinates in the parameters themselves, here."""
+        here = self.vector()
+        turn = np.eye(len(here))
         for mean, square in self._pairs:
             half = np.sqrt(max(here[square], 0.0))
             turn[mean, [mean, square]] = 0.5
@@ -193,8 +204,7 @@ class SmoothParameters(Parameters):
             share = self._main_share(here)
             turn[i, self._shares] = -here[i] / share
             turn[i, i] = -(share + here[i])
-        plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
-        return np.asarray(np.linalg.inv(plain), float)
+        return turn
 
     def _of(self, plain: Values) -> Values:
         """Coordinates of a vector of parameters."""
