@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from cpunet.training.levenberg_marquardt import levenberg_marquardt
+from cpunet.training.levenberg_marquardt import descend, levenberg_marquardt
 
 TIMES = np.linspace(0.0, 2.0, 9)
 TRUTH = np.array([3.0, 1.5])  # height and rate
@@ -79,6 +79,19 @@ def test_a_fit_ends_at_a_bound_with_the_others_at_their_best(low: float, high: f
     known = least_squares(problem.residuals, [4.0, 0.5 * (low + high)], bounds=bounds)
     np.testing.assert_allclose(problem.parameters.now, known.x, rtol=1e-3)
     assert found.cost == pytest.approx(2 * known.cost, rel=1e-3)
+
+
+@pytest.mark.parametrize("low", [0.1, 1.6])  # above the truth, too
+def test_steps_with_known_derivatives_end_at_the_best_within_bounds(low: float) -> None:
+    """Derivatives are those of another place; a first step of thrice the length leads up."""
+    problem, bounds = Decay([3.0, 1.5]), (np.array([0.0, low]), np.array([9.0, 5.0]))
+    known = least_squares(problem.residuals, [4.0, low + 0.1], bounds=bounds)
+    near = known.x + np.array([0.1, 0.05])
+    for factor in (1.0, 1 / 3):
+        jacobian = factor * problem.jacobian(0.5 * (known.x + near))
+        found, cost = descend(problem.residuals, near, jacobian, *bounds)
+        np.testing.assert_allclose(found, known.x, atol=0.01)
+        assert cost == pytest.approx(2 * known.cost, abs=0.05)
 
 
 class Clipped:

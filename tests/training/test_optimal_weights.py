@@ -113,6 +113,24 @@ def test_coordinates_are_those_of_the_poles_and_back() -> None:
     np.testing.assert_allclose(smooth.covariance(known), covariance, rtol=1e-4, atol=1e-9)
 
 
+def test_coordinates_are_those_of_the_decays_and_back() -> None:
+    made = ElectronicsResponse(load_recipe("fast").matching[0], DT_NS)
+    smooth, plain = SmoothParameters(made, poles=False), Parameters(made)
+    decay = plain.labels.index("log_decay_us")
+    vector = plain.vector()
+    vector[decay] += np.log(0.8)
+    vector[-2:] = 0.05, -0.02
+    plain.set(vector)
+    place = smooth.vector()
+    assert place[decay] == pytest.approx(0.97 * 0.25)
+    smooth.set(place)
+    np.testing.assert_allclose(plain.vector(), vector, rtol=1e-12)
+    steps = 1e-6 * np.eye(len(vector))
+    moved = [plain.set(vector + step) or smooth.vector() for step in steps]
+    plain.set(vector)
+    np.testing.assert_allclose(smooth.turn().T, (np.array(moved) - place) / 1e-6, atol=1e-5)
+
+
 def test_the_amplitude_is_right_after_it_and_wrong_before(band: Band) -> None:
     off = response((66.0, 44.0), 0.05)
     shift, error = amplitude_shift(off, [band])

@@ -248,14 +248,11 @@ def most_promising_ringing(
     vector = problem.parameters.vector()
     problem.clip = None
     deviations = problem.deviations(vector)
-    known = problem.derivatives(vector)
     best: tuple[ElectronicsResponse | None, float] = (None, float(deviations @ deviations))
     for frequency in frequencies_mhz:
         response = with_settings(problem.response, ringing_mhz=frequency)
         tried = problem.of(response)
-        rings = np.array([label == "ringing" for label in tried.parameters.labels])
-        slopes = tried.derivatives(tried.parameters.vector())
-        columns = np.concatenate([known, slopes[:, rings]], axis=1)
+        columns = tried.derivatives(tried.parameters.vector())
         move = np.linalg.lstsq(columns, deviations)[0]
         left = deviations - columns @ move
         if float(left @ left) < best[1]:
