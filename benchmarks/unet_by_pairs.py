@@ -73,6 +73,7 @@ def taught(
             )
     for network in networks:
         refresh_batch_statistics(network, sampler, config.statistics_batches)
+    del model.discriminator_data, model.discriminator_sim  # a training begins with new ones
     run = Run.of(
         model.eval(),
         recipe,
