@@ -44,12 +44,13 @@ def one_seed(
         how = {"recipe": load_recipe(recipe, overrides), "seed": seed}
         run = train(*files, Path(folder) / "run", **how)
         cpu = time.process_time() - before
-        how = {"truth": truth if truth.exists() and sim == stand else None, "baselines": False}
+        known = truth if truth.exists() and sim == stand else None
         drawn = [
-            numbers(evaluate(run, *files, **how, seed=seed + FAR * draw).metrics)
+            evaluate(run, *files, truth=known, baselines=False, seed=seed + FAR * draw).metrics
             for draw in range(draws)
         ]
-    means = {name: float(np.mean([one[name] for one in drawn])) for name in drawn[0]}
+    found = [numbers(metrics) for metrics in drawn]
+    means = {name: float(np.mean([one[name] for one in found])) for name in found[0]}
     width = getattr(run.recipe.generator, "width", None)
     about = dict(zip(ABOUT, (recipe, run.data.used, width, seed), strict=True))
     return about | {"seconds": run.seconds, "cpu": cpu} | means

@@ -71,8 +71,7 @@ def taught(
             print(
                 f"{step:6d} steps, {seconds:5.0f} s: L1 {float(loss.detach()):.4f}", flush=True
             )
-    for network in networks:
-        refresh_batch_statistics(network, sampler, config.statistics_batches)
+    refresh_batch_statistics(model.ren, sampler, config.statistics_batches)
     del model.discriminator_data, model.discriminator_sim  # a training begins with new ones
     run = Run.of(
         model.eval(),
