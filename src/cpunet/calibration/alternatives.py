@@ -18,7 +18,7 @@ import torch
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Values
-from cpunet.networks.response_layer import PADDING_AFTER, ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse, padding
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import current_amplitude, drift_time
 from cpunet.pulses.peaks import EnergySelection, parse_selection
@@ -196,7 +196,7 @@ def _numbers(
     windows = prepare(pulses, recipe.preparation, "simulated").pulses
     with torch.no_grad():
         records = parameters.chain.response(torch.from_numpy(windows.waveforms)).numpy()
-    records /= records[:, -PADDING_AFTER:].mean(axis=1, keepdims=True)
+    records /= records[:, -padding(pulses.dt_ns)[1] :].mean(axis=1, keepdims=True)
     ends = np.minimum(windows.waveforms, COLLECTED)
     return {
         "current_amplitude": current_amplitude(records),

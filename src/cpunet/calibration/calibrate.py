@@ -224,7 +224,7 @@ class _Job:
         # in random order, so that any first part is a representative sample
         rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
         some = replace(sim, prepared=sim.prepared[rows])
-        return cls(some, data, stored, selection, recipe, freedom, peak, seed)
+        return cls(some, data, stored, selection, recipe.at(data.dt_ns), freedom, peak, seed)
 
     def run(self, folder: Path, out: Path) -> None:
         """Calibrate detector and readout together, and write all to a folder, later `out`."""

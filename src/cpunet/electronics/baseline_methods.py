@@ -19,7 +19,7 @@ import scipy.fft
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.finishing import PADDING_BEFORE, finish, record_length
+from cpunet.electronics.finishing import finish, padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.parameters import current_amplitude, tail_slope
@@ -29,16 +29,14 @@ Values = npt.NDArray[np.float64]
 Spectrum = npt.NDArray[np.complex128]
 
 MIN_PULSES = 50  # of either dataset, for a fit
-TAIL_SHARE = 0.75  # of the samples after the alignment: 300 of 400, as in the paper
+TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
 
 
-def currents(windows: FloatArray) -> Values:
+def currents(windows: FloatArray, dt_ns: float) -> Values:
     """Charge collected per sample over the whole record, shape ``(n, record)``."""
     n, length = windows.shape
-    record = np.zeros((n, record_length(length)))
-    record[:, PADDING_BEFORE : PADDING_BEFORE + length] = np.diff(
-        windows.astype(float), axis=1, prepend=0.0
-    )
+    record, (before, _) = np.zeros((n, record_length(length, dt_ns))), padding(dt_ns)
+    record[:, before : before + length] = np.diff(windows.astype(float), axis=1, prepend=0.0)
     return record
 
 
@@ -85,12 +83,12 @@ def respond(
     Returns
     -------
     numpy.ndarray
-        Records, float32, shape ``(n, record_length(length))``.
+        Records, float32, shape ``(n, record_length(length, dt_ns))``.
     """
-    length = record_length(windows.shape[1])
+    length = record_length(windows.shape[1], dt_ns)
     records = np.empty((len(windows), length), np.float32)
     for rows in blocks(len(windows)):
-        spectrum = scipy.fft.rfft(currents(windows[rows]), axis=1) * transfer
+        spectrum = scipy.fft.rfft(currents(windows[rows], dt_ns), axis=1) * transfer
         current = scipy.fft.irfft(spectrum, length, axis=1)
         records[rows] = integrated(current, tail_slope_per_ms, dt_ns)
     return records
@@ -223,14 +221,14 @@ class BaselineMethod(ABC):
         self, waveforms: FloatArray, config: PreparationConfig
     ) -> FloatArray:
         """Windows translated and prepared like the data; a row that cannot be is NaN."""
-        windows = np.empty((len(waveforms), config.length), np.float32)
+        windows = np.empty((len(waveforms), config.at(self.dt_ns).length), np.float32)
         for rows in blocks(len(waveforms)):
             records = self.translate(waveforms[rows])
             windows[rows] = finish(records, config, dt_ns=self.dt_ns).windows
         return windows
 
 
-LONGEST = 64  # maximum tau, in samples
+LONGEST_NS = 1024.0  # maximum tau
 MAX_PULSES = 4000  # maximum number of pulses in the fit
 TOLERANCE = 1e-3  # precision of tau, in samples
 
@@ -265,8 +263,9 @@ class RC(BaselineMethod):
         """
         slope, steps = fitted_decay(sim, data, dt_ns, align, MAX_PULSES)
         wanted = most_frequent(current_amplitude(steps))
-        window = slice(PADDING_BEFORE, PADDING_BEFORE + sim.shape[1])
-        current = currents(sim[:MAX_PULSES])
+        before, longest = padding(dt_ns)[0], LONGEST_NS / dt_ns
+        window = slice(before, before + sim.shape[1])
+        current = currents(sim[:MAX_PULSES], dt_ns)
 
         def excess(tau: float) -> float:
             response = np.cumsum(_integration(current, 1 / tau), axis=1)[:, window]
@@ -275,19 +274,22 @@ class RC(BaselineMethod):
         if excess(1.0) <= 0:
             # The data rise faster than the simulation: any integration makes it worse.
             return cls(dt_ns, dt_ns, slope)
-        if excess(LONGEST) > 0:
+        if excess(longest) > 0:
             raise CpunetError(
-                f"the measured pulses rise slower than an RC of {LONGEST * dt_ns:g} ns makes "
+                f"the measured pulses rise slower than an RC of {LONGEST_NS:g} ns makes "
                 "them; check the sampling period and the pulses of both sides"
             )
-        tau = float(scipy.optimize.brentq(excess, 1.0, LONGEST, xtol=TOLERANCE))
+        tau = float(scipy.optimize.brentq(excess, 1.0, longest, xtol=TOLERANCE))
         return cls(dt_ns, tau * dt_ns, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the integration and the decay, see `BaselineMethod.translate`."""
-        records = np.empty((len(waveforms), record_length(waveforms.shape[1])), np.float32)
+        length = record_length(waveforms.shape[1], self.dt_ns)
+        records = np.empty((len(waveforms), length), np.float32)
         for rows in blocks(len(waveforms)):
-            current = _integration(currents(waveforms[rows]), self.dt_ns / self.tau_ns)
+            current = _integration(
+                currents(waveforms[rows], self.dt_ns), self.dt_ns / self.tau_ns
+            )
             records[rows] = integrated(current, self.tail_slope_per_ms, self.dt_ns)
         return records
 

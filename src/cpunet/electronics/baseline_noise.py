@@ -24,7 +24,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray, Pulses
 
-MIN_SAMPLES = 400  # of a baseline: 6.4 µs at 16 ns, a lowest frequency of 156 kHz
+MIN_NS = 6400.0  # of a baseline: a lowest frequency of 156 kHz
 TRACES = 64  # drawn at a time, to bound memory
 FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and number of iterations
 # Baselines are clustered along directions in which their band powers spread this many times
@@ -33,11 +33,16 @@ KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
 FIRST_OF_BANDS = 4  # bins below it hold residuals of the mean, and drifts
 # Below the third bin of a baseline, its mean and the window's leakage hide the spectrum.
 # There it is inferred from the structure function over the baseline's length.
-FIRST_CLEAN_BIN, RECORD_SAMPLES = 3, 8192
+FIRST_CLEAN_BIN, RECORD_NS = 3, 131_072.0
 # A line exceeds the median of the ten bins on either side by this factor. The window spreads
 # it over two bins on either side.
 LINE_HEIGHT, LINE_AROUND, LINE_HALF_WIDTH = 3.0, 10, 2
 CORNERS, LAGS = 8, 40  # Lorentzians of the slow part; lags at which the drift is compared
+
+
+def record_samples(dt_ns: float) -> int:
+    """Even number of samples of the records whose frequencies spectra have."""
+    return 2 * round(0.5 * RECORD_NS / dt_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +109,7 @@ class BaselineNoise:
         ------
         CpunetError
             If too few traces have a known energy and a flat baseline, or the
-            baselines are shorter than 400 samples.
+            baselines are shorter than `MIN_NS`.
         """
         if chosen is None:
             chosen = np.ones(len(baselines), bool)
@@ -123,11 +128,13 @@ class BaselineNoise:
             raise CpunetError(
                 "most baselines are constant: there is no noise to learn; give measured traces"
             )
-        continuum, lines = spectrum(flat)
+        continuum, lines = spectrum(flat, record_samples(dt_ns))
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
         which = _kinds(flat, mean)
         counts = np.bincount(which)
-        spectra = [spectrum(flat[which == kind]) for kind in range(len(counts))]
+        spectra = [
+            spectrum(flat[which == kind], record_samples(dt_ns)) for kind in range(len(counts))
+        ]
         kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
         return replace(
             mean,
@@ -322,10 +329,10 @@ def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> V
         )
     before = baselines.before[rows]
     length = min(int(np.quantile(before, SHORTEST_SHARE)), baselines.first.length)
-    if length < MIN_SAMPLES:
+    if (known_ns := max(length, 0) * baselines.first.dt_ns) < MIN_NS:
         raise CpunetError(
-            f"the traces have {max(length, 0)} samples before the pulse; the noise needs "
-            f"{MIN_SAMPLES} or more, so give traces with a longer baseline"
+            f"the traces have {known_ns:.0f} ns before the pulse; the noise needs {MIN_NS:.0f} "
+            "or more, so give traces with a longer baseline"
         )
     used = baselines.prepared[rows[before >= length]]
     samples = baselines.first.waveforms[used.index, :length].astype(float)
@@ -349,7 +356,7 @@ def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
     return flat
 
 
-def spectrum(baselines: Values) -> tuple[Values, Values]:
+def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     r"""Power spectrum of a set of baselines: mean square per sample and frequency bin.
 
     The Hann-windowed periodogram of the baselines :math:`x_j`,
@@ -363,12 +370,14 @@ def spectrum(baselines: Values) -> tuple[Values, Values]:
     Parameters
     ----------
     baselines
-        Baselines at any level, shape ``(n, samples)``.
+        Baselines at any level, shape ``(n, length)``.
+    samples
+        Even number of samples of the FFT whose frequencies the result has.
 
     Returns
     -------
     tuple of array
-        Continuum and lines at the frequencies of a real FFT of `RECORD_SAMPLES`. Their sum is
+        Continuum and lines at the frequencies of a real FFT of `samples`. Their sum is
         the density. A line, which the baselines do not resolve, occupies one bin.
 
     Examples
@@ -376,19 +385,19 @@ def spectrum(baselines: Values) -> tuple[Values, Values]:
     The spectrum of white noise is its variance.
 
     >>> white = np.random.default_rng(1).normal(0, 2, size=(200, 512))
-    >>> continuum, lines = spectrum(white)
+    >>> continuum, lines = spectrum(white, 8192)
     >>> bool(abs(continuum[1000:].mean() - 4) < 0.1), bool(lines.any())
     (True, False)
     """
     density = _periodogram(baselines)
-    continuum, lines = _without_lines(density, baselines.shape[1])
+    continuum, lines = _without_lines(density, baselines.shape[1], samples)
     return _with_slow_part(continuum, lines, _structure_function(baselines)), lines
 
 
-def _without_lines(density: Values, samples: int) -> tuple[Values, Values]:
+def _without_lines(density: Values, length: int, samples: int) -> tuple[Values, Values]:
     """Split a periodogram into its continuum and its lines on the grid of the records."""
     around = scipy.ndimage.median_filter(density, 2 * LINE_AROUND + 1, mode="nearest")
-    lines = np.zeros(RECORD_SAMPLES // 2 + 1)
+    lines = np.zeros(samples // 2 + 1)
     continuum = density.copy()
     bins = np.arange(len(density))
     local = scipy.ndimage.maximum_filter1d(density, 2 * LINE_HALF_WIDTH + 1) == density
@@ -397,9 +406,9 @@ def _without_lines(density: Values, samples: int) -> tuple[Values, Values]:
             continue
         near = slice(peak - LINE_HALF_WIDTH, peak + LINE_HALF_WIDTH + 1)
         excess = np.maximum(density[near] - around[near], 0)
-        centre = (excess @ bins[near]) / excess.sum() / samples
+        centre = (excess @ bins[near]) / excess.sum() / length
         # the bins of the periodogram are wider than those of the records
-        lines[round(centre * RECORD_SAMPLES)] += excess.sum() * RECORD_SAMPLES / samples
+        lines[round(centre * samples)] += excess.sum() * samples / length
         continuum[near] = np.minimum(continuum[near], around[near])
     return continuum, lines
 
@@ -433,7 +442,7 @@ def _structure_function(baselines: Values) -> Values:
 
 
 def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
-    """Continue the spectrum down to the frequencies of `RECORD_SAMPLES`.
+    """Continue the spectrum down to the frequencies of its lines.
 
     Parameters
     ----------
@@ -447,21 +456,21 @@ def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
     Returns
     -------
     array
-        Density at the frequencies of a real FFT of `RECORD_SAMPLES`. From `FIRST_CLEAN_BIN`
+        Density at the frequencies of the lines. From `FIRST_CLEAN_BIN`
         upwards it is the measured one. Below, it rises towards 0 by a non-negative sum of
         Lorentzians whose structure function is closest to `drift`.
     """
-    samples = len(drift)
-    frequency = np.arange(RECORD_SAMPLES // 2 + 1) / RECORD_SAMPLES
-    known = np.arange(len(density)) / samples
+    samples, length = 2 * (len(lines) - 1), len(drift)
+    frequency = np.arange(len(lines)) / samples
+    known = np.arange(len(density)) / length
     join = known[FIRST_CLEAN_BIN]
     fast = np.interp(frequency, known[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
-    corners = np.geomspace(2 / RECORD_SAMPLES, join, CORNERS)[:, np.newaxis]
+    corners = np.geomspace(2 / samples, join, CORNERS)[:, np.newaxis]
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
     slow = np.maximum(slow, 0)
-    lags = np.unique(np.geomspace(4, 0.9 * samples, LAGS).astype(int))
+    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
     # both signs of the frequency: a density of 1 is a mean square of 1
-    apart = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / RECORD_SAMPLES
+    apart = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
     weights = 1 / drift[lags]
     rest = (drift[lags] - apart @ (fast + lines)) * weights
     heights, _ = scipy.optimize.nnls((apart @ slow.T) * weights[:, np.newaxis], rest)

@@ -19,15 +19,21 @@ from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.preparation import Codes, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-# Samples of padding around a window, so that it can be cut anew if noise moves the maximum and
-# delayed pulses stay within the record. A window of 800 becomes a record of 1400, a fast length
-# of the FFT.
-PADDING_BEFORE, PADDING_AFTER = 200, 400
+# Padding before and after a window in ns, so that it can be cut anew and delayed pulses stay
+# within the record. A window of 800 samples of 16 ns becomes a record of 1400, a fast length of
+# the FFT.
+PADDING_NS = 3200.0, 6400.0
 
 
-def record_length(window: int) -> int:
+def padding(dt_ns: float) -> tuple[int, int]:
+    """Samples of padding before and after a window."""
+    before, after = PADDING_NS
+    return round(before / dt_ns), round(after / dt_ns)
+
+
+def record_length(window: int, dt_ns: float) -> int:
     """Number of samples of the record that a window of `window` samples becomes."""
-    return PADDING_BEFORE + window + PADDING_AFTER
+    return window + sum(padding(dt_ns))
 
 
 def extended(
@@ -72,8 +78,9 @@ def with_room(
     windows: FloatArray, config: PreparationConfig, dt_ns: float, reach: int = 0
 ) -> FloatArray:
     """Extend prepared windows to records (see `record_length`) that are longer by `reach`."""
-    before = PADDING_BEFORE + config.samples_before
-    return extended(windows, config, dt_ns, record_length(config.length) + reach, before)
+    before = padding(dt_ns)[0] + config.samples_before
+    length = record_length(config.length, dt_ns) + reach
+    return extended(windows, config, dt_ns, length, before)
 
 
 RecordNoise = BaselineNoise | TraceNoise
@@ -111,8 +118,7 @@ def finish(
 
     Noise is added to the whole record once its tail is at the level of the data's. The
     record is then prepared again, so that noise affects alignment, baseline and scale as it
-    does in the data. A pulse without decay cannot be aligned once noise is added: finish
-    it without noise.
+    does in the data.
 
     Parameters
     ----------
@@ -144,7 +150,7 @@ def finish(
             "take it from the data of the fit"
         )
     # A noise-free record may have equal samples at its top; none of them is clipped.
-    config = config.model_copy(update={"saturation_run": records.shape[1] + 1})
+    config = config.at(dt_ns).model_copy(update={"saturation_run": records.shape[1] + 1})
     rng, n = np.random.default_rng(seed), len(records)
     windows = np.full((n, config.length), np.nan, np.float32)
     noisy = windows if noise is None else windows.copy()

@@ -33,7 +33,7 @@ from cpunet.electronics.baseline_methods import (
     fitted_tail_slope,
     respond,
 )
-from cpunet.electronics.finishing import PADDING_BEFORE, record_length
+from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import last_below
@@ -139,9 +139,8 @@ def superpulses(spectra: Spectrum, steps: Values, groups: Groups) -> Superpulses
 # maximum number of pulses of either dataset in the fit of sigma and tau, and its iterations,
 # each with slices from the response fitted so far
 GAUSS_PULSES, GAUSS_ROUNDS = 2000, 3
-EDGE = 96  # samples compared before and after the half maximum
-START = 2.0  # initial sigma and tau, in samples
-LONGEST = 64.0  # maximum sigma and tau, in samples
+# Time compared before and after the half maximum; initial and maximum sigma and tau.
+EDGE_NS, START_NS, LONGEST_NS = 1536.0, 32.0, 1024.0
 
 
 @dataclass(frozen=True)
@@ -167,13 +166,15 @@ class GaussExp(BaselineMethod):
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
         """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
         slope, steps = fitted_decay(sim, data, dt_ns, align, GAUSS_PULSES)
-        measured = currents(steps)
-        length = record_length(sim.shape[1])
+        measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
+        length = record_length(sim.shape[1], dt_ns)
         of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
-        wanted = _mean_currents(of_data, slices(measured), length)
-        spectra = np.asarray(scipy.fft.rfft(currents(sim[:GAUSS_PULSES]), axis=1), complex)
+        wanted = _mean_currents(of_data, slices(measured), length, edge)
+        spectra = np.asarray(
+            scipy.fft.rfft(currents(sim[:GAUSS_PULSES], dt_ns), axis=1), complex
+        )
 
-        best = np.array([START, START])
+        best = np.array([START_NS, START_NS]) / dt_ns
         for _ in range(GAUSS_ROUNDS):
             transfer = _gauss_exp(length, 1.0, best[0], best[1])
             groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
@@ -186,17 +187,17 @@ class GaussExp(BaselineMethod):
                 parameters: Values, sliced: Spectrum = sliced, places: Groups = places
             ) -> Values:
                 response = sliced * _gauss_exp(length, 1.0, parameters[0], parameters[1])
-                return (_mean_currents(response, places, length) - wanted).ravel()
+                return (_mean_currents(response, places, length, edge) - wanted).ravel()
 
             best = scipy.optimize.least_squares(
-                residual, best, bounds=(0.0, LONGEST), diff_step=1e-3, xtol=1e-4
+                residual, best, bounds=(0.0, LONGEST_NS / dt_ns), diff_step=1e-3, xtol=1e-4
             ).x
         sigma, tau = (best * dt_ns).tolist()
         return cls(dt_ns, sigma, tau, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
-        length = record_length(waveforms.shape[1])
+        length = record_length(waveforms.shape[1], self.dt_ns)
         transfer = _gauss_exp(length, self.dt_ns, self.sigma_ns, self.tau_ns)
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
 
@@ -208,18 +209,19 @@ def _gauss_exp(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spe
     return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
 
 
-def _mean_currents(spectra: Spectrum, groups: Groups, length: int) -> Values:
-    """Superpulses of currents around the half maximum, shape ``(slices, 2 * EDGE)``."""
+def _mean_currents(spectra: Spectrum, groups: Groups, length: int, edge: int) -> Values:
+    """Superpulses of currents around the half maximum, shape ``(slices, 2 * edge)``."""
     steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
     means = superpulses(spectra, steps, groups)
-    around = np.roll(scipy.fft.irfft(means.spectra, length, axis=1), EDGE, axis=1)
-    return np.asarray(around[:, : 2 * EDGE], float)
+    around = np.roll(scipy.fft.irfft(means.spectra, length, axis=1), edge, axis=1)
+    return np.asarray(around[:, : 2 * edge], float)
 
 
 # the same of the free kernel, whose iterations take half maxima of the response found so far
 FREE_PULSES, FREE_ROUNDS = 4000, 4
-LEAD, LAG = 32, 256  # samples of the kernel before and after the half maximum
-FADE_IN, FADE_OUT = 8, 64  # samples over which the ends of the kernel are tapered
+# The kernel before and after the half maximum, and where its ends are tapered.
+LEAD_NS, LAG_NS = 512.0, 4096.0
+FADE_IN_NS, FADE_OUT_NS = 128.0, 1024.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +237,7 @@ class SuperpulseKernel(BaselineMethod):
     Parameters
     ----------
     kernel
-        Weights with a sum of 1: `LEAD` samples before zero delay and `LAG` from it on.
+        Weights with a sum of 1: `LEAD_NS` before zero delay and `LAG_NS` from it on.
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms.
     """
@@ -248,29 +250,31 @@ class SuperpulseKernel(BaselineMethod):
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
         """Divide the mean spectra, see `BaselineMethod.fit`."""
         slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
-        length = record_length(sim.shape[1])
-        current = currents(steps)
+        length, lead = record_length(sim.shape[1], dt_ns), round(LEAD_NS / dt_ns)
+        current = currents(steps, dt_ns)
         wanted = _superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
 
-        spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES]), axis=1))
-        kernel = np.zeros(LEAD + LAG)
-        kernel[LEAD] = 1.0
+        spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES], dt_ns), axis=1))
+        kernel = np.zeros(lead + round(LAG_NS / dt_ns))
+        kernel[lead] = 1.0
         for _ in range(FREE_ROUNDS):
             # The simulated pulses are placed by the half maximum of their response. A shift
             # of their own half maximum does not give this exactly.
-            response = scipy.fft.irfft(spectra * _transfer(kernel, length), length, axis=1)
-            kernel = _kernel(wanted, _superpulses(spectra, response), length)
+            response = scipy.fft.irfft(
+                spectra * _transfer(kernel, lead, length), length, axis=1
+            )
+            kernel = _kernel(wanted, _superpulses(spectra, response), length, dt_ns)
         found = cls(dt_ns, kernel, slope)
         # subtract the contribution of the kernel's late part to the tail slope from the decay
-        windows = found.translate(sim[:FREE_PULSES])[
-            :, PADDING_BEFORE : PADDING_BEFORE + sim.shape[1]
-        ]
+        before = padding(dt_ns)[0]
+        windows = found.translate(sim[:FREE_PULSES])[:, before : before + sim.shape[1]]
         excess = fitted_tail_slope(windows, dt_ns, align) - slope
         return replace(found, tail_slope_per_ms=slope - excess)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
-        transfer = _transfer(self.kernel, record_length(waveforms.shape[1]))
+        length = record_length(waveforms.shape[1], self.dt_ns)
+        transfer = _transfer(self.kernel, round(LEAD_NS / self.dt_ns), length)
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
 
     def describe(self) -> Mapping[str, float]:
@@ -279,7 +283,7 @@ class SuperpulseKernel(BaselineMethod):
         mean = float(self.kernel @ time)
         variance = float(self.kernel @ (time - mean) ** 2)
         return {
-            "kernel_mean_ns": mean - LEAD * self.dt_ns,
+            "kernel_mean_ns": mean - LEAD_NS,
             "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
             "tail_slope_per_ms": self.tail_slope_per_ms,
         }
@@ -290,15 +294,18 @@ def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
     return superpulses(spectra, np.cumsum(response, axis=1), slices(response))
 
 
-def _kernel(data: Superpulses, sim: Superpulses, length: int) -> Values:
+def _kernel(data: Superpulses, sim: Superpulses, length: int, dt_ns: float) -> Values:
     """Regularised ratio as weights around zero delay with a sum of 1."""
     power = (np.abs(data.spectra) ** 2).sum(axis=0)
     wiener = np.clip(1 - data.error.sum(axis=0) / power, 0, 1)
     below = (np.abs(sim.spectra) ** 2 + sim.error).sum(axis=0)
     ratio = wiener * (data.spectra * sim.spectra.conj()).sum(axis=0) / below
-    weights = np.roll(scipy.fft.irfft(ratio, length), LEAD)[: LEAD + LAG]
-    weights[:FADE_IN] *= _fade(FADE_IN)
-    weights[-FADE_OUT:] *= _fade(FADE_OUT)[::-1]
+    lead, lag, fade_in, fade_out = (
+        round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
+    )
+    weights = np.roll(scipy.fft.irfft(ratio, length), lead)[: lead + lag]
+    weights[:fade_in] *= _fade(fade_in)
+    weights[-fade_out:] *= _fade(fade_out)[::-1]
     return np.asarray(weights / weights.sum(), float)
 
 
@@ -306,10 +313,10 @@ def _fade(samples: int) -> Values:
     return np.asarray(np.sin(0.5 * np.pi * (np.arange(samples) + 0.5) / samples) ** 2, float)
 
 
-def _transfer(kernel: Values, length: int) -> Spectrum:
+def _transfer(kernel: Values, lead: int, length: int) -> Spectrum:
     around_zero = np.zeros(length)
     around_zero[: len(kernel)] = kernel
-    return np.asarray(scipy.fft.rfft(np.roll(around_zero, -LEAD)), complex)
+    return np.asarray(scipy.fft.rfft(np.roll(around_zero, -lead)), complex)
 
 
 BASELINE_METHODS: dict[str, type[BaselineMethod]] = {

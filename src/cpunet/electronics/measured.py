@@ -8,7 +8,7 @@ import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise, passing
-from cpunet.electronics.finishing import PADDING_BEFORE
+from cpunet.electronics.finishing import padding
 from cpunet.electronics.pile_up_tails import PileUpTails, TailsInfo
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
@@ -85,9 +85,8 @@ def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) ->
         Preparation of the pulses.
     """
     windows, whole = data.prepared.pulses.waveforms, _baselines(data).whole
-    begins = (
-        float(np.median(data.prepared.align_sample)) - config.samples_before - PADDING_BEFORE
-    )
+    before = config.at(data.dt_ns).samples_before + padding(data.dt_ns)[0]
+    begins = float(np.median(data.prepared.align_sample)) - before
     passed = None
     if data.cuts is not None and whole is not None and tails.law is not None:
         passed = passing(tails, whole, config, data.cuts)
@@ -128,7 +127,7 @@ def measured_noise(
     try:
         return noise_of(data, tails), None
     except CpunetError as error:
-        half = config.baseline_samples // 2
+        half = config.at(data.dt_ns).baseline_samples // 2
         noise = BaselineNoise.from_windows(data.prepared.pulses, half)
         return noise, f"noise is taken from {half} samples a pulse: {error}"
 

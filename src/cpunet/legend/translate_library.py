@@ -46,7 +46,7 @@ from cpunet.legend.library_files import (
     put_column,
     require_complete,
 )
-from cpunet.networks.response_layer import PADDING_BEFORE
+from cpunet.networks.response_layer import padding
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, blocks
@@ -89,7 +89,8 @@ class TemplateTranslator:
     def __call__(self, templates: FloatArray) -> FloatArray:
         """Translate templates of charge, 0 before it moves, shape (n, samples)."""
         results = np.empty(templates.shape, np.float32)
-        inside = slice(PADDING_BEFORE, PADDING_BEFORE + templates.shape[1])
+        before = padding(float(self._chain.response.dt_ns))[0]
+        inside = slice(before, before + templates.shape[1])
         with torch.inference_mode():
             for rows in blocks(len(templates), BATCH):
                 charge = torch.from_numpy(np.ascontiguousarray(templates[rows], np.float32))

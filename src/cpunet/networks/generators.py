@@ -8,13 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cpunet.electronics.baseline_noise import KINDS, BaselineNoise
+from cpunet.electronics.baseline_noise import KINDS, BaselineNoise, record_samples
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import LearnedConfig, MatchingConfig, ResponseConfig
-
-NOISE_BINS = 4097  # in a spectrum as measured by `BaselineNoise`
 
 
 class KeptNoise(nn.Module):
@@ -34,9 +32,10 @@ class KeptNoise(nn.Module):
     def __init__(self, dt_ns: float) -> None:
         super().__init__()
         self._dt_ns = float(dt_ns)
+        bins = record_samples(dt_ns) // 2 + 1
         # (prepared units x keV)^2, see `BaselineNoise`; kinds that are absent have a share of 0
         for name in ("noise_continua", "noise_lines"):
-            self.register_buffer(name, torch.zeros(KINDS, NOISE_BINS))
+            self.register_buffer(name, torch.zeros(KINDS, bins))
         self.register_buffer("noise_shares", torch.zeros(KINDS, dtype=torch.float64))
         self.register_buffer("n_baselines", torch.zeros((), dtype=torch.long))
 
@@ -47,7 +46,7 @@ class KeptNoise(nn.Module):
 
     def set_noise(self, noise: BaselineNoise) -> None:
         """Store a measured spectrum."""
-        one = noise.density_of(2 * (NOISE_BINS - 1))[np.newaxis]
+        one = noise.density_of(record_samples(self._dt_ns))[np.newaxis]
         continua = one if noise.kinds is None else noise.kinds
         lines = np.zeros_like(continua) if noise.lines is None else noise.lines
         shares = np.ones(1) if noise.shares is None else noise.shares
@@ -70,7 +69,7 @@ class KeptNoise(nn.Module):
         )
         return BaselineNoise(
             shares @ (continua + lines),
-            2 * (NOISE_BINS - 1),
+            record_samples(self._dt_ns),
             self.noise_dt_ns,
             int(self.n_baselines),
             continua,
@@ -79,7 +78,7 @@ class KeptNoise(nn.Module):
         )
 
 
-AFTER = 170  # samples from the half maximum until charge and slow response have arrived
+AFTER_NS = 2720.0  # from the half maximum until charge and slow response have arrived
 MIN_LEVEL = 1e-3  # below it, there is no pulse
 
 
@@ -117,7 +116,7 @@ class LinearInverse(nn.Module):
         super().__init__()
         self.length = length
         self.before, stop = config.baseline
-        self.after = min(AFTER, config.after)
+        self.after = min(config.samples(AFTER_NS), config.after)
         self.baseline = (-self.before, -stop)
         self.level = (config.after - config.level_samples, config.after)
         n = self.before + self.after

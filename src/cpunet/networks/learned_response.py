@@ -22,7 +22,7 @@ import scipy.special
 import torch
 from torch import Tensor, nn
 
-from cpunet.electronics.finishing import PADDING_BEFORE
+from cpunet.electronics.finishing import padding
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_layer import (
     MIN_FACTOR,
@@ -133,7 +133,7 @@ class StepResponse(Readout):
 
     def transfer(self, padded: int) -> Tensor:
         """Response to a step of charge at sample 0, as a spectrum of `padded` samples."""
-        step = self.step(int(padded / MIN_FACTOR) - PADDING_BEFORE)
+        step = self.step(int(padded / MIN_FACTOR) - padding(float(self.dt_ns))[0])
         before = -int(self.lags[0])
         gap = step.new_zeros(padded - len(step))
         # times before 0 stand at the end

@@ -15,12 +15,11 @@ import scipy.fft
 import torch
 from torch import Tensor, nn
 
-from cpunet.electronics.finishing import PADDING_AFTER as PADDING_AFTER
-from cpunet.electronics.finishing import PADDING_BEFORE as PADDING_BEFORE
+from cpunet.electronics.finishing import padding as padding
 from cpunet.electronics.finishing import record_length as record_length
 from cpunet.recipes.schema import ResponseConfig
 
-# Fractions of the final charge at which collection begins and, as pulses are aligned, ends.
+# Fractions of the final charge at which collection begins and ends.
 BEGIN, END = 1e-6, 0.999
 LONGEST_US = 3.0  # time before the end from which the factor is constant
 MIN_STRETCH = 0.2
@@ -162,13 +161,13 @@ class Readout(nn.Module):
         Returns
         -------
         Tensor
-            Shape (batch, PADDING_BEFORE + samples + PADDING_AFTER).
+            Shape (batch, record_length).
         """
-        length = record_length(windows.shape[1])
+        length = record_length(windows.shape[1], dt_ns := float(self.dt_ns))
         padded = padded_length(length)
         windows = self.drifted(windows)
         transfer = self.transfer(padded).to(torch.complex64)
-        spectrum = current_spectrum(windows, padded) * transfer
+        spectrum = current_spectrum(windows, padded, dt_ns) * transfer
         signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
         return signal
 
@@ -221,7 +220,7 @@ class ElectronicsResponse(Readout):
     >>> complex(response.bandwidth(torch.tensor([1j / 64]))[0].detach())
     (0.5-0.5j)
     >>> step = (torch.arange(800) >= 400).float()[None]
-    >>> record = response(step)[0].detach()[PADDING_BEFORE + 400 :]
+    >>> record = response(step)[0].detach()[padding(16)[0] + 400 :]
     >>> round(float(record[200] / record[100]), 5), round(math.exp(-1.6 / 100), 5)
     (0.98413, 0.98413)
     """
@@ -276,7 +275,7 @@ class ElectronicsResponse(Readout):
         everywhere = frequency + image  # (images, frequencies), in units of 1/period
         passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
         fast = (_spline(everywhere) * passed).sum(dim=0)
-        kept = math.ceil(padded / MIN_FACTOR - PADDING_BEFORE)
+        kept = math.ceil(padded / MIN_FACTOR) - padding(float(dt_ns))[0]
         time_us = torch.arange(kept, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
         whole: Tensor = fast * torch.fft.rfft(self.decay(time_us), padded)
         return whole
@@ -356,10 +355,10 @@ def _spline(frequency: Tensor) -> Tensor:
     return spline
 
 
-def current_spectrum(windows: Tensor, padded: int) -> Tensor:
+def current_spectrum(windows: Tensor, padded: int, dt_ns: float) -> Tensor:
     """Spectra of the current of windows (..., samples) within records."""
     current = torch.diff(windows, dim=-1, prepend=torch.zeros_like(windows[..., :1]))
-    current = nn.functional.pad(current, (PADDING_BEFORE, 0))
+    current = nn.functional.pad(current, (padding(dt_ns)[0], 0))
     spectrum: Tensor = torch.fft.rfft(current, padded)
     return spectrum
 

@@ -189,32 +189,39 @@ def tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
 # Stable rejection codes; `preparation.Rejection` names them.
 ACCEPTED, NAN, CONSTANT, SATURATED = range(4)
 WINDOW_OUTSIDE_RECORD, NO_AMPLITUDE, TAIL_NOT_POSITIVE = range(4, 7)
+PULSE_AT_EDGE, NO_PLATEAU, SECOND_PULSE = range(7, 10)
 
 # Columns of the table of numbers kept for each pulse.
 BASELINE, SCALE, ALIGN_SAMPLE, BASELINE_RMS, BASELINE_SLOPE, TAIL_SLOPE, CHI2 = range(7)
 
-# The alignment moves the baseline window, and the baseline moves the 99.9 % threshold by
-# a thousandth of its own change.  Two rounds settle all but exact ties.
+# The alignment moves the window of the baseline, and this the level at which it is searched.
+# Two rounds settle all but exact ties.
 _ROUNDS = 4
 # If the first sample is at most this many times the rise to the second, it is charge that moved
 # within that sample: for a constant current, its mean in the first period is half the rise.
 _MAX_FIRST = 2.0
 # A pulse has begun where it exceeds a hundredth of its height and is clear of the noise.  The
-# baseline ends some samples earlier, since the rise starts below that threshold.
-_BEGUN_FRACTION, _BEGUN_RMS, _BEGUN_MARGIN = 0.01, 8.0, 16
-# In a thousand samples, noise alone reaches a maximum of three to four RMS.
-_MIN_AMPLITUDE_RMS = 8.0
-# Values that differ by float32 rounding, in units of the amplitude, count as equal.
-_ROUNDING = 2.0 * 2.0**-23
+# baseline ends somewhat earlier, since the rise starts below that threshold.
+_BEGUN_FRACTION, _BEGUN_RMS, BEGUN_MARGIN_NS = 0.01, 8.0, 256.0
+# In a thousand samples, noise alone reaches a maximum of three to four RMS; so much above that
+# is a pulse.
+_MIN_TOP_RMS, _MIN_HEIGHT_RMS = 8.0, 5.0
+# A tail that rises by so much, in heights and in RMS, is no plateau.
+_MAX_RISE, _MAX_RISE_RMS = 0.1, 4.0
+# Values that differ by float32 rounding, in units of the amplitude, count as equal; and a
+# crossing as of a sample that is as near but for rounding.
+_ROUNDING, _NEAREST = 2.0 * 2.0**-23, 0.501
+# Noise is averaged over this time before a pulse is searched.
+SMOOTHED_NS = 480.0
 
 
 class Settings(NamedTuple):
-    """The preparation settings in the form that the compiled loop accepts."""
+    """The preparation settings in the form that the compiled loop accepts, in samples."""
 
     simulated: bool
     samples_before: int
     samples_after: int
-    align_fraction: float
+    align_fraction: float  # of the maximum; 0 for half of the height
     baseline_samples: int
     tail_samples: int
     tail_level: float
@@ -222,6 +229,8 @@ class Settings(NamedTuple):
     max_padding_before: int
     max_padding_after: int
     saturation_run: int
+    smoothed: int
+    begun_margin: int
 
 
 @compiled
@@ -292,6 +301,102 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _smooth(trace, half, smooth):  # type: ignore[no-untyped-def]
+    """Means over the samples up to `half` away; fewer at the ends of the trace."""
+    length = len(trace)
+    total, first, stop = 0.0, 0, 0
+    for i in range(length):
+        while stop < min(i + half + 1, length):
+            total += trace[stop]
+            stop += 1
+        while first < i - half:
+            total -= trace[first]
+            first += 1
+        smooth[i] = total / (stop - first)
+
+
+@compiled
+def _level_at(trace, align, s):  # type: ignore[no-untyped-def]
+    """Base, height and rise of the tail of a pulse that is aligned at a sample.
+
+    The height is that of a straight line through the tail at the alignment: a decay takes
+    nothing from it, and noise moves it little.
+    """
+    length, start, stop = len(trace), align - s.samples_before, align + s.samples_after
+    if s.simulated:
+        base = _charge_before(trace, start, min(stop, length))
+    else:
+        first, last = _baseline_stretch(length, start, s)
+        base = mean_of(trace[first:last])
+    n = s.decay_fit_samples
+    centre, total, moment = 0.5 * (n - 1), 0.0, 0.0
+    for k in range(n):
+        value = np.float64(trace[max(min(stop - n + k, length - 1), 0)])
+        total += value
+        moment += (k - centre) * value
+    slope = moment / (n * (n * n - 1.0) / 12.0)
+    height = total / n + slope * (align - (stop - n + centre)) - base
+    return base, height, slope * n
+
+
+@compiled
+def _half_crossing(trace, smooth, align, level, s):  # type: ignore[no-untyped-def]
+    """Time in samples at which a pulse passes a level, searched backward from its plateau.
+
+    The averaged trace decides which of several crossings by noise is meant.
+    """
+    length = len(trace)
+    near = min(align + s.samples_after - s.decay_fit_samples, length - 1)
+    while near >= 0 and smooth[near] >= level:
+        near -= 1
+    sample = min(near + s.smoothed + 1, length - 1)
+    while sample >= 0 and trace[sample] >= level:
+        sample -= 1
+    if sample < 0:
+        return 0.0  # charge that moved within the first sample
+    if sample == length - 1:
+        return float(length)
+    low, high = np.float64(trace[sample]), np.float64(trace[sample + 1])
+    return sample + (level - low) / (high - low)
+
+
+@compiled
+def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
+    """The sample nearest to the crossing of half the height, base, height and rise."""
+    length = len(trace)
+    _smooth(trace, s.smoothed, smooth)
+    if length == s.samples_before + s.samples_after:  # prepared already?
+        align = s.samples_before
+        base, height, rise = _level_at(trace, align, s)
+        if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < _NEAREST:
+            return align, base, height, rise
+    top = highest_of(smooth)
+    top_sample = first_at(smooth, top)
+    base = np.float64(lowest_of(smooth))
+    if not s.simulated:
+        base = mean_of(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
+    align = crossing(smooth, top_sample, base + 0.5 * (top - base))
+    for _ in range(_ROUNDS):
+        base, height, rise = _level_at(trace, align, s)
+        time = _half_crossing(trace, smooth, align, base + 0.5 * height, s)
+        if abs(time - align) < _NEAREST:
+            break
+        align = math.floor(time + 0.5)
+    return align, base, height, rise
+
+
+@compiled
+def _jumps(smooth, align, rise, s):  # type: ignore[no-untyped-def]
+    """Whether most of the rise of a tail is within the time over which noise is averaged."""
+    apart = 2 * s.smoothed + 1
+    first = max(align + s.samples_after - s.decay_fit_samples, 0)
+    for i in range(first, min(align + s.samples_after, len(smooth)) - apart):
+        if smooth[i + apart] - smooth[i] > 0.5 * rise:
+            return True
+    return False
+
+
+@compiled
 def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-def]
     """The `baseline_samples` of the record before the pulse begins; at least three.
 
@@ -302,7 +407,7 @@ def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-d
     level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
     begun = crossing(trace, min(align, len(trace) - 1), level)
     middle = align - s.samples_before + s.baseline_samples // 2
-    stop = min(max(begun - _BEGUN_MARGIN, middle, 3), len(trace))
+    stop = min(max(begun - s.begun_margin, middle, 3), len(trace))
     return max(stop - s.baseline_samples, 0), stop
 
 
@@ -319,7 +424,7 @@ def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-def]
+def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-untyped-def]
     """Fill `window` and `numbers` from one trace and return its code."""
     if not all_finite(trace):
         return NAN
@@ -331,7 +436,12 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
     if not s.simulated and is_saturated(trace, quiet, top, top_sample, s.saturation_run):
         return SATURATED
 
-    align, base, top = _aligned(trace, top, top_sample, s)
+    if s.align_fraction == 0:
+        align, base, height, rise = _aligned_half(trace, smooth, s)
+        top = np.float64(highest_of(trace[: min(align + s.samples_after, length)]))
+    else:
+        align, base, top = _aligned(trace, top, top_sample, s)
+        height, rise = top - base, 0.0
     start = align - s.samples_before
     stop = align + s.samples_after
     first, last = _baseline_stretch(length, start, s)
@@ -340,18 +450,21 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
         scale = top - base
     else:
         quietest = quietest_rms(trace[first:last])
-        if top - mean < _MIN_AMPLITUDE_RMS * quietest:
+        if height < (_MIN_HEIGHT_RMS if s.align_fraction == 0 else _MIN_TOP_RMS) * quietest:
             return NO_AMPLITUDE
         first, last = _before_pulse(trace, align, mean, top, quietest, s)
         _, slope, rms = line(trace[first:last])
-        if start < -s.max_padding_before or stop > length + s.max_padding_after:
-            return WINDOW_OUTSIDE_RECORD
-        if start + s.baseline_samples <= 0:  # no samples for the baseline
-            return WINDOW_OUTSIDE_RECORD
+        # no samples for the baseline, or more to fill in than is allowed
+        before = min(s.max_padding_before, s.baseline_samples - 1)
+        if start < -before or stop > length + s.max_padding_after:
+            short = length + before + s.max_padding_after < len(window)
+            return WINDOW_OUTSIDE_RECORD if short else PULSE_AT_EDGE
         base = mean
         scale = (tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
-        if not scale > 0:
-            return NO_AMPLITUDE
+        if rise > max(_MAX_RISE * height, _MAX_RISE_RMS * quietest):
+            return SECOND_PULSE if _jumps(smooth, align, rise, s) else NO_PLATEAU
+    if not scale > 0:
+        return NO_AMPLITUDE
 
     _fill(trace, start, base, scale, window)
     tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
@@ -366,10 +479,10 @@ def _prepare_one(trace, s, window, numbers, logs):  # type: ignore[no-untyped-de
 @compiled
 def _prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
     """Prepare all traces; accepted ones fill the first rows.  Return how many there are."""
-    logs = np.empty(s.decay_fit_samples)
+    logs, smooth = np.empty(s.decay_fit_samples), np.empty(waveforms.shape[1])
     kept = 0
     for i in range(len(waveforms)):
-        codes[i] = _prepare_one(waveforms[i], s, windows[kept], numbers[kept], logs)
+        codes[i] = _prepare_one(waveforms[i], s, windows[kept], numbers[kept], logs, smooth)
         kept += codes[i] == ACCEPTED
     return kept
 

@@ -17,8 +17,8 @@ TRACES = 16384  # whose baselines are kept
 WHOLE = 1024  # traces of the selected energies that are kept as a whole
 SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
 KEPT_SHARE = 0.5  # the same for those kept, since those of some of the traces may be longer
-# Threshold of the start of a pulse, and samples before it in which the pulse may already rise.
-START_FRACTION, START_SIGMAS, MARGIN = 0.01, 8.0, 60
+# Threshold of the start of a pulse, and time before it in which the pulse may already rise.
+START_FRACTION, START_SIGMAS, MARGIN_NS = 0.01, 8.0, 960.0
 
 Rows = npt.NDArray[np.int64]
 
@@ -109,9 +109,12 @@ class Baselines:
 
 def samples_before_pulses(prepared: Prepared, config: PreparationConfig) -> Rows:
     """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
+    config = config.at(prepared.pulses.dt_ns)
     windows = prepared.pulses.waveforms[:, : config.samples_before]
     level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
     above = windows >= level[:, np.newaxis]
     # Start of the pulse proper: every sample from there to the alignment is above threshold.
     start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
-    return np.asarray(prepared.align_sample - config.samples_before + start - MARGIN)
+    return np.asarray(
+        prepared.align_sample - config.samples_before + start - config.samples(MARGIN_NS)
+    )

@@ -54,7 +54,7 @@ def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
     kev_per_adc = whole.energy_kev[is_pulse] / amplitude(traces)
     if np.isfinite(kev_per_adc).sum() >= MIN_NUMBER:
         noise += f", {noise_adc * float(np.nanmedian(kev_per_adc)):.3g} keV"
-    slope = _tail_slope(traces, config) * 1e3 / whole.dt_ns
+    slope = _tail_slope(traces, config.at(whole.dt_ns)) * 1e3 / whole.dt_ns
     return [
         ("decay", f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"),
         ("noise", f"{noise} (RMS of a baseline, median)"),

@@ -301,6 +301,7 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     source = file.open()
+    recipe = recipe.at(source.dt_ns)
     seen = Seen(source, side, recipe.preparation, insist=file.insist)
     try:
         prepared = load_prepared(

@@ -247,7 +247,9 @@ def pulse_parameters(
     return {
         "current_amplitude": current_amplitude(waveforms),
         "drift_time": drift_time(waveforms, pulses.dt_ns, scores.drift_start_fraction),
-        "tail_slope": tail_slope(waveforms, pulses.dt_ns, preparation.decay_fit_samples),
+        "tail_slope": tail_slope(
+            waveforms, pulses.dt_ns, preparation.at(pulses.dt_ns).decay_fit_samples
+        ),
     }
 
 

@@ -1,8 +1,15 @@
 """From raw traces to the aligned, normalised windows that a network sees, and quality cuts.
 
 The definition follows the paper (Bhimani et al. 2026, section 3.3).  Measured traces
-are aligned at 99.9 % of their maximum, baseline-subtracted and scaled to a fixed level
-of their last samples.  Simulated pulses are aligned in the same way and scaled to 0…1.
+are aligned, baseline-subtracted and scaled to a fixed level of their last samples.  Simulated
+pulses are aligned in the same way and scaled to 0…1.
+
+The paper aligns at 99.9 % of the maximum.  On a flat, noisy top that is wherever noise peaks:
+at 200 keV a fifth of the windows begin inside the pulse.  Half of the height is where a pulse
+is steep.  The height is that of a straight line through the tail, continued to the alignment:
+hundreds of samples average the noise, and a decay takes nothing from it.  A search in a trace
+averaged over half a microsecond decides which of several crossings is meant; its time is
+interpolated in the trace itself.
 Nothing is skipped silently: each trace gets a `Rejection`.
 
 Quality cuts remove pile-up, decaying baselines and outliers (same section).  Each cut window is
@@ -53,6 +60,9 @@ class Rejection(IntEnum):
     WINDOW_OUTSIDE_RECORD = _kernels.WINDOW_OUTSIDE_RECORD
     NO_AMPLITUDE = _kernels.NO_AMPLITUDE
     TAIL_NOT_POSITIVE = _kernels.TAIL_NOT_POSITIVE
+    PULSE_AT_EDGE = _kernels.PULSE_AT_EDGE
+    NO_PLATEAU = _kernels.NO_PLATEAU
+    SECOND_PULSE = _kernels.SECOND_PULSE
     ENERGY_UNKNOWN = 16
     ENERGY_OUTSIDE_SELECTION = 17
     NOT_DRAWN = 18
@@ -178,23 +188,35 @@ class Prepared:
 _PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name != "codes")
 
 
+_IN_SAMPLES = (
+    "samples_before",
+    "samples_after",
+    "baseline_samples",
+    "tail_samples",
+    "tail_level",
+    "decay_fit_samples",
+    "saturation_run",
+)
+
+
 def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     """Align, cut out and normalise every pulse (paper, section 3.3).
 
-    The window is placed so that its sample ``samples_before`` is the first one after the
-    last sample below ``align_fraction`` of the maximum.  From a *measured* window the mean
+    The window is placed so that its sample ``samples_before`` is the one nearest to the
+    crossing of half the height, or the first one after the last sample below a fraction of the
+    maximum, see `PreparationConfig`.  From a *measured* window the mean
     of its first ``baseline_samples`` is subtracted, and it is scaled so that its last
     ``tail_samples`` average ``tail_level``.  A *simulated* window is scaled so that its
     lowest and highest values are 0 and 1.  The window is padded with 0 before the record and
     with the record's last value after it; measured windows that need more padding than the
-    ``max_padding`` settings allow are rejected.  Preparing prepared pulses changes nothing.
+    settings allow are rejected.  Preparing prepared pulses changes nothing.
 
     Parameters
     ----------
     pulses
         Raw traces of any length, in any units.
     config
-        Preparation settings: lengths in samples, fractions and levels.
+        Preparation settings.
     kind
         Normalisation: ``"measured"`` or ``"simulated"``.
 
@@ -212,9 +234,9 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     --------
     >>> from cpunet.recipes.schema import PreparationConfig
     >>> config = PreparationConfig(
-    ...     samples_before=4, samples_after=4, align_fraction=0.999, baseline_samples=2,
-    ...     tail_samples=1, tail_level=0.8, decay_fit_samples=3, max_padding_before=0,
-    ...     max_padding_after=0, saturation_run=4)
+    ...     before_ns=64, after_ns=64, align_at=0.999, baseline_ns=32, tail_ns=16,
+    ...     tail_level=0.8, decay_fit_ns=48, padding_before_ns=0, padding_after_ns=0,
+    ...     saturation_run=4)
     >>> raw = Pulses.of([[0, 0.5, 2, 2, 2], [1, 1, 1, 1, 1]], dt_ns=16)
     >>> prepared = prepare(raw, config, "simulated")
     >>> prepared.pulses.waveforms.tolist()
@@ -224,9 +246,15 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     """
     if pulses.length == 0:
         raise CpunetError("the pulses have no samples; give traces of at least one sample")
+    config = config.at(pulses.dt_ns)
     settings = _kernels.Settings(
         simulated=kind == "simulated",
-        **config.model_dump(include=set(_kernels.Settings._fields)),
+        align_fraction=0.0 if config.align_at == "half_height" else config.align_at,
+        max_padding_before=config.samples(config.padding_before_ns),
+        max_padding_after=config.samples(config.padding_after_ns),
+        smoothed=config.samples(0.5 * _kernels.SMOOTHED_NS),
+        begun_margin=config.samples(_kernels.BEGUN_MARGIN_NS),
+        **{name: getattr(config, name) for name in _IN_SAMPLES},
     )
     codes, windows, numbers = _kernels.prepare_block(pulses.waveforms, settings)
     rows = np.flatnonzero(codes == Rejection.ACCEPTED)

@@ -94,6 +94,7 @@ def all_parameters(
     >>> found["rise_10_90"].round(3), found["effective_drift_time"].round(1)
     (array([1280.]), array([784.1]))
     """
+    preparation = preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:
         raise CpunetError(
             f"the pulses have {pulses.length} samples and prepared ones "

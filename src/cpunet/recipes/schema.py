@@ -1,12 +1,14 @@
 """Every setting of a run, validated: one small class per part of a recipe.
 
 The values are in the YAML files next to this module.  A missing field is an error,
-and so is an unknown one.
+and so is an unknown one.  Times are in ns, so that a recipe means the same at any sampling
+period; `Recipe.at` makes numbers of samples of them.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple
+import math
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -21,6 +23,29 @@ def _rising(ends: tuple[float, float]) -> tuple[float, float]:
     if not ends[0] < ends[1]:
         raise ValueError("must go from a lower to a higher value")
     return ends
+
+
+class Timed(Config):
+    """Settings with times, which are numbers of samples at a sampling period.
+
+    ``dt_ns`` is no setting: `at` gives it, and it is not stored.
+    """
+
+    dt_ns: Annotated[Positive | None, Field(exclude=True, repr=False)] = None
+
+    def at(self, dt_ns: float) -> Self:
+        """The same settings for pulses with a sampling period in ns."""
+        return self.model_copy(update={"dt_ns": float(dt_ns)})
+
+    @property
+    def sampled_ns(self) -> float:
+        """The sampling period; `at` comes first."""
+        assert self.dt_ns is not None
+        return self.dt_ns
+
+    def samples(self, time_ns: float) -> int:
+        """Number of samples of a time in ns."""
+        return round(time_ns / self.sampled_ns)
 
 
 _RangeKev = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
@@ -103,38 +128,71 @@ class PeakConfig(Config):
     half_width_kev: Positive
 
 
-class PreparationConfig(Config):
+class PreparationConfig(Timed):
     """From raw trace to the window a network sees (paper, section 3.3).
 
-    Lengths are in samples of the record.  ``max_padding_before`` and
-    ``max_padding_after`` limit how many samples of a *measured* window may lie
-    outside its record; these are filled with the baseline and with the last value.
-    Simulated pulses are padded without limit, since they are constant outside it.
-    A trace with ``saturation_run`` equal samples at its top is saturated.
+    A window reaches from ``before_ns`` before the alignment to ``after_ns`` after it.  With
+    ``align_at`` ``half_height``, pulses are aligned where they cross half of the height that a
+    straight line through the last ``decay_fit_ns`` of the window has there; with a number, at
+    that fraction of their maximum (paper: 0.999).  ``padding_before_ns`` and
+    ``padding_after_ns`` limit how much of a *measured* window may lie outside its record; it
+    is filled with the baseline and with the last value.  Simulated pulses are padded without
+    limit, since they are constant outside it.  A trace with ``saturation_run`` equal samples at
+    its top is saturated.
     """
 
-    samples_before: Samples
-    samples_after: Samples
-    align_fraction: Annotated[float, Field(gt=0, le=1)]
-    baseline_samples: Samples
-    tail_samples: Samples
+    before_ns: Positive
+    after_ns: Positive
+    align_at: Literal["half_height"] | Annotated[float, Field(gt=0, le=1)]
+    baseline_ns: Positive
+    tail_ns: Positive
     tail_level: Positive
-    decay_fit_samples: Annotated[int, Field(ge=3, le=100_000)]
-    max_padding_before: Annotated[int, Field(ge=0, le=100_000)]
-    max_padding_after: Annotated[int, Field(ge=0, le=100_000)]
+    decay_fit_ns: Positive
+    padding_before_ns: NonNegative
+    padding_after_ns: NonNegative
     saturation_run: Samples
+
+    @property
+    def samples_before(self) -> int:
+        """Samples of a window before its alignment."""
+        return self.samples(self.before_ns)
+
+    @property
+    def samples_after(self) -> int:
+        """Samples of a window from its alignment on."""
+        return self.samples(self.after_ns)
 
     @property
     def length(self) -> int:
         """Samples of a prepared pulse."""
         return self.samples_before + self.samples_after
 
+    @property
+    def align_fraction(self) -> float:
+        """Fraction of the height at which pulses are aligned."""
+        return 0.5 if self.align_at == "half_height" else self.align_at
+
+    @property
+    def baseline_samples(self) -> int:
+        """Samples at the start of a window that are its baseline."""
+        return max(1, self.samples(self.baseline_ns))
+
+    @property
+    def tail_samples(self) -> int:
+        """Samples at the end of a window that are scaled to the level of the tail."""
+        return max(1, self.samples(self.tail_ns))
+
+    @property
+    def decay_fit_samples(self) -> int:
+        """Samples at the end of a window to which the decay is fitted."""
+        return max(3, self.samples(self.decay_fit_ns))
+
     @model_validator(mode="after")
     def _fits(self) -> PreparationConfig:
-        if self.baseline_samples >= self.samples_before:
-            raise ValueError("baseline_samples must be fewer than samples_before")
-        if max(self.tail_samples, self.decay_fit_samples) > self.samples_after:
-            raise ValueError("tail_samples and decay_fit_samples must fit in samples_after")
+        if self.baseline_ns >= self.before_ns:
+            raise ValueError("baseline_ns must be less than before_ns")
+        if max(self.tail_ns, self.decay_fit_ns) > self.after_ns:
+            raise ValueError("tail_ns and decay_fit_ns must fit in after_ns")
         return self
 
 
@@ -153,18 +211,25 @@ class CutConfig(Config):
 _Number = Annotated[int, Field(ge=1, le=1000)]
 
 
-class LossConfig(Config):
+class LossConfig(Timed):
     """Weights of the eight losses and of the three windows of the L1 terms."""
 
-    baseline_len: Samples
-    rising_edge_len: Samples
-    tail_len: Samples
+    baseline_ns: Positive
+    rising_edge_ns: Positive
+    tail_ns: Positive
     baseline_weight: NonNegative
     rising_edge_weight: NonNegative
     tail_weight: NonNegative
     cycle_weight: NonNegative
     identity_weight: NonNegative
     adversarial_weight: NonNegative
+
+    @property
+    def edges(self) -> tuple[int, int]:
+        """Samples at which the baseline and the rising edge end."""
+        return self.samples(self.baseline_ns), self.samples(
+            self.baseline_ns + self.rising_edge_ns
+        )
 
 
 class TrainingConfig(Config):
@@ -200,13 +265,13 @@ class TrainingConfig(Config):
     losses: LossConfig
 
 
-class MatchingConfig(Config):
+class MatchingConfig(Timed):
     """A response matched to data by moments, see `cpunet.training.moments`.
 
-    Pulses are compared from ``before`` to ``after`` samples around their half maximum, with the
-    mean of ``baseline`` (range of samples before it) shifted to 0 and that of the last
-    ``level_samples`` scaled to the level of the preparation.  ``segments`` are the edges, in
-    samples from the half maximum, of stretches whose means are compared; ``components`` is the
+    Pulses are compared from ``before_ns`` before their half maximum to ``after_ns`` after it,
+    with the mean of ``baseline_ns`` (range of times before it) shifted to 0 and that of the
+    last ``level_ns`` scaled to the level of the preparation.  ``segments_ns`` are the edges of
+    stretches whose means are compared, in ns from the half maximum; ``components`` is the
     number of principal components of the data, and the first ``squares`` of them are also
     squared; ``amplitude_bins`` is the number of bins of the logarithm of the current amplitude,
     no narrower than ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard
@@ -223,11 +288,11 @@ class MatchingConfig(Config):
     """
 
     method: Literal["matching"]
-    before: Samples
-    after: Samples
-    baseline: tuple[Samples, Samples]
-    level_samples: Samples
-    segments: Annotated[tuple[int, ...], Field(min_length=2, max_length=1000)]
+    before_ns: Positive
+    after_ns: Positive
+    baseline_ns: tuple[Positive, Positive]
+    level_ns: Positive
+    segments_ns: Annotated[tuple[float, ...], Field(min_length=2, max_length=1000)]
     components: _Number
     squares: _Number
     amplitude_bins: _Number
@@ -242,22 +307,48 @@ class MatchingConfig(Config):
     drift_terms: DriftTerms
     noise_sets: _Number
 
+    @property
+    def before(self) -> int:
+        """Samples that are compared before the half maximum."""
+        return self.samples(self.before_ns)
+
+    @property
+    def after(self) -> int:
+        """Samples that are compared from the half maximum on."""
+        return self.samples(self.after_ns)
+
+    @property
+    def baseline(self) -> tuple[int, int]:
+        """Samples before the half maximum between which the mean becomes 0."""
+        first, stop = self.baseline_ns
+        return self.samples(first), self.samples(stop)
+
+    @property
+    def level_samples(self) -> int:
+        """Samples whose mean becomes the level."""
+        return self.samples(self.level_ns)
+
+    @property
+    def segments(self) -> tuple[int, ...]:
+        """Edges of the stretches in samples from the half maximum."""
+        return tuple(self.samples(edge) for edge in self.segments_ns)
+
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:
-        if sorted({*self.segments}) != [*self.segments]:
-            raise ValueError("segments must be in rising order")
-        if self.segments[0] < -self.before or self.segments[-1] > self.after:
-            raise ValueError("segments must lie within before and after")
-        if not self.baseline[0] > self.baseline[1]:
-            raise ValueError("baseline goes from more samples before the edge to fewer")
-        if self.level_samples >= self.after:
-            raise ValueError("level_samples must be fewer than after")
+        if sorted({*self.segments_ns}) != [*self.segments_ns]:
+            raise ValueError("segments_ns must be in rising order")
+        if self.segments_ns[0] < -self.before_ns or self.segments_ns[-1] > self.after_ns:
+            raise ValueError("segments_ns must lie within before_ns and after_ns")
+        if not self.baseline_ns[0] > self.baseline_ns[1]:
+            raise ValueError("baseline_ns goes from a longer time before the edge to a shorter")
+        if self.level_ns >= self.after_ns:
+            raise ValueError("level_ns must be less than after_ns")
         if self.squares > self.components:
             raise ValueError("squares must be no more than components")
         return self
 
 
-class ScoreConfig(Config):
+class ScoreConfig(Timed):
     """Histograms and resampling for the comparison of two distributions.
 
     ``sideband_kev`` are the nearest and farthest distances of the sidebands from a line, where
@@ -268,9 +359,14 @@ class ScoreConfig(Config):
     max_bins: Annotated[int, Field(ge=2, le=100_000)]
     bootstraps: Annotated[int, Field(ge=2, le=100_000)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
-    edge_samples: Samples
+    edge_ns: Positive
     sideband_kev: _RangeKev
     continuum_kev: dict[str, _RangeKev]
+
+    @property
+    def edge_samples(self) -> int:
+        """Samples on either side of the half maximum that are its edge."""
+        return self.samples(self.edge_ns)
 
 
 class SearchConfig(Config):
@@ -329,6 +425,35 @@ class Recipe(Config):
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
 
+    def at(self, dt_ns: float) -> Self:
+        """The same recipe for pulses with a sampling period in ns.
+
+        Networks halve their windows four times, and a GRU takes several samples a step: of
+        them, either side of the alignment has the nearest multiple of so many samples.
+
+        Examples
+        --------
+        >>> from cpunet.recipes import load_recipe
+        >>> [load_recipe("paper").at(dt).preparation.length for dt in (16, 10, 4)]
+        [800, 1280, 3200]
+        """
+        preparation, training = self.preparation.at(dt_ns), self.training
+        if isinstance(training, MatchingConfig):
+            training = training.at(dt_ns)
+        else:
+            step = dt_ns * math.lcm(8, self.cyclegan.discriminator.samples_per_step)
+            sides = ("before_ns", "after_ns")
+            whole = {side: round(getattr(preparation, side) / step) * step for side in sides}
+            preparation = preparation.model_copy(update=whole)
+            training = training.model_copy(update={"losses": training.losses.at(dt_ns)})
+        return self.model_copy(
+            update={
+                "preparation": preparation,
+                "training": training,
+                "scores": self.scores.at(dt_ns),
+            }
+        )
+
     @property
     def cyclegan(self) -> CycleGanSettings:
         """The settings of a CycleGAN.
@@ -377,21 +502,17 @@ class Recipe(Config):
             raise ValueError(
                 "generator punet goes with training method cyclegan, others with matching"
             )
+        if not network and self.preparation.align_at != "half_height":
+            raise ValueError("preparation.align_at must be half_height for a matched response")
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")
         if not network:
             return self
-        losses, length = self.cyclegan.training.losses, self.preparation.length
-        covered = losses.baseline_len + losses.rising_edge_len + losses.tail_len
-        if covered != length:
+        losses, window = self.cyclegan.training.losses, self.preparation
+        covered = losses.baseline_ns + losses.rising_edge_ns + losses.tail_ns
+        length = window.before_ns + window.after_ns
+        if abs(covered - length) > 1e-6 * length:
             raise ValueError(
-                f"the loss windows cover {covered} samples, a prepared pulse has {length}"
+                f"the loss windows cover {covered:g} ns, a prepared pulse has {length:g} ns"
             )
-        step = self.cyclegan.discriminator.samples_per_step
-        halved = "16 (the generators halve it four times)"
-        for factor, name in ((16, halved), (step, f"samples_per_step ({step})")):
-            if length % factor:
-                raise ValueError(
-                    f"a prepared pulse has {length} samples, no multiple of {name}"
-                )
         return self

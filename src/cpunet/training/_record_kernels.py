@@ -1,8 +1,7 @@
 """Compiled loops that align records and read their tail slopes and current amplitudes.
 
-They align at half maximum, where a pulse is steepest: the 99.9 % alignment of the preparation
-jitters by tens of samples on a flat, noisy top.  Both sides go through the same code, so that
-its effects on a pulse cancel.
+They align at half maximum, where a pulse is steepest.  Both sides go through the same code, so
+that its effects on a pulse cancel.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ class RecordWindow(NamedTuple):
     base_first, base_stop, level_samples, tail_level
         Range of samples before the crossing whose mean becomes 0, number of samples at the
         window's end whose mean becomes the level, and the level.
-    align_before, align_after, align_fraction, fit_samples
-        Settings of the preparation, for the tail slope.
+    tail, fit_samples
+        First sample of the tail from the crossing, and number of samples of its slope.
     edge
         Samples on either side of the crossing that contain the steepest point.
     """
@@ -41,9 +40,7 @@ class RecordWindow(NamedTuple):
     base_stop: int
     level_samples: int
     tail_level: float
-    align_before: int
-    align_after: int
-    align_fraction: float
+    tail: int
     fit_samples: int
     edge: int
 
@@ -73,14 +70,6 @@ def _crossing(record: Any, level: float, last: int) -> Any:  # pragma: no cover 
 
 
 @kernel(error_model="numpy", fastmath=FAST)
-def _highest(record: Any, first: int, stop: int) -> Any:  # pragma: no cover - compiled
-    highest = record[first]
-    for i in range(first, stop):
-        highest = max(highest, record[i])
-    return highest
-
-
-@kernel(error_model="numpy", fastmath=FAST)
 def _slope(tail: Any, logs: Any) -> Any:  # pragma: no cover - compiled
     """Slope per sample of the logarithm."""
     n = len(tail)
@@ -93,21 +82,13 @@ def _slope(tail: Any, logs: Any) -> Any:  # pragma: no cover - compiled
 
 
 @kernel(error_model="numpy")
-def _tail_slope(record: Any, w: RecordWindow, tail: Any, logs: Any) -> Any:  # pragma: no cover
-    """Tail slope of the window that the preparation would cut, and where this begins."""
-    first, stop = w.last - w.align_before, min(w.last + w.align_after, len(record))
-    highest = _highest(record, first, stop)
-    at = first
-    while record[at] != highest:
-        at += 1
-    threshold = np.float32(w.align_fraction) * highest
-    align = at - 1
-    while align >= first and not record[align] < threshold:
-        align -= 1
-    start = align + 1 + w.align_after - w.fit_samples
+def _tail_slope(
+    record: Any, start: int, w: RecordWindow, tail: Any, logs: Any
+) -> Any:  # pragma: no cover - compiled
+    """Tail slope of the window that the preparation would cut."""
     for i in range(w.fit_samples):
         tail[i] = record[min(start + i, len(record) - 1)]
-    return _slope(tail, logs), start
+    return _slope(tail, logs)
 
 
 @kernel(error_model="numpy", fastmath=FAST)
@@ -189,17 +170,17 @@ def read_records(
     tail = np.empty(w.fit_samples, np.float32)
     logs = np.empty(w.fit_samples, np.float32)
     current = np.empty(w.before + w.after - 1, np.float32)
-    near = w.edge // 3  # of the steepest sample, within which the maximum is
+    near = w.edge // 3  # of a crossing, or of the steepest sample, within which the maximum is
     for row in range(len(records)):
         record = records[row]
         _, sample = _crossing(record, w.level, w.last)
         _normalise(record, sample, w)
-        time, again = _crossing(record, w.level, sample + 20)
+        time, again = _crossing(record, w.level, sample + near)
         if again != sample:
             # baseline and level are taken relative to the crossing of the normalised record:
             # with a decay of 50 us, one sample off is many standard deviations of a mean
             _normalise(record, again, w)
-            time, half = _crossing(record, w.level, again + 20)
+            time, half = _crossing(record, w.level, again + near)
         else:
             half = again
         if not math.isfinite(time):
@@ -207,7 +188,8 @@ def read_records(
             places[row] = 0
             continue
         _window(record, time, w, aligned[row])
-        slopes[row], start = _tail_slope(record, w, tail, logs)
+        start = half + (time - half >= 0.5) + w.tail  # from the nearest sample
+        slopes[row] = _tail_slope(record, start, w, tail, logs)
         for i in range(len(current)):
             current[i] = aligned[row, i + 1] - aligned[row, i]
         steepest = max(w.before - w.edge, 0)

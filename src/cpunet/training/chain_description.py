@@ -110,9 +110,7 @@ def _noise_error(run: Run, chain: Chain) -> Numbers:
     if not error or not rms or chain.noise is None:
         return {}
     preparation = run.recipe.preparation
-    end_ns = (
-        reaches_ns(chain, preparation.align_fraction) + preparation.samples_after * run.dt_ns
-    )
+    end_ns = reaches_ns(chain, preparation.align_fraction) + preparation.after_ns
     sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
     kev = noise_numbers(chain)["noise_rms_kev"]
     return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}

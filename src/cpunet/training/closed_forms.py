@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from cpunet.electronics.baseline_noise import record_samples
 from cpunet.electronics.chain import Decay, Electronics
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
 from cpunet.electronics.readout import noise_power
-from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.response_problem import SmoothParameters
@@ -75,7 +76,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
         ``noise_corner_mhz``, the frequency at which the noise power falls to half.
     """
     step, undecayed = chain.whole.step(_TIMES_NS), chain.undecayed.step(_TIMES_NS)
-    end_ns = _reaches_ns(step, preparation.align_fraction) + preparation.samples_after * dt_ns
+    end_ns = _reaches_ns(step, preparation.align_fraction) + preparation.after_ns
     numbers = {
         name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
         for name, low in _RISES.items()
@@ -83,7 +84,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     for time in (500, 1000):
         numbers[f"missing_{time}_ns"] = float(1 - chain.undecayed.step(time))
     numbers["overshoot"] = max(0.0, float(undecayed.max()) - 1)
-    tail_ns = np.arange(end_ns - preparation.decay_fit_samples * dt_ns, end_ns, dt_ns)
+    tail_ns = np.arange(end_ns - preparation.decay_fit_ns, end_ns, dt_ns)
     slope = np.polyfit(tail_ns, np.log(np.maximum(chain.whole.step(tail_ns), 1e-3)), 1)[0]
     if slope < 0:
         numbers["effective_decay_us"] = float(-1e-3 / slope)
@@ -161,7 +162,7 @@ def true_chain_of(electronics: Electronics) -> Chain:
         update={"decays": (Decay(fraction=1, tau_us=_FOREVER_US),)}
     )
     name = f"true response ({electronics.name})"
-    samples, dt_ns = 2 * (NOISE_BINS - 1), electronics.dt_ns
+    samples, dt_ns = record_samples(electronics.dt_ns), electronics.dt_ns
     power = noise_power(electronics.noise.spectrum, dt_ns, samples)
     frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
     density = electronics.noise.rms_kev**2 * power / frequency[1]
@@ -174,8 +175,8 @@ def with_noise(
     """Add the noise, converted from the units of prepared pulses to keV."""
     noise = network.noise
     # height of a full charge whose tail has the level of prepared pulses
-    tail = preparation.samples_after - 0.5 * preparation.tail_samples
-    tail_ns = reaches_ns(chain, preparation.align_fraction) + tail * noise.dt_ns
+    tail_ns = preparation.after_ns - 0.5 * preparation.tail_ns
+    tail_ns += reaches_ns(chain, preparation.align_fraction)
     height = preparation.tail_level / float(chain.whole.step(tail_ns))
     dt_us = 1e-3 * noise.dt_ns
     frequency = np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float)

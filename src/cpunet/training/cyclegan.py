@@ -30,7 +30,7 @@ from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
 from cpunet.electronics.drawn_pile_up import TraceNoise
-from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE
+from cpunet.electronics.finishing import padding
 from cpunet.networks.generators import KeptNoise, stretch
 from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.pulses.container import Pulses
@@ -90,11 +90,12 @@ def in_room(windows: Tensor, config: PreparationConfig) -> Tensor:
     lever = lever - lever.mean()
     slope = torch.where(usable, last, 1).log() @ (lever / lever.square().sum())
     # the mean of the last samples is the level at their centre
-    since = torch.arange(PADDING_AFTER).to(last) + 0.5 * (config.tail_samples + 1)
+    before, after_samples = padding(config.sampled_ns)
+    since = torch.arange(after_samples).to(last) + 0.5 * (config.tail_samples + 1)
     level = last[:, -config.tail_samples :].mean(dim=1, keepdim=True)
     after = level * (slope[:, None] * since).exp()
     return torch.cat(
-        [windows.new_zeros(len(windows), PADDING_BEFORE), windows, after.to(windows)], dim=1
+        [windows.new_zeros(len(windows), before), windows, after.to(windows)], dim=1
     )
 
 
@@ -108,7 +109,7 @@ def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Ten
     prepared = prepare(
         raw, config.model_copy(update={"saturation_run": raw.length}), "measured"
     )
-    align = np.full(len(records), PADDING_BEFORE + config.samples_before)
+    align = np.full(len(records), padding(dt_ns)[0] + config.samples_before)
     align[prepared.index] = prepared.align_sample
     start = torch.from_numpy(align - config.samples_before).to(records.device)
     windows = stretch(records, start, 0, config.length)
@@ -135,9 +136,9 @@ class CycleGan(nn.Module):
 
     def __init__(self, recipe: Recipe, outside: Outside | None = None) -> None:
         super().__init__()
-        config, length = recipe.cyclegan, recipe.preparation.length
-        self.ren = PositionalUNet(config.generator, length)
-        self.iren = PositionalUNet(config.generator, length)
+        config, self.length = recipe.cyclegan, recipe.preparation.length
+        self.ren = PositionalUNet(config.generator, self.length)
+        self.iren = PositionalUNet(config.generator, self.length)
         self.discriminator_data = GruDiscriminator(config.discriminator)
         self.discriminator_sim = GruDiscriminator(config.discriminator)
         if outside is not None:
@@ -153,16 +154,17 @@ class CycleGan(nn.Module):
         return {"data": self.discriminator_data, "sim": self.discriminator_sim}
 
 
-def window_weights(config: LossConfig) -> Tensor:
+def window_weights(config: LossConfig, length: int) -> Tensor:
     """Weight of each sample in the L1 losses, shape (samples,).
 
     Baseline, rising edge and tail each count as their weight times the *mean*
     absolute difference in their window, whatever its length.
     """
+    begin, end = config.edges
     windows = (
-        (config.baseline_len, config.baseline_weight),
-        (config.rising_edge_len, config.rising_edge_weight),
-        (config.tail_len, config.tail_weight),
+        (begin, config.baseline_weight),
+        (end - begin, config.rising_edge_weight),
+        (length - end, config.tail_weight),
     )
     return torch.cat([torch.full((length,), weight / length) for length, weight in windows])
 
@@ -235,7 +237,8 @@ class Step:
         self.model, self.config = model, config
         self.outside, self.warmup = outside, warmup
         self.accuracy: dict[str, Tensor] = {}  # of the discriminators, if updated
-        self.weights = window_weights(config.losses).to(next(model.parameters()).device)
+        weights = window_weights(config.losses, model.length)
+        self.weights = weights.to(next(model.parameters()).device)
         self.ren, self.iren = (_pass(network, config) for network in (model.ren, model.iren))
 
         def adamw(parameters: list[nn.Parameter], rate: float) -> AdamW:

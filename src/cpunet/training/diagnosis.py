@@ -19,8 +19,9 @@ PHYSICS = 8.0
 # Limits of the fraction of charge that arrives late; an overshoot makes it a few percent
 # negative.
 MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
-ONSET, TOP, TAIL = -8, 15, 84  # limits of the parts in samples from the half maximum
-_SAMPLES = re.compile(r"samples (-?\d+) to (-?\d+)")
+# Limits of the parts in ns from the half maximum.
+ONSET_NS, TOP_NS, TAIL_NS = -128.0, 240.0, 1344.0
+_STRETCH = re.compile(r"(-?[\d.e+]+) to (-?[\d.e+]+) ns")
 
 # Likely cause of a deviation of each part of a pulse, and a test of it.
 PARTS = {
@@ -48,7 +49,7 @@ def parts_off(pulls: Mapping[str, float]) -> dict[str, float]:
 
     Examples
     --------
-    >>> parts_off({"samples -40 to -25": 9.0, "samples 140 to 180": -1.0, "tail slope": 30.0})
+    >>> parts_off({"-640 to -400 ns": 9.0, "2240 to 2880 ns": -1.0, "tail slope": 30.0})
     {'onset': 9.0, 'tail': 21.2}
     """
     squares: dict[str, list[float]] = {}
@@ -140,12 +141,12 @@ def _part(name: str) -> str:
         return "current amplitude"
     if name == "tail slope":
         return "tail"
-    match = _SAMPLES.fullmatch(name)
+    match = _STRETCH.fullmatch(name)
     if match is None:
         return ""
-    first, stop = map(int, match.groups())
-    if stop <= ONSET:
+    first, stop = map(float, match.groups())
+    if stop <= ONSET_NS:
         return "onset"
-    if first < TOP:
+    if first < TOP_NS:
         return "edge"
-    return "top" if first < TAIL else "tail"
+    return "top" if first < TAIL_NS else "tail"

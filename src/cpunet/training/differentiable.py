@@ -22,7 +22,6 @@ from torch import Tensor
 
 from cpunet.networks.generators import stretch
 from cpunet.networks.response_layer import (
-    PADDING_AFTER,
     Readout,
     current_spectrum,
     padded_length,
@@ -30,7 +29,7 @@ from cpunet.networks.response_layer import (
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.training.dual_numbers import Dual
 from cpunet.training.moments import Moments, Readings, aligned_records
-from cpunet.training.translated import PLATEAU, SimulatedSide, in_threads
+from cpunet.training.translated import SimulatedSide, in_threads
 
 T = TypeVar("T")
 BLOCK = 128  # pulses at a time: each has a record for every parameter
@@ -210,7 +209,7 @@ class DifferentiableSet:
 
     def height(self, records: Tensor) -> Tensor:
         """Mean long after the pulse over the nominal level, shape (..., pulses, 1)."""
-        plateau = records[..., -PADDING_AFTER : PLATEAU - PADDING_AFTER]
+        plateau = records[..., self.sim.plateau]
         over: Tensor = (
             plateau.mean(dim=-1, keepdim=True) / self.sim.moments.preparation.tail_level
         )
@@ -249,7 +248,7 @@ class DifferentiableSet:
             rows = slice(first, first + len(spectra))
             clean, moved = self.records(spectra, transfer), self.records(spectra, of_transfer)
             if len(further := ways.of_pulses(rows)):
-                changes = current_spectrum(further, self.padded)
+                changes = current_spectrum(further, self.padded, self.sim.dt_ns)
                 moved = torch.cat([moved, self.records(changes, transfer)])
             heights = self.height(clean), self.height(moved)
             clean = clean / heights[0]

@@ -18,7 +18,7 @@ from torch import Tensor
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import LinearInverse, ResponseGenerator, stretch
-from cpunet.networks.response_layer import PADDING_BEFORE
+from cpunet.networks.response_layer import padding
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
@@ -28,7 +28,6 @@ from cpunet.training.moments import MIN_PULSES, Values
 # and effects that the response does not describe.
 FLOOR = 1e-5
 MAX_PULSES = 4096  # maximum number of translated pulses
-RECORD_SAMPLES = 8192  # minimum length of the transform that gives the correlation of the noise
 
 
 def fit_inverse(
@@ -120,7 +119,7 @@ def _translated(
             f"only {len(prepared)} of {len(sim)} translated pulses can be prepared, the "
             f"inverse needs {MIN_PULSES}: {prepared.rejections}; check the fit of the response"
         )
-    delay = prepared.align_sample - preparation.samples_before - PADDING_BEFORE
+    delay = prepared.align_sample - preparation.samples_before - padding(dt_ns)[0]
     return torch.from_numpy(prepared.pulses.waveforms), torch.from_numpy(delay), prepared.index
 
 
@@ -132,7 +131,7 @@ def _noise_covariance(noise: BaselineNoise, sizes: LinearInverse, pulse: Values)
     """
     first = min(-sizes.before, sizes.baseline[0])
     samples = max(sizes.after, sizes.level[1]) - first
-    density = noise.density_of(max(RECORD_SAMPLES, 2 * samples))
+    density = noise.density_of(max(noise.samples, 2 * samples))
     correlation = scipy.fft.irfft(density)[:samples]
 
     def mean_over(stretch: tuple[int, int]) -> Values:

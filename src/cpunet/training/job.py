@@ -202,7 +202,16 @@ class Training:
             kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
             raise CpunetError(f"{init.name}: {kinds}; resample them")
         return TrainingJob(
-            recipe, self.peak, self.seed, self.device, sim, data, folder, init, resume, beside
+            recipe.at(data.dt_ns),
+            self.peak,
+            self.seed,
+            self.device,
+            sim,
+            data,
+            folder,
+            init,
+            resume,
+            beside,
         )
 
 

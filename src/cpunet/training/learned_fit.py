@@ -213,7 +213,7 @@ class _Trained:
         batch = DifferentiableSet(sim.of(rows))
         with torch.no_grad():
             transfer = self.response.step.transfer(batch.padded).to(torch.complex64)
-        spectra = current_spectrum(pulses, batch.padded)
+        spectra = current_spectrum(pulses, batch.padded, sim.dt_ns)
         clean = batch.scaled(batch.records(spectra, transfer))
         draw = int(rng.integers(len(sim.noise.factor)))
         noisy = clean + batch.noise(draw, 0, len(rows))

@@ -34,10 +34,10 @@ Rows = npt.NDArray[np.intp]
 
 SIGMA_PER_MAD = 1.4826
 MIN_PULSES = 200  # minimum number of pulses for a covariance of about a hundred moments
-EDGE = 60  # samples on either side of the half maximum that contain the steepest point
-# Charge drift shapes a pulse up to sample EARLY from the half maximum, later the electronics.
+EDGE_NS = 960.0  # on either side of the half maximum, contains the steepest point
+# Charge drift shapes a pulse up to EARLY_NS from the half maximum, later the electronics.
 # If the simulated physics are wrong, moments may be off by WRONG and LATE standard deviations.
-EARLY, WRONG, LATE = 30, 20.0, 2.0
+EARLY_NS, WRONG, LATE = 480.0, 20.0, 2.0
 MIN_SHARE = 0.2  # of the median amplitude; below it, there is no single pulse
 QUIET = 0.05  # of the height; above it before the pulse, there is another pulse
 # Width of the logarithm of the current amplitude in which the peak of the single sites is the
@@ -139,7 +139,7 @@ class Moments:
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
         some = whole[spread(len(whole), DRAWN)]
         level = 0.5 * float(windows[some].mean(axis=0).max()) if len(some) else 0.0
-        window = _window(config, preparation, level, preparation.samples_before + 1)
+        window = _window(config, preparation, level, preparation.samples_before + 2)
         aligned, slopes, log_amplitude = _read_windows(windows[some], window, preparation)
         usable = _single(aligned, config)
         if usable.any():
@@ -282,7 +282,7 @@ class Moments:
         """Errors of the moments, in their standard deviations, if the physics are wrong."""
         if self.balance is not None:
             return np.zeros(len(self.names))
-        errors = [WRONG if stop <= EARLY else LATE for stop in self.config.segments[1:]]
+        errors = [WRONG if stop <= EARLY_NS else LATE for stop in self.config.segments_ns[1:]]
         errors += [WRONG] * self.config.components + [0.0]
         errors += [WRONG] * self.config.squares
         errors += [0.0] * (len(self.names) - len(errors))
@@ -301,6 +301,11 @@ class Moments:
     def offset(self) -> Values:
         """Components of the mean pulse."""
         return np.asarray(self.mean.astype(float) @ self.components)
+
+    @property
+    def dt_ns(self) -> float:
+        """Sampling period in ns."""
+        return self.preparation.sampled_ns
 
     @property
     def slope(self) -> float:
@@ -377,11 +382,9 @@ def _window(
         base_stop=config.baseline[1],
         level_samples=config.level_samples,
         tail_level=preparation.tail_level,
-        align_before=preparation.samples_before,
-        align_after=preparation.samples_after,
-        align_fraction=preparation.align_fraction,
+        tail=preparation.samples_after - preparation.decay_fit_samples,
         fit_samples=preparation.decay_fit_samples,
-        edge=EDGE,
+        edge=config.samples(EDGE_NS),
     )
 
 
@@ -434,10 +437,14 @@ def _principal_components(aligned: FloatArray, n: int) -> tuple[FloatArray, Floa
     return mean, np.ascontiguousarray(scaled, np.float32)
 
 
+def stretch_name(begin_ns: float, end_ns: float) -> str:
+    """Name of the mean over a stretch of the pulse."""
+    return f"{begin_ns:g} to {end_ns:g} ns"
+
+
 def _names(config: MatchingConfig) -> tuple[str, ...]:
-    edges = config.segments
     return (
-        *(f"samples {a} to {b}" for a, b in pairwise(edges)),
+        *(stretch_name(a, b) for a, b in pairwise(config.segments_ns)),
         *(f"component {i + 1}" for i in range(config.components)),
         "tail slope",
         *(f"component {i + 1} squared" for i in range(config.squares)),

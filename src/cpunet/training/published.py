@@ -27,6 +27,7 @@ LAYERS = (
 )
 MAPS = [f"pe{i}.pe" for i in range(1, 10)]  # computed here
 
+PUBLISHED_DT_NS = 16.0  # of the windows of 800 samples
 # Facts on the training for a report; its pulses were not published.
 UNKNOWN = SideInfo(file="not published with the weights", used="an unknown number of")
 
@@ -38,7 +39,7 @@ def import_weights(
     *,
     ren: str | Path | None = None,
     iren: str | Path | None = None,
-    dt_ns: float = 16.0,
+    dt_ns: float = PUBLISHED_DT_NS,
     force: bool = False,
 ) -> Run:
     """Make a run of the published state dicts; nothing of the files is executed.
@@ -80,14 +81,25 @@ def import_weights(
         refuse_existing(Path(out), *files.values(), force=force)
     if not (np.isfinite(dt_ns) and dt_ns > 0):
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
-    length = load_recipe("paper").preparation.length
+    published = load_recipe("paper").at(PUBLISHED_DT_NS)
+    length = published.preparation.length
     networks = {part: _generator(path, length) for part, path in files.items()}
     widths = {network.width for network in networks.values()}
     if len(widths) > 1:
         raise CpunetError(
             f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
         )
-    recipe = load_recipe("paper", {"generator.width": widths.pop()})
+    settings: dict[str, float] = {"generator.width": widths.pop()}
+    # windows of as many samples, whatever the period
+    parts = {
+        "preparation": published.preparation,
+        "training.losses": published.cyclegan[2].losses,
+    }
+    for part, config in parts.items():
+        for name, value in config.model_dump().items():
+            if name.endswith("_ns"):
+                settings[f"{part}.{name}"] = value * dt_ns / PUBLISHED_DT_NS
+    recipe = load_recipe("paper", settings)
     run = Run.of(
         nn.ModuleDict(networks),
         recipe,

@@ -260,6 +260,6 @@ class PulseSets:
     def _translated(
         self, sim: Pulses, moments: Moments, weights: Values, draws: int
     ) -> SimulatedSide:
-        length = record_length(sim.waveforms.shape[1])
+        length = record_length(sim.waveforms.shape[1], sim.dt_ns)
         drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
         return SimulatedSide(sim.waveforms, drawn, moments, weights)

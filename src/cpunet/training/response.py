@@ -120,8 +120,7 @@ class Response:
         """Step and impulse response, tail and noise."""
         from cpunet.training.figures import response_figure
 
-        first = self.runs[0].run
-        tail_ns = first.recipe.preparation.samples_after * first.dt_ns
+        tail_ns = self.runs[0].run.recipe.preparation.after_ns
         truth = None if self.truth is None else true_chain_of(self.truth)
         return response_figure([one.chain for one in self.runs], truth, tail_ns=tail_ns)
 

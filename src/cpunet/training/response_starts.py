@@ -19,6 +19,7 @@ from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import ResponseConfig
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
+from cpunet.training.moments import stretch_name
 from cpunet.training.response_problem import STRETCH, ResponseProblem
 
 # Chi-square per moment of another detector; in a wrong valley it is about three.
@@ -43,7 +44,7 @@ SLOWEST_NS = 800.0
 MIN_DECAY_ERROR = 0.01
 # Sample from the half maximum up to which drift alone shapes a pulse, and pull above which this
 # part disagrees with the simulation.
-ONSET, OFF = -15, 4.0
+ONSET_NS, OFF = -240.0, 4.0
 
 
 def from_known(
@@ -98,8 +99,8 @@ def onset_is_off(problem: ResponseProblem) -> bool:
     If only later parts are off, the data contain effects that no readout chain has, such as
     pile-up in their tails, and the edge can still be trusted.
     """
-    edges = problem.bands[0].moments.config.segments
-    onset = {f"samples {a} to {b}" for a, b in pairwise(edges) if b <= ONSET}
+    edges = problem.bands[0].moments.config.segments_ns
+    onset = {stretch_name(a, b) for a, b in pairwise(edges) if b <= ONSET_NS}
     pulls = problem.pulls(problem.parameters.vector())
     named = zip(problem.names, pulls, strict=True)
     return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)

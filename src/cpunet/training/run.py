@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
 
 import torch
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
@@ -115,6 +115,7 @@ class Run(InfoPart):
         Files of imported weights, by part.
     """
 
+    dt_ns: Annotated[float, Field(gt=0, le=1e9)]
     recipe: Recipe = Field(**_NOT_STORED)
     weights: dict[str, Tensor] = Field(**_NOT_STORED)
     folder: Path | None = Field(None, **_NOT_STORED)
@@ -122,7 +123,6 @@ class Run(InfoPart):
     seed: Annotated[int, Field(ge=0)] | None
     device: str
     seconds: Annotated[float, Field(ge=0, le=1e15)] | None
-    dt_ns: Annotated[float, Field(gt=0, le=1e9)]
     init: str | None = None
     started: str = ""
     sim: SideInfo = SideInfo()
@@ -130,6 +130,11 @@ class Run(InfoPart):
     fit: FitInfo | None = None
     versions: dict[str, str] = {}
     imported: dict[str, dict[str, str]] = {}
+
+    @field_validator("recipe")
+    @classmethod
+    def _at_its_period(cls, recipe: Recipe, info: ValidationInfo) -> Recipe:
+        return recipe.at(info.data["dt_ns"]) if "dt_ns" in info.data else recipe
 
     __eq__ = object.__eq__  # weights are not compared
     __hash__ = object.__hash__

@@ -21,20 +21,18 @@ import torch
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.response_layer import (
-    PADDING_AFTER,
-    PADDING_BEFORE,
     DriftClock,
     Readout,
     padded_length,
+    padding,
     record_length,
 )
 from cpunet.pulses.container import FloatArray
 from cpunet.training._record_kernels import add_noise
 from cpunet.training.moments import BLOCK, Moments, Readings, Rows, Values
 
-# Maximum delay of the half maximum by the response, in samples after the alignment sample.
-DELAY = 100
-PLATEAU = 100  # samples after the window whose mean gives the height of a record
+DELAY_NS = 1600.0  # maximum delay of the half maximum by the response
+PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
 # Maximum number of noise traces, each twice as long as a record.  If there are more pulses,
 # they share the traces, with other start samples and signs.
 NOISE_TRACES = 4096
@@ -176,12 +174,24 @@ class SimulatedSide:
     @property
     def length(self) -> int:
         """Samples of a record."""
-        return record_length(self.sim.shape[1])
+        return record_length(self.sim.shape[1], self.dt_ns)
+
+    @property
+    def dt_ns(self) -> float:
+        """Sampling period in ns."""
+        return self.moments.dt_ns
+
+    @property
+    def plateau(self) -> slice:
+        """Samples of a record whose mean gives its height."""
+        _, after = padding(self.dt_ns)
+        return slice(-after, round(PLATEAU_NS / self.dt_ns) - after)
 
     @property
     def last(self) -> int:
         """Sample of a record after all half maxima."""
-        return PADDING_BEFORE + self.moments.preparation.samples_before + DELAY
+        late = round(DELAY_NS / self.dt_ns)
+        return padding(self.dt_ns)[0] + self.moments.preparation.samples_before + late
 
     def of(self, rows: Rows | slice) -> SimulatedSide:
         """Some of the pulses, with their noise."""
@@ -232,7 +242,7 @@ class SimulatedSide:
             within, outside, n = [], [], 0
             spectrum = self.spectrum(response, first, size) * transfer
             records = scipy.fft.irfft(spectrum, padded, overwrite_x=True)[:, : self.length]
-            top = records[:, -PADDING_AFTER : PLATEAU - PADDING_AFTER]
+            top = records[:, self.plateau]
             records *= self.moments.preparation.tail_level / top.mean(axis=1, keepdims=True)
             weights = self.weights[first : first + size]
             for draw in range(len(self.noise.factor))[:draws]:
@@ -276,10 +286,9 @@ class SimulatedSide:
             with torch.no_grad():
                 sim = response.drifted(torch.from_numpy(np.ascontiguousarray(sim))).numpy()
         current = np.zeros((len(sim), self.length), np.float32)
-        current[:, PADDING_BEFORE] = sim[:, 0]
-        np.subtract(
-            sim[:, 1:], sim[:, :-1], out=current[:, PADDING_BEFORE + 1 : -PADDING_AFTER]
-        )
+        before, after = padding(self.dt_ns)
+        current[:, before] = sim[:, 0]
+        np.subtract(sim[:, 1:], sim[:, :-1], out=current[:, before + 1 : -after])
         spectrum: npt.NDArray[np.complex64] = scipy.fft.rfft(
             current, padded_length(self.length)
         )

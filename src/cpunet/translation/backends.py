@@ -108,7 +108,7 @@ class Backend(ABC):
         """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
 
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
-        """Noise-free traces of any length, with 99.9 % at sample `n_pre`; of a chain only."""
+        """Noise-free traces of any length, aligned at sample `n_pre`; of a chain only."""
         raise NotImplementedError
 
     def finished(
@@ -203,7 +203,7 @@ class ResponseBackend(Backend):
         return self.finished(windows, records, drawn)
 
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
-        """Noise-free traces of prepared simulated windows, with 99.9 % at sample `n_pre`."""
+        """Noise-free traces of prepared simulated windows, aligned at sample `n_pre`."""
         before = max(0, n_pre - self.config.samples_before)
         after = max(0, length - n_pre - self.config.samples_after)
         # before the window no charge has moved, after it all charge has been collected

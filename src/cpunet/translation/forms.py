@@ -19,7 +19,7 @@ import torch
 from cpunet.electronics.drawn_pile_up import Columns, DrawnPileUp, DrawnTails
 from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import PADDING_BEFORE, record_length
+from cpunet.networks.response_layer import padding, record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.training.run import Run
@@ -28,7 +28,7 @@ from cpunet.translation.options import LEARNED, NONE, Adc, TranslateOptions
 from cpunet.translation.translator import TranslatedPulses, Translator
 
 HIGHEST = int(np.iinfo(np.uint16).max)
-RISE_SAMPLES = 20  # of the pulse whose height defines the gain
+RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
 
@@ -69,7 +69,8 @@ class Windows:
         self.translator, self.tails, self.pile_up = translator, tails, pile_up
         self.config = config = translator.recipe.preparation
         self.n_pre, self.length = config.samples_before, config.length
-        self.record = PADDING_BEFORE + self.n_pre, record_length(self.length)
+        before = padding(translator.dt_ns)[0]
+        self.record = before + self.n_pre, record_length(self.length, translator.dt_ns)
 
     @property
     def t0_ns(self) -> float:
@@ -282,7 +283,7 @@ def _height(translator: Translator) -> float:
     """Maximum, in prepared units, of a fast pulse without noise."""
     config = translator.recipe.preparation
     time = np.arange(config.length) - config.samples_before
-    ramp = np.clip(time / RISE_SAMPLES + 1, 0, 1).astype(np.float32)
+    ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
     height = float(translator.apply(ramp[np.newaxis], noise=False).max())
     if not (np.isfinite(height) and height > 0):
         raise CpunetError("the run cannot translate a fast pulse; train again")

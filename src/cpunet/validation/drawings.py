@@ -12,7 +12,7 @@ import torch
 from matplotlib.figure import Figure
 
 from cpunet.networks.learned_response import DriftUNet
-from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
+from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
@@ -30,7 +30,7 @@ from cpunet.validation.run_figures import (
     roc_figure,
     shape_figure,
 )
-from cpunet.validation.slices import AFTER, BEFORE, MeanPulse
+from cpunet.validation.slices import MeanPulse, around_half
 
 # methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
@@ -129,15 +129,16 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
 
 def _single_pulse(peak: PeakSets) -> Drawing | None:
     """The first simulated event with an edge in every method, beside a measured pulse."""
+    dt_ns = peak.translations.ren.dt_ns
     for row in peak.known_to_all():
         windows = _shown(peak.translations.without_noise(row), SINGLE)
-        shapes = {m: align_half_maximum(w, BEFORE, AFTER)[0] for m, w in windows.items()}
+        shapes = {m: around_half(w, dt_ns)[0] for m, w in windows.items()}
         if all(np.isfinite(shape).any() for shape in shapes.values()):
             data = peak.windows("data")
-            place, rms = nearest(data, shapes["ren"])
-            shapes = {"data": align_half_maximum(data[[place]], BEFORE, AFTER)[0]} | shapes
+            place, rms = nearest(around_half(data, dt_ns), shapes["ren"])
+            shapes = {"data": around_half(data[[place]], dt_ns)[0]} | shapes
             pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
             title = f"{peak.name}: a simulated pulse without noise, and the measured one\n"
             title += f"nearest to its REN translation (RMS difference {rms:.4f})"
-            return partial(shape_figure, {"": pulses}, peak.translations.ren.dt_ns, title)
+            return partial(shape_figure, {"": pulses}, dt_ns, title)
     return None

@@ -116,7 +116,7 @@ def evaluate(
             if found:
                 values[peak.name] = found
                 rise = {method: v["rise_01_90"] for method, v in found.items()}
-                slices[peak.name] = aligned_means(peak.windows, rise)
+                slices[peak.name] = aligned_means(peak.windows, rise, run.dt_ns)
             bar.update(1)
     if not values:
         raise CpunetError(

@@ -25,8 +25,8 @@ from cpunet.pulses.parameters import Values
 
 MIN_BASELINES = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2
-# A pulse rises slowly before it crosses 1 %, its nominal start; margin in samples before that.
-MARGIN = 60
+# A pulse rises slowly before it crosses 1 %, its nominal start; margin before that.
+MARGIN_NS = 960.0
 EARLY_SHARE = 0.1  # of the measured pulses that may begin too early and are left out
 MIN_SAMPLES = 32  # of the stretch
 
@@ -69,7 +69,7 @@ def baseline_spectra(
     >>> round(found["ren"]["rms_ratio"], 1), found["ren"]["sigma"] > 5
     (1.1, True)
     """
-    free = {method: begins[method] - MARGIN for method in windows}
+    free = {method: begins[method] - MARGIN_NS / dt_ns for method in windows}
     known = free["data"][np.isfinite(free["data"])]
     samples = min(samples, int(np.quantile(known, EARLY_SHARE)) if known.size else 0)
     if samples < MIN_SAMPLES:

@@ -30,10 +30,10 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
+from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.validation.comparisons import Compared, histogram
-from cpunet.validation.slices import AFTER, BEFORE, MeanPulse
+from cpunet.validation.slices import BEFORE_NS, MeanPulse
 
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is told
@@ -222,7 +222,7 @@ def shape_figure(
     figure, grid = panels((width, 4.9), 2, n, sharey="row", **STACKED)
     for (above, below), (name, pulses) in zip(grid.T, columns.items(), strict=True):
         data = pulses["data"]
-        time_ns = dt_ns * np.arange(-BEFORE, len(data.mean) - BEFORE, dtype=float)
+        time_ns = dt_ns * (np.arange(len(data.mean)) - round(BEFORE_NS / dt_ns))
         for method, pulse in pulses.items():
             mean = pulse.mean
             if method == "raw":
@@ -249,7 +249,7 @@ def shape_figure(
     return figure
 
 
-def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
+def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
     """The pulse with the smallest RMS difference from another, both aligned at half maximum.
 
     Noise contributes to the difference.  Pulses with less than half of the compared samples
@@ -257,25 +257,24 @@ def nearest(windows: FloatArray, target: FloatArray) -> tuple[int, float]:
 
     Parameters
     ----------
-    windows
-        Pulses to choose from, shape ``(n, length)``.
+    aligned
+        Pulses to choose from, see `around_half`, shape ``(n, samples)``.
     target
-        Aligned pulse to compare with, shape ``(BEFORE + AFTER + 1,)``.
+        Aligned pulse to compare with, shape ``(samples,)``.
 
     Returns
     -------
     tuple
-        Row of the pulse, and its RMS difference from 100 samples before the crossing to 150
-        after it, in pulse heights.
+        Row of the pulse, and its RMS difference in pulse heights.
 
     Examples
     --------
     >>> time = np.arange(400.0)
     >>> pulses = np.array([1 / (1 + np.exp((200 - time) / width)) for width in (2, 5, 9)])
-    >>> nearest(pulses, align_half_maximum(pulses, BEFORE, AFTER)[1])[0]
+    >>> aligned = around_half(pulses, dt_ns=16)
+    >>> nearest(aligned, aligned[1])[0]
     1
     """
-    aligned = align_half_maximum(windows, BEFORE, AFTER)
     apart = np.square(aligned - target.astype(float))
     known = np.isfinite(apart)
     mean = np.where(known, apart, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)

@@ -24,7 +24,7 @@ import numpy as np
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values, align_half_maximum
 
-BEFORE, AFTER = 100, 150  # samples of a mean pulse before and after half maximum
+BEFORE_NS, AFTER_NS = 1600.0, 2400.0  # of a mean pulse before and after half maximum
 SLICES = 4
 
 
@@ -95,8 +95,14 @@ def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
     return np.quantile(finite, np.linspace(0, 1, slices + 1))
 
 
+def around_half(windows: FloatArray, dt_ns: float) -> FloatArray:
+    """Pulses from `BEFORE_NS` before their half maximum to `AFTER_NS` after it."""
+    before, after = round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns)
+    return align_half_maximum(windows, before, after)
+
+
 def aligned_means(
-    windows: Callable[[str], FloatArray], rise_time: Mapping[str, Values]
+    windows: Callable[[str], FloatArray], rise_time: Mapping[str, Values], dt_ns: float
 ) -> dict[str, Slices]:
     """Mean pulses of each method, in the same slices for all.
 
@@ -106,10 +112,12 @@ def aligned_means(
         Prepared pulses of a method, shape ``(n, length)``.
     rise_time
         Their rise times in ns by method, those of the measured pulses under ``"data"``.
+    dt_ns
+        Sampling period in ns.
     """
     edges = slice_edges(rise_time["data"])
     return {
-        method: sliced(align_half_maximum(windows(method), BEFORE, AFTER), times, edges)
+        method: sliced(around_half(windows(method), dt_ns), times, edges)
         for method, times in rise_time.items()
     }
 
