@@ -97,11 +97,14 @@ class Finished(NamedTuple):
         A `cpunet.pulses.preparation.Rejection` for each record.
     clean
         Without noise.
+    begin
+        Sample of the record with which each window begins; of no meaning if it is NaN.
     """
 
     windows: FloatArray
     codes: Codes
     clean: FloatArray
+    begin: npt.NDArray[np.int64]
 
 
 def finish(
@@ -154,13 +157,14 @@ def finish(
     rng, n = np.random.default_rng(seed), len(records)
     windows = np.full((n, config.length), np.nan, np.float32)
     noisy = windows if noise is None else windows.copy()
-    codes = np.zeros(n, np.uint8)
+    codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
     for rows in blocks(n):
         block = records[rows]
         clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
         codes[rows] = clean.codes
         kept = np.arange(n)[rows][clean.index]
         windows[kept] = clean.pulses.waveforms
+        begin[kept] = clean.align_sample - config.samples_before
         if noise is not None:
             assert energy_kev is not None  # noise scales as 1/energy
             height = clean.scale[:, np.newaxis]
@@ -172,4 +176,5 @@ def finish(
             prepared = prepare(raw, config, "measured")
             codes[kept] = prepared.codes
             noisy[kept[prepared.index]] = prepared.pulses.waveforms
-    return Finished(noisy, codes, windows)
+            begin[kept[prepared.index]] = prepared.align_sample - config.samples_before
+    return Finished(noisy, codes, windows, begin)

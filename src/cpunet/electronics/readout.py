@@ -256,6 +256,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         energy_kev=smeared.normal(energy, fwhm_kev / math.sqrt(8 * math.log(2))),
         event_number=pulses.event_number,
         peak=pulses.peak,
+        t0_ns=np.zeros(n),
         flag=flag,
         response=response.astype(np.float32),
         true_energy_kev=energy,

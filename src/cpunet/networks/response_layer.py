@@ -183,6 +183,18 @@ class Readout(nn.Module):
         """Fitted properties by name, with the unit at the end of the name."""
         raise NotImplementedError
 
+    @torch.no_grad()
+    def delay_ns(self) -> float:
+        """Time in ns at which the response to a step is half as high as its maximum."""
+        padded = padded_length(record_length(0, dt_ns := float(self.dt_ns)))
+        lead = padding(dt_ns)[0]
+        step = torch.fft.irfft(self.transfer(padded), padded).roll(lead)[: padded - lead]
+        after = int((step >= 0.5 * step.max()).int().argmax())
+        low, high = step[after - 1], step[after]
+        place = after - 1 + float((0.5 * step.max() - low) / (high - low))
+        # a sample is the mean over its period
+        return (place + 0.5 - lead) * dt_ns
+
 
 class ElectronicsResponse(Readout):
     r"""Charge pulses → noise-free records of any height, by physical parameters.

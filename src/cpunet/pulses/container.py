@@ -19,7 +19,7 @@ FloatArray = npt.NDArray[np.float32]
 
 BLOCK = 512  # pulses at a time, to bound memory
 
-_PER_PULSE = ("waveforms", "energy_kev", "event_number", "peak")
+_PER_PULSE = ("waveforms", "energy_kev", "event_number", "peak", "t0_ns")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,6 +39,9 @@ class Pulses:
         Event number in the source.
     peak
         Name of the gamma line of each energy (``"FEP"``, …), ``""`` for none.
+    t0_ns
+        Time of the first sample of each pulse in ns, simulated ones after the deposit; 0 where
+        a file does not say.
 
     Raises
     ------
@@ -62,6 +65,7 @@ class Pulses:
     energy_kev: npt.NDArray[np.float64]
     event_number: npt.NDArray[np.int64]
     peak: npt.NDArray[np.str_]
+    t0_ns: npt.NDArray[np.float64]
 
     def __post_init__(self) -> None:
         if self.waveforms.ndim != 2:
@@ -85,6 +89,7 @@ class Pulses:
         energy_kev: npt.ArrayLike | None = None,
         event_number: npt.ArrayLike | None = None,
         peak: npt.ArrayLike | None = None,
+        t0_ns: npt.ArrayLike = 0.0,
     ) -> Pulses:
         """Build a set from array-likes, with defaults for unknown quantities."""
         values = np.asarray(waveforms, dtype=np.float32)
@@ -99,6 +104,7 @@ class Pulses:
                 np.arange(n) if event_number is None else np.asarray(event_number, np.int64)
             ),
             peak=np.full(n, "") if peak is None else np.asarray(peak, np.str_),
+            t0_ns=np.broadcast_to(np.asarray(t0_ns, float), (n,)),
         )
 
     def __len__(self) -> int:

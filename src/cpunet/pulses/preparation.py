@@ -259,6 +259,7 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     codes, windows, numbers = _kernels.prepare_block(pulses.waveforms, settings)
     rows = np.flatnonzero(codes == Rejection.ACCEPTED)
     per_ms = 1e6 / pulses.dt_ns
+    begin = numbers[:, _kernels.ALIGN_SAMPLE] - config.samples_before
     return Prepared(
         pulses=Pulses(
             waveforms=windows,
@@ -266,6 +267,7 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
             energy_kev=pulses.energy_kev[rows],
             event_number=pulses.event_number[rows],
             peak=pulses.peak[rows],
+            t0_ns=pulses.t0_ns[rows] + begin * pulses.dt_ns,
         ),
         index=rows,
         baseline=numbers[:, _kernels.BASELINE].copy(),

@@ -79,7 +79,6 @@ class PulseWriter:
         *,
         table: str = "geds/sim",
         waveform_units: str = "",
-        t0_ns: float = 0.0,
         attrs: Mapping[str, str | float] | None = None,
         samples: npt.DTypeLike = np.float32,
         force: bool = False,
@@ -91,7 +90,6 @@ class PulseWriter:
         if not self._table:
             raise CpunetError(f"{path}: the table has no name; give one such as geds/sim")
         self._waveform_units = waveform_units
-        self._t0_ns = t0_ns
         self._attrs = dict(attrs or {})
         self._stack = ExitStack()
         self._file: h5py.File  # within the writer's with block
@@ -123,7 +121,7 @@ class PulseWriter:
             return
         content: dict[str, LGDO] = {
             "waveform": waveform_table(
-                pulses, t0_ns=self._t0_ns, units=self._waveform_units, samples=self._samples
+                pulses, units=self._waveform_units, samples=self._samples
             ),
             "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
             "event_number": Array(pulses.event_number),
@@ -211,7 +209,7 @@ def written_hdf5(target: Path) -> Iterator[tuple[h5py.File, HeldFile]]:
 
 
 def waveform_table(
-    pulses: Pulses, *, t0_ns: float, units: str, samples: npt.DTypeLike = np.float32
+    pulses: Pulses, *, units: str, samples: npt.DTypeLike = np.float32
 ) -> WaveformTable:
     """LH5 waveform table with the given sample type, in chunks of whole traces."""
     n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
@@ -230,7 +228,7 @@ def waveform_table(
         },
     )
     return WaveformTable(
-        t0=np.full(len(pulses), t0_ns),
+        t0=np.array(pulses.t0_ns),
         t0_units="ns",
         dt=np.full(len(pulses), pulses.dt_ns),
         dt_units="ns",

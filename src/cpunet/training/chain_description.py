@@ -142,6 +142,7 @@ def summary(run: Run) -> list[tuple[str, str]]:
         ("off", _deviations(fit.pulls)),
         *(("cause", cause) for cause in fit.causes),
         ("response", _parameters(fit.parameters)),
+        ("delay", _delay(fit)),
     ]
     if "baselines" in fit.noise:
         size = ""
@@ -155,6 +156,12 @@ def summary(run: Run) -> list[tuple[str, str]]:
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]
+
+
+def _delay(fit: FitInfo) -> str:
+    if not fit.delay_ns:
+        return ""
+    return f"{fit.delay_ns:.1f} ns, half rise of a step; translated pulses have it taken off t0"
 
 
 def _side(side: SideInfo) -> str:

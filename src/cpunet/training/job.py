@@ -270,6 +270,7 @@ def match(
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     told = asdict(fit) | {
         "parameters": parameters,
+        "delay_ns": response.delay_ns(),
         "verdict": "; ".join([fit.verdict, *stretches]),
         "causes": diagnosis(fit.pulls) if fit.poor else [],
         "in_no_band": {

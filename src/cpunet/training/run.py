@@ -65,8 +65,12 @@ _NOT_STORED: Any = {"exclude": True, "repr": False}
 
 
 class FitInfo(InfoPart):
-    """Fit of a readout chain: its parameters, their errors and covariance, and its quality."""
+    """Fit of a readout chain: its parameters, their errors and covariance, and its quality.
 
+    ``delay_ns`` is the half rise of its step response.
+    """
+
+    delay_ns: float = 0.0
     chi_square: float | None = None
     moments: int | None = None
     verdict: str = ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
-from cpunet.electronics.finishing import finish, with_room
+from cpunet.electronics.finishing import finish, padding, with_room
 from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
@@ -68,6 +69,24 @@ class Drawn:
         return int(torch.randint(2**62, (), generator=self.generator, device=device))
 
 
+class Translated(NamedTuple):
+    """A translated batch.
+
+    Parameters
+    ----------
+    windows
+        Float32, shape (n, samples); NaN for rejected rows.
+    codes
+        A `Rejection` for each row.
+    begin
+        First sample of each, in samples after the first one of what was translated.
+    """
+
+    windows: FloatArray
+    codes: Codes
+    begin: npt.NDArray[np.int64]
+
+
 class Backend(ABC):
     """Translates a batch of prepared windows.
 
@@ -104,16 +123,14 @@ class Backend(ABC):
         return weights.device
 
     @abstractmethod
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
-        """Return translated windows (NaN for rejected rows) and a `Rejection` for each row."""
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
+        """Translate a batch of windows."""
 
-    def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
+    def levels(self, windows: FloatArray, n_pre: int, length: int) -> Translated:
         """Noise-free traces of any length, aligned at sample `n_pre`; of a chain only."""
         raise NotImplementedError
 
-    def finished(
-        self, windows: FloatArray, records: FloatArray, drawn: Drawn
-    ) -> tuple[FloatArray, Codes]:
+    def finished(self, windows: FloatArray, records: FloatArray, drawn: Drawn) -> Translated:
         """Records with noise in proportion to 1/energy and other pulses, prepared like data.
 
         `windows` are those of which `shapes` makes the other pulses.
@@ -129,7 +146,7 @@ class Backend(ABC):
                 # with shapes of the same batch; early ones need longer records
                 shapes = self.shapes(windows[piled.partner], piled.reach(self.dt_ns))
                 added += piled.added(shapes, energy_kev, self.dt_ns, records.shape[1])
-        return finish(
+        done = finish(
             records,
             self.config,
             dt_ns=self.dt_ns,
@@ -137,7 +154,8 @@ class Backend(ABC):
             energy_kev=energy_kev if drawn.noise else None,
             seed=seed,
             added=added,
-        )[:2]
+        )
+        return Translated(done.windows, done.codes, done.begin - padding(self.dt_ns)[0])
 
     def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
         """Records in prepared units, longer by `reach`, for piled-up pulses."""
@@ -173,13 +191,14 @@ class NetworkBackend(Backend):
             self.dt_ns, self.noise, self.tails = kept.noise_dt_ns, kept.noise, tails
             self.needs_energies = True
 
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Run the network; add noise in proportion to 1/energy, and prepare like data."""
         batch = torch.from_numpy(windows).to(self.device)
         out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
         clean: FloatArray = out[:, 0].cpu().numpy()
         if self.noise is None or not drawn.noise:
-            return clean, np.zeros(len(windows), np.uint8)
+            n = len(windows)
+            return Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
         return self.finished(clean, with_room(clean, self.config, self.dt_ns), drawn)
 
     def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
@@ -197,12 +216,12 @@ class ResponseBackend(Backend):
         self.noise, self.tails = generator.noise, generator.tails
         self.config, self.dt_ns = config, float(generator.response.dt_ns)
 
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         return self.finished(windows, records, drawn)
 
-    def levels(self, windows: FloatArray, n_pre: int, length: int) -> tuple[FloatArray, Codes]:
+    def levels(self, windows: FloatArray, n_pre: int, length: int) -> Translated:
         """Noise-free traces of prepared simulated windows, aligned at sample `n_pre`."""
         before = max(0, n_pre - self.config.samples_before)
         after = max(0, length - n_pre - self.config.samples_after)
@@ -215,7 +234,9 @@ class ResponseBackend(Backend):
         levels = np.full((len(windows), length), np.nan, np.float32)
         height = clean.scale[:, np.newaxis]
         levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / height
-        return levels, clean.codes
+        begin = np.zeros(len(windows), np.int64)
+        begin[clean.index] = clean.align_sample - n_pre - before - padding(self.dt_ns)[0]
+        return Translated(levels, clean.codes, begin)
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
         """Records without noise, and the same prepared; flat tops do not count as saturated."""
@@ -242,14 +263,15 @@ class InverseBackend(Backend):
         self.config = config
         self.dt_ns = dt_ns
 
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> tuple[FloatArray, Codes]:
+    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Invert the response and suppress the noise; deterministic."""
         pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
         pulses = np.asarray(pulses, np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
-        result = np.full_like(windows, np.nan)
+        result, begin = np.full_like(windows, np.nan), np.zeros(len(windows), np.int64)
         result[prepared.index] = prepared.pulses.waveforms
-        return result, prepared.codes
+        begin[prepared.index] = prepared.align_sample - self.config.samples_before
+        return Translated(result, prepared.codes, begin)
 
 
 def backend_of(run: Run, part: str, device: str) -> Backend:

@@ -208,7 +208,6 @@ class FileTranslation:
             out,
             table=self.options.table or f"geds/{self.kind.part}",
             waveform_units=self.form.units,
-            t0_ns=self.form.t0_ns,
             attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
             samples=self.form.samples,
             force=force,

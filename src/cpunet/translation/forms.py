@@ -21,9 +21,9 @@ from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import padding, record_length
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Codes, Rejection
+from cpunet.pulses.preparation import Rejection
 from cpunet.training.run import Run
-from cpunet.translation.backends import Drawn
+from cpunet.translation.backends import Drawn, Translated
 from cpunet.translation.options import LEARNED, NONE, Adc, TranslateOptions
 from cpunet.translation.translator import TranslatedPulses, Translator
 
@@ -49,7 +49,7 @@ class Windows:
     samples, units
         Type and units of the stored samples.
     n_pre, length
-        Samples of a trace before a pulse without noise reaches 99.9 % of its maximum, and all.
+        Samples of a trace before the alignment of a pulse without noise, and all.
     record
         The same of the record within which pulses pile up.
     fills_in
@@ -71,11 +71,6 @@ class Windows:
         self.n_pre, self.length = config.samples_before, config.length
         before = padding(translator.dt_ns)[0]
         self.record = before + self.n_pre, record_length(self.length, translator.dt_ns)
-
-    @property
-    def t0_ns(self) -> float:
-        """Time of the first sample from where a pulse reaches 99.9 % of its maximum."""
-        return -self.n_pre * self.translator.dt_ns
 
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
@@ -103,8 +98,8 @@ class AdcTraces(Windows):
     per_kev, baseline
         ADC counts per prepared unit and keV, and baseline in ADC counts, see `adc_scale`.
     adc
-        Number of samples of a trace, and of those before the pulse without noise reaches
-        99.9 % of its maximum; the values of the prepared window if None.
+        Number of samples of a trace, and of those before the alignment of the pulse without
+        noise; the values of the prepared window if None.
     tails
         Distribution of the pile-up tails, which raise the baseline at the start
         of a trace; None for none.
@@ -154,12 +149,14 @@ class AdcTraces(Windows):
         if self.translator.backend.chain is not None:
             act = partial(self._of_chain, rng_of(known.generator))
             done = self.translator.translate_drawn(pulses, known, act, self.length)
-            windows = done.pulses.waveforms
+            windows, t0_ns = done.pulses.waveforms, done.pulses.t0_ns
         else:
             done = self.translator.translate_drawn(pulses, replace(known, tails_kev=None))
             windows = extended(
                 done.pulses.waveforms, self.config, pulses.dt_ns, self.length, self.n_pre
             )
+            earlier = self.n_pre - self.config.samples_before
+            t0_ns = done.pulses.t0_ns - earlier * pulses.dt_ns
         codes = done.codes
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
@@ -172,25 +169,25 @@ class AdcTraces(Windows):
         scale = np.where(unknown, 0.0, self.per_kev * pulses.energy_kev)
         traces, saturated = to_adc(windows, scale, self.baseline)
         # single precision represents 16-bit integers exactly
-        whole = pulses.with_waveforms(traces.astype(np.float32))
+        whole = replace(pulses, waveforms=traces.astype(np.float32), t0_ns=t0_ns)
         return TranslatedPulses(whole, codes, saturated)
 
     def _of_chain(
         self, rng: np.random.Generator, windows: FloatArray, known: Drawn
-    ) -> tuple[FloatArray, Codes]:
-        """Traces in prepared units from a readout chain, and a `Rejection` for each row."""
+    ) -> Translated:
+        """Traces in prepared units from a readout chain."""
         backend, piled, dt_ns = self.translator.backend, known.piled, self.translator.dt_ns
         energies = known.energy_kev
         assert energies is not None  # those of the pulses
-        levels, codes = backend.levels(windows, self.n_pre, self.length)
+        levels, codes, begin = backend.levels(windows, self.n_pre, self.length)
         if known.noise and backend.noise is not None:
             levels += backend.noise.draw(energies, self.length, rng)
         if piled is not None and len(piled.row):
             # early piled-up pulses need longer traces
             reached = self.length + piled.reach(dt_ns)
-            shapes, _ = backend.levels(windows[piled.partner], self.n_pre, reached)
+            shapes = backend.levels(windows[piled.partner], self.n_pre, reached).windows
             levels += piled.added(np.nan_to_num(shapes), energies, dt_ns, self.length)
-        return levels, codes
+        return Translated(levels, codes, begin)
 
 
 def form_of(run: Run, translator: Translator, options: TranslateOptions) -> Windows:

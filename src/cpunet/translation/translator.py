@@ -24,11 +24,11 @@ from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejection
 from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
 from cpunet.training.run import Run
-from cpunet.translation.backends import Backend, Drawn, Energies, backend_of
+from cpunet.translation.backends import Backend, Drawn, Energies, Translated, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
 
-Act: TypeAlias = Callable[[FloatArray, Drawn], tuple[FloatArray, Codes]]
+Act: TypeAlias = Callable[[FloatArray, Drawn], Translated]
 
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
@@ -103,6 +103,10 @@ class Translator:
         Network, readout chain or inverse.
     recipe, dt_ns
         Recipe of the run, and sampling period in ns.
+    delay_ns
+        What is taken off the times of translated pulses: half rise of the step response for a
+        REN, as much with the other sign for an IREN.  How long a readout takes cannot be seen
+        in unpaired pulses; so the charge of a step is at half rise.
     needs_energies
         Whether the noise depends on the energies.
     tails
@@ -111,9 +115,13 @@ class Translator:
 
     part: ClassVar[str]
     takes: ClassVar[Kind]
+    sign: ClassVar[int]
 
-    def __init__(self, backend: Backend, recipe: Recipe, dt_ns: float) -> None:
-        self.backend, self.recipe, self.dt_ns = backend, recipe, dt_ns
+    def __init__(
+        self, backend: Backend, recipe: Recipe, dt_ns: float, delay_ns: float = 0.0
+    ) -> None:
+        self.backend, self.recipe, self.dt_ns = backend, recipe.at(dt_ns), dt_ns
+        self.delay_ns = delay_ns
         self.needs_energies = backend.needs_energies
         self.tails: DrawnTails | None = backend.tails
 
@@ -126,7 +134,8 @@ class Translator:
         CpunetError
             If the weights of the run do not match its recipe.
         """
-        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns)
+        delay_ns = 0.0 if run.fit is None else cls.sign * run.fit.delay_ns
+        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns, delay_ns)
 
     @classmethod
     def load(cls, run: str | Path, device: str = "cpu") -> Self:
@@ -260,10 +269,13 @@ class Translator:
         rows = codes[prepared.index] == Rejection.ACCEPTED
         waveforms = np.full((len(pulses), length), np.nan, np.float32)
         index = prepared.index[rows]
-        waveforms[index], codes[index] = self.apply_with_codes(
+        done = self.apply_with_codes(
             prepared.pulses.waveforms[rows], drawn.of_rows(index), act, length
         )
-        return TranslatedPulses(pulses.with_waveforms(waveforms), codes)
+        waveforms[index], codes[index] = done.windows, done.codes
+        t0_ns = pulses.t0_ns.copy()
+        t0_ns[index] = prepared.pulses.t0_ns[rows] + done.begin * self.dt_ns - self.delay_ns
+        return TranslatedPulses(replace(pulses, waveforms=waveforms, t0_ns=t0_ns), codes)
 
     def require_sampling(self, what: str, dt_ns: float) -> None:
         """Raise a `CpunetError` if pulses are not sampled like those of the training."""
@@ -284,7 +296,7 @@ class Translator:
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
         drawn = Drawn(energy_kev, noise, generator, tails_kev)
-        return self.apply_with_codes(windows, drawn)[0]
+        return self.apply_with_codes(windows, drawn).windows
 
     def apply_with_codes(
         self,
@@ -292,8 +304,8 @@ class Translator:
         drawn: Drawn,
         act: Act | None = None,
         length: int | None = None,
-    ) -> tuple[FloatArray, Codes]:
-        """Like `apply`, with a `Rejection` for each row.
+    ) -> Translated:
+        """Like `apply`, with a `Rejection` and the begin of each row.
 
         Parameters
         ----------
@@ -320,13 +332,13 @@ class Translator:
         if drawn.tails_kev is not None and self.tails is None:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
         result = np.empty((len(windows), length or windows.shape[1]), np.float32)
-        codes = np.zeros(len(windows), np.uint8)
+        codes, begin = np.zeros(len(windows), np.uint8), np.zeros(len(windows), np.int64)
         with torch.inference_mode():
             for first in range(0, len(windows), BATCH):
                 rows = np.arange(first, min(first + BATCH, len(windows)))
                 some = windows[rows], drawn.of_rows(rows)
-                result[rows], codes[rows] = (act or self.backend)(*some)
-        return result, codes
+                result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)
+        return Translated(result, codes, begin)
 
     def seeded(self, seed: int | None) -> torch.Generator:
         """Return a random generator for the noise, randomly seeded if the seed is None."""
@@ -354,6 +366,7 @@ class REN(Translator):
 
     part = "ren"
     takes = "simulated"
+    sign = 1
 
 
 class IREN(Translator):
@@ -361,3 +374,4 @@ class IREN(Translator):
 
     part = "iren"
     takes = "measured"
+    sign = -1

@@ -52,10 +52,12 @@ class Lh5Source(PulseSource):
             columns = columns_of(options.path, file[chosen.table or "/"])
             rows = _rows_of_contact(options.path, columns, contact)
             self._first, n_pulses = rows or (0, _n_rows(file[self._values]))
-            period = columns_of(options.path, file[chosen.path]).get("dt")
+            own = columns_of(options.path, file[chosen.path])
             if rows is not None:
-                columns = {name: column.part(*rows) for name, column in columns.items()}
-                period = period.part(*rows) if period is not None else None
+                columns, own = (
+                    {name: column.part(*rows) for name, column in of.items()}
+                    for of in (columns, own)
+                )
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
             shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
             if shortest < longest and first.dtype.kind == "f":
@@ -70,7 +72,8 @@ class Lh5Source(PulseSource):
                 length=longest,
                 columns=columns,
                 period_name=f"{chosen.path}/dt",
-                period=period,
+                period=own.get("dt"),
+                t0=own.get("t0"),
             )
         super().__init__(options, layout)
 

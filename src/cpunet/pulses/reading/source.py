@@ -15,6 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.energies import (
     EVENT_KEYS,
+    TIME_UNITS,
     Column,
     require_length,
     resolve_energies,
@@ -50,6 +51,8 @@ class Layout:
         Sampling period, if it is in the file.
     period_hint
         Hint for the error message if the sampling period is not in the file.
+    t0
+        Times of the first samples, if they are in the file.
     """
 
     format: str
@@ -60,6 +63,7 @@ class Layout:
     period_name: str = "dt"
     period: Column | None = None
     period_hint: str = ""
+    t0: Column | None = None
 
     @classmethod
     def of_array(
@@ -229,8 +233,15 @@ class PulseSource(ABC):
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         self._sampling.check(start, event_number)
+        t0, t0_ns = self.layout.t0, np.zeros(len(waveforms))
+        if t0 is not None and t0.units in TIME_UNITS:
+            t0_ns = TIME_UNITS[t0.units] * np.asarray(t0.read(start, stop), np.float64)
         return Pulses.of(
-            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number
+            waveforms,
+            dt_ns=self.dt_ns,
+            energy_kev=energy_kev,
+            event_number=event_number,
+            t0_ns=t0_ns,
         )
 
 
