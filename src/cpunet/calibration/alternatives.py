@@ -199,6 +199,6 @@ def _numbers(
     records /= records[:, -padding(pulses.dt_ns)[1] :].mean(axis=1, keepdims=True)
     ends = np.minimum(windows.waveforms, COLLECTED)
     return {
-        "current_amplitude": current_amplitude(records),
+        "current_amplitude": current_amplitude(records, pulses.dt_ns),
         "drift_time": drift_time(ends, pulses.dt_ns, recipe.scores.drift_start_fraction),
     }

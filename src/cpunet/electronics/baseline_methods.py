@@ -262,14 +262,14 @@ class RC(BaselineMethod):
             tau.
         """
         slope, steps = fitted_decay(sim, data, dt_ns, align, MAX_PULSES)
-        wanted = most_frequent(current_amplitude(steps))
+        wanted = most_frequent(current_amplitude(steps, dt_ns))
         before, longest = padding(dt_ns)[0], LONGEST_NS / dt_ns
         window = slice(before, before + sim.shape[1])
         current = currents(sim[:MAX_PULSES], dt_ns)
 
         def excess(tau: float) -> float:
             response = np.cumsum(_integration(current, 1 / tau), axis=1)[:, window]
-            return most_frequent(current_amplitude(response.astype(np.float32))) - wanted
+            return most_frequent(current_amplitude(response.astype(np.float32), dt_ns)) - wanted
 
         if excess(1.0) <= 0:
             # The data rise faster than the simulation: any integration makes it worse.

@@ -13,7 +13,6 @@ from cpunet.settings import (
     Fraction,
     NonNegative,
     Positive,
-    Samples,
     Set,
     read_settings,
 )
@@ -24,6 +23,7 @@ REFERENCE_KEV = 2614.5
 _Share = Annotated[float, Field(gt=0, le=1)]
 MAX_RATE_KHZ = 1000.0  # a pulse per microsecond, far beyond any detector
 MAX_JITTER_NS = 1e6  # longer than records; traces are followed from the start of the pulse
+MAX_SAMPLES = 100_000  # of a record, far beyond any digitiser
 _Rate = Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
 
 
@@ -87,7 +87,12 @@ class NoiseSpectrum(Config):
 
 
 class ReadoutNoise(Config):
-    """Noise with an RMS of `rms_kev` and a spectrum, independent of the pulse energy."""
+    """Noise with an RMS of `rms_kev` and a spectrum, independent of the pulse energy.
+
+    The RMS is that of single samples, at whatever period. The spectrum ends near its corner,
+    which periods up to some 30 ns can follow; longer ones would average over the noise, so
+    that a lower RMS belongs to them.
+    """
 
     rms_kev: NonNegative
     spectrum: NoiseSpectrum
@@ -134,10 +139,10 @@ class Electronics(Config):
     resolution_fwhm_kev
         FWHM of the calibrated energies at 2614.5 keV. It scales with the square root of the
         energy.
-    n_pre, length
-        Number of samples before the pulse, and of the whole record.
+    before_ns, record_ns
+        Time before the pulse and of the whole record in ns, which are rounded to whole samples.
     dt_ns
-        Sampling period in ns. A sample is the mean over one period.
+        Sampling period in ns, 1 to 200. A sample is the mean over one period.
     """
 
     name: str
@@ -157,9 +162,9 @@ class Electronics(Config):
     other_pulses_kev: Annotated[tuple[Positive, ...], Field(min_length=2)]
     adc_bits: Annotated[int, Field(ge=8, le=16)]
     resolution_fwhm_kev: NonNegative
-    n_pre: Samples
-    length: Samples
-    dt_ns: Annotated[float, Field(ge=0.1, le=1e6)]
+    before_ns: Positive
+    record_ns: Positive
+    dt_ns: Annotated[float, Field(ge=1, le=200)]
 
     @model_validator(mode="after")
     def _is_possible(self) -> Electronics:
@@ -168,8 +173,10 @@ class Electronics(Config):
             raise ValueError(f"decays: their fractions add up to {total:g}; they must to 1")
         if list(self.other_pulses_kev) != sorted(self.other_pulses_kev):
             raise ValueError("other_pulses_kev: quantiles of energies must not fall")
-        if self.n_pre >= self.length:
-            raise ValueError("n_pre must be less than length, or no pulse is in the record")
+        if self.record_ns > MAX_SAMPLES * self.dt_ns:
+            raise ValueError(f"record_ns: more than {MAX_SAMPLES} samples; lower it")
+        if not 0 < self.n_pre < self.length:
+            raise ValueError("before_ns must be at least dt_ns and less than record_ns")
         if self.baseline_mean_adc >= self.adc_top:
             raise ValueError(
                 f"baseline_mean_adc must be below {self.adc_top}, the most of adc_bits"
@@ -178,6 +185,16 @@ class Electronics(Config):
         if any(line.frequency_MHz >= nyquist_MHz for line in lines):
             raise ValueError(f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate")
         return self
+
+    @property
+    def n_pre(self) -> int:
+        """Number of samples before the pulse."""
+        return round(self.before_ns / self.dt_ns)
+
+    @property
+    def length(self) -> int:
+        """Number of samples of the record."""
+        return round(self.record_ns / self.dt_ns)
 
     @property
     def adc_top(self) -> int:
@@ -236,7 +253,7 @@ def read_electronics(path: str | Path | Electronics, overrides: Set = ()) -> Ele
     Parameters
     ----------
     path
-        Name of a preset (ornl, legend200, ringing) or a YAML file with the fields of
+        Name of a preset (ornl, legend200, ringing, mjd) or a YAML file with the fields of
         `Electronics`. Or a readout chain, for overrides.
     overrides
         Values as ``"earlier_pulses.rate_kHz=3"``.
@@ -252,5 +269,7 @@ def read_electronics(path: str | Path | Electronics, overrides: Set = ()) -> Ele
     54.6
     >>> read_electronics("ornl", ["earlier_pulses.rate_kHz=3"]).earlier_pulses.rate_kHz
     3.0
+    >>> read_electronics("ornl").length, read_electronics("ornl", ["dt_ns=10"]).length
+    (1400, 2240)
     """
     return read_settings(Electronics, path, overrides, _PRESETS)

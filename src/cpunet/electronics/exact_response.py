@@ -36,7 +36,7 @@ def linear_response(
     electronics
         The readout chain.
     shift_ns
-        Start of each pulse after `n_pre` samples, in ns; shape ``(n,)`` or a number.
+        Start of each pulse after the chain's `n_pre` samples, in ns; shape ``(n,)`` or a number.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
     if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
         raise CpunetError(
             f"{where}: dt_ns = {electronics.dt_ns:g} is no multiple of the pulses' "
-            f"{pulses.dt_ns:g} ns; simulate them with 1, 2 or 4 ns"
+            f"{pulses.dt_ns:g} ns; simulate them with a period that divides it"
         )
     if min(poles) < pulses.dt_ns:
         raise CpunetError(

@@ -22,9 +22,9 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray as PulseArray
 from cpunet.pulses.container import Pulses
 
-# Traces are cut from longer ones (131 us at 16 ns, down to 8 kHz), so that noise slower than
-# the record moves its level and the trace's end is independent of its beginning.
-_MIN_SAMPLES = 8192
+# Traces are cut from longer ones (8192 samples of 16 ns, down to 8 kHz), so that noise slower
+# than the record moves its level and the trace's end is independent of its beginning.
+_MIN_NS = 131_072
 _TRACES_AT_A_TIME = 128
 
 
@@ -81,7 +81,7 @@ def coloured_noise(
 
     Each real FFT bin is a complex Gaussian whose variance follows `noise_power`. Traces are
     cut from longer ones. The RMS is taken about 0 and includes frequencies down to that of
-    these longer traces (8 kHz at 16 ns), so the scatter within a short trace is slightly lower.
+    these longer traces (8 kHz), so the scatter within a short trace is slightly lower.
 
     Examples
     --------
@@ -90,7 +90,7 @@ def coloured_noise(
     >>> bool(abs(noise.std() - 1) < 0.05)
     True
     """
-    n_long = max(_MIN_SAMPLES, fft.next_fast_len(2 * length, real=True))
+    n_long = fft.next_fast_len(max(round(_MIN_NS / dt_ns), 2 * length), real=True)
     power = noise_power(spectrum, dt_ns, n_long)
     # irfft divides by n_long, and each bin but the last represents both signs of frequency
     scale = n_long * np.sqrt(power / 4)

@@ -57,8 +57,8 @@ COUNTS = ("n_sim", "n_data", "sim_lines", "data_lines", "flags")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
 LABELS = {"DEP": 0, "SEP": 1, "FEP": 2, "other": 3}
 OTHER = LABELS["other"]
-# Period of the simulated pulses at the input of the chain; same as that of the library.
-_FINE_NS = 4.0
+# Longest period of the simulated pulses at the input of the chain.
+_COARSEST_NS = 4.0
 
 
 @dataclass(repr=False)
@@ -159,7 +159,7 @@ def make_stand(
     out
         Folder to make; it appears when it is complete.
     electronics
-        Readout of the data and of the truth: ornl, legend200, ringing, or a YAML file.
+        Readout of the data and of the truth: ornl, legend200, ringing, mjd, or a YAML file.
     detector
         icpc, bege, ppc, a YAML file, a siggen configuration or LEGEND metadata.
     events
@@ -169,7 +169,8 @@ def make_stand(
         or a YAML file of keys (repeatable). The truth is the response to the simulated pulses.
     settings
         Override a value of the detector, of the settings or of the readout: bias_V=3500,
-        earlier_pulses.rate_kHz=3, or all those in a YAML file, without the period (repeatable).
+        earlier_pulses.rate_kHz=3, or all those in a YAML file (repeatable). dt_ns=10 is the
+        period of the data and of the simulated pulses; records last as long at any.
     seed
         Seed of all random numbers; the sides are independent.
     force
@@ -187,18 +188,21 @@ def make_stand(
 
     cpunet stand --preset ornl --set earlier_pulses.rate_kHz=3 --out busy
 
+    cpunet stand --preset mjd --detector ppc --out mjd
+
+    cpunet stand --preset legend200 --set dt_ns=10 --out stand10
+
     cpunet stand --preset ornl --shift default --shift bias_V=20 --out stand2
     """
     words = [w for given in (shift, settings) if not isinstance(given, Mapping) for w in given]
     given = (electronics, detector, *words)
     refuse_inputs(Path(out), *(f for f in given if isinstance(f, str | Path)))
     values = words_and_files(settings)
-    others = {"name", *SimulationSettings.model_fields}  # a period is that of the pulses
-    readout = Electronics.model_fields.keys() - others
+    readout = Electronics.model_fields.keys() - {"name"}  # a name is that of the detector
     of_chain = {k: values.pop(k) for k in [*values] if k.split(".")[0] in readout}
     seed, moved = require_seed(seed), Shift.of(shift)
     chain = read_electronics(electronics, of_chain)
-    crystal, physics = detector_and_settings(detector, values)
+    crystal, physics = detector_and_settings(detector, values, dt_ns=chain.dt_ns)
     wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
     sim, data, readout_seed = stand_sides(chain, crystal, wanted, moved, physics, seed)
     mode, n_events = sim.settings.mode, sum(sim.source.events.values())
@@ -302,32 +306,27 @@ def stand_sides(
     shift
         Deviations of the data's detector from the simulated one.
     settings
-        Settings of the simulation.
+        Settings of the simulation; their period becomes that of the pulses at the input of
+        the chain.
     seed
         Seed of all random numbers.
 
     Raises
     ------
     CpunetError
-        If a window has no events, the chain's period is not a multiple of that of the
-        pulses, the settings have another period, or the shifted detector is not valid.
+        If a window has no events, the chain's period is no multiple of the time step, the
+        steps are too long, or the shifted detector is not valid.
     """
     for window, number in events.items():
         if number < 1:
             raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
-    ratio = electronics.dt_ns / _FINE_NS
-    if abs(ratio - round(ratio)) > 1e-9:
+    if settings.step_ns > _COARSEST_NS:
         raise CpunetError(
-            f"electronics {electronics.name}: dt_ns = {electronics.dt_ns:g} is no multiple of "
-            f"{_FINE_NS:g}, the pulses' period; choose another"
+            f"settings: step_ns = {settings.step_ns:g}: a stand needs steps of at most "
+            f"{_COARSEST_NS:g} ns; lower it"
         )
-    if "dt_ns" in settings.model_fields_set and settings.dt_ns != _FINE_NS:
-        raise CpunetError(
-            f"settings: dt_ns = {settings.dt_ns:g}: the pulses of a stand have the chain's "
-            "period; leave dt_ns out"
-        )
-    values = settings.model_dump() | {"dt_ns": _FINE_NS}
-    settings = checked(SimulationSettings, values, f"settings, for a stand's {_FINE_NS:g} ns")
+    values = settings.model_dump() | {"dt_ns": _fine_ns(electronics.dt_ns, settings.step_ns)}
+    settings = checked(SimulationSettings, values, "settings")
     # seeds of the events of both sides and of the readout
     sim_seed, data_seed, readout_seed = map(
         int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
@@ -337,6 +336,25 @@ def stand_sides(
     other = shift.detector(detector), shift.settings(settings)
     data = Side(*other, GammaSource(*source, data_seed))
     return sim, data, readout_seed
+
+
+def _fine_ns(dt_ns: float, step_ns: float) -> float:
+    """Longest period of pulses with whole steps, and at least two samples in one of `dt_ns`.
+
+    Examples
+    --------
+    >>> [_fine_ns(dt_ns, 1.0) for dt_ns in (1, 2, 4, 5, 8, 10, 16)]
+    [1.0, 1.0, 2.0, 1.0, 4.0, 2.0, 4.0]
+    >>> _fine_ns(12.5, 0.5)
+    2.5
+    """
+    steps = round(dt_ns / step_ns)
+    parts = next(
+        n
+        for n in range(min(2, steps), steps + 1)
+        if steps % n == 0 and dt_ns <= n * _COARSEST_NS
+    )
+    return dt_ns / parts
 
 
 def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindow]) -> Labels:

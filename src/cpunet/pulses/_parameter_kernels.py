@@ -43,7 +43,7 @@ def average(values, steps, averaged):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def averaged_maxima(current, first, samples, upsampling, steps, averages, ends):  # type: ignore[no-untyped-def]
+def averaged_maxima(current, first, samples, upsampling, widths, ends):  # type: ignore[no-untyped-def]
     """Maximum of the averaged current of each pulse in the `samples` samples from `first` on.
 
     Parameters
@@ -54,8 +54,8 @@ def averaged_maxima(current, first, samples, upsampling, steps, averages, ends):
         First sample that is averaged, shape ``(n,)``, and number of averaged samples.
     upsampling
         Steps per sample.
-    steps, averages
-        Width of the moving average in steps, and number of successive averages.
+    widths
+        Widths of the successive moving averages in steps.
     ends
         Steps at each end that are excluded from the search.
 
@@ -78,8 +78,8 @@ def averaged_maxima(current, first, samples, upsampling, steps, averages, ends):
             start = sample * upsampling - upsampling // 2
             for i in range(max(start, 0), min(start + upsampling, fine)):
                 values[i] = highest
-        for _ in range(averages):
-            average(values, steps, averaged)
+        for width in widths:
+            average(values, width, averaged)
             values, averaged = averaged, values
         highest[:] = values[ends]
         for i in range(ends, fine - ends):

@@ -10,9 +10,11 @@ is told by the cubic spline through the samples: linear interpolation would smoo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,32 +47,64 @@ PARAMETERS = {
     "tail_slope": Parameter("Tail slope", "1/ms"),
 }
 
-# I_max as defined by Majorana and LEGEND: 16 steps per sample (1 ns for 16-ns records)
-# and three moving averages over 48 steps.
-UPSAMPLING = 16
-AVERAGE_STEPS = 48
-AVERAGES = 3
-
-# Reach of the averages in samples: they cover 94 steps back and 47 ahead.
-REACH = 8
-# Samples around the steepest point that are searched first for the maximum.
-NEIGHBOURHOOD = 96
+# I_max as defined by Majorana and LEGEND at 16 ns: moving averages in steps of 1 ns.
+AVERAGE_NS, AVERAGES, REFERENCE_NS = 48.0, 3, 16.0
+# Part of the difference of two periods squared that a further average makes up for, see
+# `current_amplitude`.
+SHORTER = 2.5
+# Time around the steepest point of a pulse that is searched first for the maximum.
+NEIGHBOURHOOD_NS = 1536.0
 
 BLOCK = 256  # pulses per block: bounds memory and keeps the buffers in the cache
 
 
-def current_amplitude(waveforms: FloatArray) -> Values:
+class Averages(NamedTuple):
+    """The averages of the current at a sampling period.
+
+    Parameters
+    ----------
+    steps
+        Steps per sample.
+    widths
+        Widths of the successive moving averages in steps.
+    """
+
+    steps: int
+    widths: tuple[int, ...]
+
+    @classmethod
+    def at(cls, dt_ns: float) -> Averages:
+        """Those for a sampling period in ns."""
+        steps = max(1, round(dt_ns))
+        further = math.sqrt(SHORTER * max(REFERENCE_NS**2 - dt_ns**2, 0.0))
+        times = [AVERAGE_NS] * AVERAGES + [further] * (further > 0)
+        return cls(steps, tuple(max(1, round(time * steps / dt_ns)) for time in times))
+
+    @property
+    def reach(self) -> int:
+        """Samples that they cover on either side."""
+        # they look back and ahead by turns
+        return math.ceil(sum(self.widths[::2]) / self.steps + 1.5)
+
+
+def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     r"""Maximum current of each pulse (A of A/E; the paper's I_max, section 4.3.2).
 
     .. math:: I_{\max} = \max_t \, (h * h * h * i)(t), \qquad i_k = x_{k+1} - x_k
 
-    with the moving average :math:`h` over 48 steps of 1/16 sample, as defined by Majorana
-    (arXiv:1901.05388).  It is the result of dspeed's processors
+    with the moving average :math:`h` over 48 ns in steps of 1 ns, as defined by Majorana
+    (arXiv:1901.05388).  At 16 ns it is the result of dspeed's processors
     ``avg_current(1)`` → ``upsampler(16)`` → ``moving_window_multi(48, 3, 0)`` → ``min_max``,
     whose arithmetic is repeated here for several pulses at once.
 
-    Each value of that chain is a positively weighted mean of the current at most `REACH`
-    samples away.  The chain is therefore first run only around the steepest point of a
+    There the difference of samples 16 ns apart, held for 16 ns, and where samples are means,
+    these, average the current, too.  At a shorter period :math:`\Delta t` a further moving
+    average over :math:`\sqrt{2.5\,(16^2 - \Delta t^2)}` ns has nearly the variance that
+    they lack: of two such averages for samples at a time, of three for means.  Divided by the
+    period, the amplitude of an edge is then the same within half a percent.
+
+    Each value of that chain is a positively weighted mean of the current some samples
+    away.  The chain is therefore first run only around the steepest point of a
     pulse.  If the current elsewhere exceeds the maximum found there, the whole pulse is
     processed.
 
@@ -78,6 +112,8 @@ def current_amplitude(waveforms: FloatArray) -> Values:
     ----------
     waveforms
         Pulses of shape ``(n, length)``.
+    dt_ns
+        Sampling period in ns.
 
     Returns
     -------
@@ -95,31 +131,36 @@ def current_amplitude(waveforms: FloatArray) -> Values:
 
     >>> import numpy as np
     >>> ramp = np.clip(np.arange(-100.0, 300.0) / 200.0, 0, 1).astype(np.float32)
-    >>> current_amplitude(ramp[np.newaxis]).round(6)
+    >>> current_amplitude(ramp[np.newaxis], dt_ns=16).round(6)
     array([0.005])
     """
-    shortest = AVERAGE_STEPS // UPSAMPLING + 3
-    return _by_blocks(_current_amplitude, waveforms, shortest)
+    averages = Averages.at(dt_ns)
+    shortest = max(averages.widths) // averages.steps + 3
+    of_block = partial(_current_amplitude, dt_ns=dt_ns, averages=averages)
+    return _by_blocks(of_block, waveforms, shortest)
 
 
-def current_amplitude_kernel() -> npt.NDArray[np.float32]:
+def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
     """Weights of the current's samples on the fine grid of the current amplitude.
 
     Returns
     -------
     numpy.ndarray
-        Float32, shape ``(16, 2 * REACH + 1)``: for each step within a sample, the weights of
-        the current from `REACH` samples before to `REACH` samples after it.
+        Float32, shape ``(steps, 2 * reach + 1)``: for each step within a sample, the weights of
+        the current from `reach` samples before to as many after it, see `Averages`.
     """
-    fine = np.zeros(((4 * REACH + 1) * UPSAMPLING, 1), np.float32)
-    centre = 2 * REACH * UPSAMPLING
-    fine[centre - UPSAMPLING // 2 : centre + UPSAMPLING // 2] = 1  # a current of one sample
+    averages = Averages.at(dt_ns)
+    steps, reach = averages.steps, averages.reach
+    fine = np.zeros(((4 * reach + 1) * steps, 1), np.float32)
+    centre = 2 * reach * steps
+    fine[centre - steps // 2 : centre - steps // 2 + steps] = 1  # a current of one sample
     smooth = np.empty_like(fine)
-    for _ in range(AVERAGES):
-        kernels.average(fine, AVERAGE_STEPS, smooth)
+    for width in averages.widths:
+        kernels.average(fine, width, smooth)
         fine, smooth = smooth, fine
-    grid = fine[::-1].reshape(-1, UPSAMPLING)  # each average reverses the order
-    around = grid[REACH : 3 * REACH + 1]
+    # each average reverses the order
+    forward = fine[::-1] if len(averages.widths) % 2 else fine
+    around = forward.reshape(-1, steps)[reach : 3 * reach + 1]
     # the response at sample j to a unit current at sample 0 is the weight of the current j
     # samples earlier
     return np.ascontiguousarray(around[::-1].T)
@@ -245,7 +286,7 @@ def pulse_parameters(
     """
     waveforms = pulses.waveforms
     return {
-        "current_amplitude": current_amplitude(waveforms),
+        "current_amplitude": current_amplitude(waveforms, pulses.dt_ns),
         "drift_time": drift_time(waveforms, pulses.dt_ns, scores.drift_start_fraction),
         "tail_slope": tail_slope(
             waveforms, pulses.dt_ns, preparation.at(pulses.dt_ns).decay_fit_samples
@@ -264,32 +305,38 @@ def _by_blocks(
     return values
 
 
-def _current_amplitude(waveforms: FloatArray) -> Values:
+def _current_amplitude(waveforms: FloatArray, dt_ns: float, averages: Averages) -> Values:
     n, length = waveforms.shape
+    reach = averages.reach
+    near = max(round(NEIGHBOURHOOD_NS / dt_ns), 5 * reach)
     current, steepest = kernels.currents(waveforms)
     start = np.zeros(n, np.int64)
-    if length - 1 <= NEIGHBOURHOOD:
-        return _maximum(current, start, length - 1, 0)
-    first = np.clip(steepest - NEIGHBOURHOOD // 2, 0, length - 1 - NEIGHBOURHOOD)
+    if length - 1 <= near:
+        return _maximum(current, start, length - 1, 0, averages)
+    first = np.clip(steepest - near // 2, 0, length - 1 - near)
     # near the ends of the neighbourhood the averages differ from those of the whole pulse
-    values = _maximum(current, first, NEIGHBOURHOOD, REACH)
+    values = _maximum(current, first, near, reach, averages)
     # samples that those averages do not reach
-    elsewhere = kernels.maxima_elsewhere(current, first + 2 * REACH, NEIGHBOURHOOD - 4 * REACH)
+    elsewhere = kernels.maxima_elsewhere(current, first + 2 * reach, near - 4 * reach)
     unsure = np.flatnonzero(~(elsewhere <= values))
     if len(unsure):
-        values[unsure] = _maximum(current[unsure], start, length - 1, 0)
+        values[unsure] = _maximum(current[unsure], start, length - 1, 0, averages)
     return values
 
 
 def _maximum(
-    current: FloatArray, first: npt.NDArray[np.int64], samples: int, ends: int
+    current: FloatArray,
+    first: npt.NDArray[np.int64],
+    samples: int,
+    ends: int,
+    averages: Averages,
 ) -> Values:
     """Maximum of the averaged current, excluding `ends` samples at each end."""
-    ends *= UPSAMPLING
-    found: FloatArray = kernels.averaged_maxima(
-        current, first, samples, UPSAMPLING, AVERAGE_STEPS, AVERAGES, ends
+    steps, widths = averages
+    highest: FloatArray = kernels.averaged_maxima(
+        current, first, samples, steps, widths, ends * steps
     )
-    return found.astype(float)
+    return highest.astype(float)
 
 
 _compiled: Any = kernel(error_model="numpy")

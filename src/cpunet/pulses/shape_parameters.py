@@ -108,7 +108,7 @@ def all_parameters(
         # overflows become NaN below
         with np.errstate(all="ignore"):
             found = {
-                "current_amplitude": current_amplitude(block)
+                "current_amplitude": current_amplitude(block, pulses.dt_ns)
                 if amplitudes is None
                 else np.where(damaged, np.nan, amplitudes[rows]),
                 "drift_time": drift_time(block, pulses.dt_ns, scores.drift_start_fraction),

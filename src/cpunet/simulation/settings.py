@@ -19,6 +19,13 @@ _Nanoseconds = Annotated[float, Field(ge=0.01, le=1e6)]
 _Diffusion = Annotated[float, Field(gt=0, le=1000)]
 _MAX_STEPS = 2_000_000
 _PerUs = Annotated[float, Field(ge=0, le=100)]
+# Steps to propose for a period that the step does not divide.
+_FINER_NS = (2.0, 1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
+
+
+def _is_multiple(dt_ns: float, step_ns: float) -> bool:
+    ratio = dt_ns / step_ns
+    return ratio > 1 - 1e-9 and abs(ratio - round(ratio)) < 1e-9
 
 
 class SimulationSettings(Config):
@@ -142,9 +149,12 @@ class SimulationSettings(Config):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> SimulationSettings:
-        ratio = self.dt_ns / self.step_ns
-        if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
-            raise ValueError(f"dt_ns must be a multiple of {self.step_ns} ns")
+        if not _is_multiple(self.dt_ns, self.step_ns):
+            finer = [s for s in _FINER_NS if s < self.step_ns and _is_multiple(self.dt_ns, s)]
+            remedy = f"add step_ns={finer[0]:g}" if finer else "choose another"
+            raise ValueError(
+                f"dt_ns must be a multiple of step_ns, {self.step_ns:g} ns; {remedy}"
+            )
         if self.length_ns < self.dt_ns:
             raise ValueError("length_ns must be at least dt_ns")
         if self.n_steps > _MAX_STEPS:

@@ -30,6 +30,8 @@ class RecordWindow(NamedTuple):
         First sample of the tail from the crossing, and number of samples of its slope.
     edge
         Samples on either side of the crossing that contain the steepest point.
+    dt_ns
+        Sampling period in ns.
     """
 
     level: float
@@ -43,6 +45,7 @@ class RecordWindow(NamedTuple):
     tail: int
     fit_samples: int
     edge: int
+    dt_ns: float
 
 
 FAST = {"nnan", "nsz", "reassoc", "contract"}  # where all numbers are finite

@@ -372,7 +372,7 @@ def _of_height_one(one: InputSet) -> FloatArray:
 
 
 def _amplitudes(one: InputSet) -> Values:
-    return current_amplitude(_of_height_one(one))
+    return current_amplitude(_of_height_one(one), one.dt_ns)
 
 
 def _rise_ns(one: InputSet) -> Values:

@@ -88,7 +88,9 @@ class DifferentiableReadings:
         self.centres, self.spreads = (
             torch.from_numpy(values).float() for values in (moments.centres, moments.spreads)
         )
-        self.weights = torch.from_numpy(np.asarray(current_amplitude_kernel(), np.float32))
+        self.weights = torch.from_numpy(
+            np.asarray(current_amplitude_kernel(w.dt_ns), np.float32)
+        )
         lever = torch.arange(w.fit_samples) - 0.5 * (w.fit_samples - 1)
         self.lever = lever / (lever @ lever)
         self.sum = self.matrix.sum(dim=0)

@@ -385,6 +385,7 @@ def _window(
         tail=preparation.samples_after - preparation.decay_fit_samples,
         fit_samples=preparation.decay_fit_samples,
         edge=config.samples(EDGE_NS),
+        dt_ns=config.sampled_ns,
     )
 
 
@@ -395,7 +396,7 @@ def aligned_records(
     n = len(records)
     aligned = np.empty((n, window.before + window.after), np.float32)
     slopes, amplitudes, places = np.empty(n), np.empty(n), np.empty((n, 6))
-    weights = current_amplitude_kernel()
+    weights = current_amplitude_kernel(window.dt_ns)
     read_records(records, window, weights, aligned, slopes, amplitudes, places)
     return aligned, slopes, np.log(np.maximum(amplitudes, 1e-4)), places
 

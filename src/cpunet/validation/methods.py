@@ -351,7 +351,7 @@ def translate_all(
         every,
         {method: _whole(windows) for method, windows in every.items()},
         {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
-        {method: current_amplitude(windows) for method, windows in every.items()},
+        {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()},
         known,
         squares,
         truth,
