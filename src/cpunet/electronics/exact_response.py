@@ -36,7 +36,7 @@ def linear_response(
     electronics
         The readout chain.
     shift_ns
-        Start of each pulse after the chain's `n_pre` samples, in ns; shape ``(n,)`` or a number.
+        Start of each pulse after `n_pre` samples, in ns; shape ``(n,)`` or a number.
 
     Returns
     -------
