@@ -54,7 +54,7 @@ def judged(stand: Path) -> tuple[np.ndarray, np.ndarray]:
     rows = np.flatnonzero(truth["label"][prepared.index] == 0)[:1000]
     traces = truth["response"][prepared.index[rows]].astype(np.float32)
     windows = finish(traces, RECIPE.preparation, dt_ns=sim.dt_ns).windows
-    return prepared.pulses.waveforms[rows], current_amplitude(windows)
+    return prepared.pulses.waveforms[rows], current_amplitude(windows, 16.0)
 
 
 def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray) -> float:
@@ -66,7 +66,7 @@ def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray
 
 def off(translated: np.ndarray, wanted: np.ndarray) -> float:
     """Median relative error of current amplitudes in percent."""
-    return 100 * float(np.nanmedian(np.log(current_amplitude(translated) / wanted)))
+    return 100 * float(np.nanmedian(np.log(current_amplitude(translated, 16.0) / wanted)))
 
 
 def experiment(
@@ -91,12 +91,12 @@ def experiment(
     ).windows
     data = Pulses.of(measured, dt_ns=sim.dt_ns, energy_kev=kev)
     true = finish(records(windows), config, dt_ns=sim.dt_ns).windows
-    return sim[:half], data, current_amplitude(true)
+    return sim[:half], data, current_amplitude(true, 16.0)
 
 
 def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
     moments = Moments.of_data(data.waveforms, TRAINING, RECIPE.preparation)
-    length = record_length(sim.waveforms.shape[1])
+    length = record_length(sim.waveforms.shape[1], sim.dt_ns)
     drawn = Noise.draw(noise, sim.energy_kev, length, TRAINING.noise_sets, rng)
     rows = np.arange(len(sim))
     return Band("FEP", SimulatedSide(sim.waveforms, drawn, moments, np.ones(len(sim))), rows)

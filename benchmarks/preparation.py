@@ -18,15 +18,15 @@ from cpunet.recipes.schema import PreparationConfig
 
 N_PULSES, LENGTH, REPEATS = 10_000, 1_200, 7
 CONFIG = PreparationConfig(
-    samples_before=400,
-    samples_after=400,
-    align_fraction=0.999,
-    baseline_samples=200,
-    tail_samples=5,
+    before_ns=6400,
+    after_ns=6400,
+    align_at=0.999,
+    baseline_ns=3200,
+    tail_ns=80,
     tail_level=0.80,
-    decay_fit_samples=300,
-    max_padding_before=200,
-    max_padding_after=0,
+    decay_fit_ns=4800,
+    padding_before_ns=3200,
+    padding_after_ns=0,
     saturation_run=4,
 )
 

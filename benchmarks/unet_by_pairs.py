@@ -49,7 +49,7 @@ def taught(
         torch.from_numpy(side)[:, None] for side in (prepared.waveforms, wanted)
     )  # (n, 1, samples)
     config, steps = recipe.cyclegan.training, given.steps
-    weights = window_weights(config.losses)
+    weights = window_weights(config.losses, recipe.preparation.length)
     sampler = EpochSampler(pulses, config.batch_size, seed=0)
     networks = [model.ren, model.iren] if given.out else [model.ren]
     optimiser = AdamW([p for network in networks for p in network.parameters()], given.rate)

@@ -24,17 +24,17 @@ import torch
 from lgdo import ArrayOfEqualSizedArrays, WaveformTable
 from matplotlib.figure import Figure
 
+from cpunet import recipes
 from cpunet.cli import main
-from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.finishing import finish
+from cpunet.electronics.baseline_noise import BaselineNoise, record_samples
+from cpunet.electronics.finishing import finish, padding
 from cpunet.electronics.tails_law import TailsLaw, energies_at
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import Columns, PulseWriter
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.cyclegan import Step
 from cpunet.training.run import Run
@@ -51,18 +51,27 @@ DT_NS = 16.0
 LENGTH, START, STOP = 1200, 500, 725  # of a trace, and of the charge within it
 KEV = (2614.511, 2103.511, 1592.511)
 
+
+def load_recipe(recipe: str, settings: Any = ()) -> Recipe:
+    """A recipe for pulses with the period of these."""
+    return recipes.load_recipe(recipe, settings).at(DT_NS)
+
+
 PREPARATION = PreparationConfig(
-    samples_before=400,
-    samples_after=400,
-    align_fraction=0.999,
-    baseline_samples=200,
-    tail_samples=5,
+    before_ns=6400,
+    after_ns=6400,
+    align_at="half_height",
+    baseline_ns=3200,
+    tail_ns=80,
     tail_level=0.8,
-    decay_fit_samples=300,
-    max_padding_before=200,
-    max_padding_after=0,
+    decay_fit_ns=4800,
+    padding_before_ns=3200,
+    padding_after_ns=0,
     saturation_run=4,
-)
+).at(DT_NS)
+PADDING_BEFORE, PADDING_AFTER = padding(DT_NS)
+NOISE_SAMPLES = record_samples(DT_NS)
+NOISE_BINS = NOISE_SAMPLES // 2 + 1
 # of a run that was not trained
 FACTS = {"peak": "FEP", "seed": 0, "dt_ns": DT_NS, "seconds": 1.0, "device": "cpu"}
 # settings of the narrowest networks
@@ -297,7 +306,7 @@ def write_chain(
     chain = ResponseGenerator(recipe.matching.generator, DT_NS)
     if noise_kev:
         density = np.full(NOISE_BINS, noise_kev**2)
-        chain.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
+        chain.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
     with torch.no_grad():
         change(chain)
     networks = {"ren": chain} | ({} if inverse is None else {"iren": inverse(chain)})

@@ -16,11 +16,10 @@ from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.description import left_out, trace_properties
-from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits
 from cpunet.training import chain_description
-from synthetic import status_of, write_pulses, write_run
+from synthetic import load_recipe, status_of, write_pulses, write_run
 
 RECIPE = load_recipe("fast")
 DT = FileOptions(dt_ns=16)

@@ -118,7 +118,7 @@ def test_the_papers_numbers():
     assert (training.iterations, training.decay_start, training.batch_size) == (7000, 1000, 32)
     assert (training.rate_generators, training.rate_discriminators) == (1e-3, 1e-3)
     assert (training.discriminator_interval, training.max_grad_norm) == (30, 100)
-    assert (losses.baseline_len, losses.rising_edge_len, losses.tail_len) == (200, 250, 350)
+    assert (losses.baseline_ns, losses.rising_edge_ns, losses.tail_ns) == (3200, 4000, 5600)
     assert (losses.baseline_weight, losses.rising_edge_weight, losses.tail_weight) == (3, 10, 7)
     weights = (losses.cycle_weight, losses.identity_weight, losses.adversarial_weight)
     assert weights == (20, 5, 9)
@@ -156,7 +156,7 @@ def test_values_are_overridden_in_turn():
         ("training.rate_generators=.nan", "training.rate_generators: "),
         ("discriminator.value_range=[1, 0]", "discriminator.value_range: must go from a lower"),
         ("discriminator.samples_per_step=7", "samples_per_step (7)"),
-        ("preparation.samples_before=300", "the loss windows cover 800 samples"),
+        ("preparation.before_ns=4800", "the loss windows cover 12800 ns"),
         ("preparation.baseline_samples=400", "baseline_samples must be fewer"),
     ],
 )

@@ -20,9 +20,8 @@ from cpunet.networks.response_layer import Readout
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import MatchingConfig
-from synthetic import drifting, two_sites
+from synthetic import drifting, load_recipe, two_sites
 
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
 KEV, NOISE_KEV = 2614.5, 1.95

@@ -11,10 +11,10 @@ from cpunet.calibration.alternatives import side_by_side
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from synthetic import load_recipe
 
 RECIPE = load_recipe("fast")
 BOTH = tuple(named(f"hole_velocity_{field}") for field in ("low", "high"))

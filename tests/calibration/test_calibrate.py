@@ -13,8 +13,8 @@ import pytest
 import cpunet
 from cpunet.cli import run
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
+from synthetic import load_recipe
 
 # Pulses of the peak, on each side: as few as a fit takes, and enough for a small error.
 FEW, ENOUGH = 240, 420

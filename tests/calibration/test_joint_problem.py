@@ -22,13 +22,13 @@ from cpunet.calibration.sliced_functions import SlicedFunctions
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.moments import Readings
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import STRETCH
 from cpunet.training.response_starts import set_decay, with_settings
+from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, charge, coarse, faster, measured_with
 
 RECIPE = load_recipe("fast")

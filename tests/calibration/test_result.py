@@ -12,9 +12,9 @@ from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
+from synthetic import load_recipe
 
 SHORT = ("temperature", "impurity", "cloud", "self_repulsion", "diffusion")
 NUISANCES = tuple(named(name) for name in SHORT)

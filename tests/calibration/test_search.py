@@ -23,10 +23,10 @@ from cpunet.calibration.nuisances import (
 from cpunet.calibration.search import Search, _relaxed
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes import load_recipe
 from cpunet.simulation.fields import solve
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
+from synthetic import load_recipe
 
 
 @given(st.floats(-3, -0.05), st.floats(0.1, 10))

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.electronics.baseline_methods import RC
-from cpunet.electronics.finishing import PADDING_AFTER, PADDING_BEFORE, finish
+from cpunet.electronics.finishing import finish
 from cpunet.electronics.fitted_kernels import (
     BASELINE_METHODS,
-    LEAD,
+    LEAD_NS,
     GaussExp,
     SuperpulseKernel,
     crossing,
@@ -20,8 +20,7 @@ from cpunet.electronics.fitted_kernels import (
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
-from synthetic import paired_scores
+from synthetic import PADDING_AFTER, PADDING_BEFORE, load_recipe, paired_scores
 
 CONFIG = load_recipe("paper").preparation
 DT_NS, ALIGN = 16.0, CONFIG.samples_before
@@ -142,7 +141,8 @@ def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     shifted = np.interp(np.arange(60) - at + true_at, np.arange(200), true, left=0.0)
     # the step of the free kernel keeps the band that the pulses have
     np.testing.assert_allclose(steps[0, :60], shifted, atol=0.06)
-    np.testing.assert_allclose(steps[0, LEAD + 8 : 60], shifted[LEAD + 8 :], atol=0.01)
+    lead = round(LEAD_NS / DT_NS)
+    np.testing.assert_allclose(steps[0, lead + 8 : 60], shifted[lead + 8 :], atol=0.01)
 
 
 @pytest.mark.slow

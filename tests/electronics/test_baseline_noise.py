@@ -19,7 +19,7 @@ from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
+from synthetic import load_recipe
 
 CONFIG = load_recipe("paper").preparation
 DT_NS = 16.0

@@ -30,8 +30,7 @@ from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
 from cpunet.pulses.reading.files import open_pulses
-from cpunet.recipes import load_recipe
-from synthetic import mean_kev
+from synthetic import load_recipe, mean_kev
 
 TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
 

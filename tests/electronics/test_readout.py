@@ -18,7 +18,7 @@ from cpunet.electronics.chain import (
 )
 from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.exponentials import Exponentials, moved_apart
-from cpunet.electronics.finishing import PADDING_BEFORE, record_length, with_room
+from cpunet.electronics.finishing import record_length, with_room
 from cpunet.electronics.readout import (
     RawTraces,
     coloured_noise,
@@ -29,8 +29,7 @@ from cpunet.electronics.readout import (
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.recipes import load_recipe
-from synthetic import mean_kev
+from synthetic import PADDING_BEFORE, load_recipe, mean_kev
 
 PRESETS = ("legend200", "ornl", "ringing")
 T_NS = np.arange(0, 20_000, 0.5)
@@ -140,7 +139,10 @@ DT_NS, DECAY_NS = 16.0, 54_600.0
 def test_windows_go_on_with_their_decay_wherever_their_maximum_is(late: int) -> None:
     """A network does not place the maximum of its output exactly."""
     time = (
-        np.arange(record_length(CONFIG.length)) - PADDING_BEFORE - CONFIG.samples_before - late
+        np.arange(record_length(CONFIG.length, DT_NS))
+        - PADDING_BEFORE
+        - CONFIG.samples_before
+        - late
     )
     pulse = np.clip(1 + time / 40, 0, 1) * np.exp(-np.maximum(time, 0) * DT_NS / DECAY_NS)
     window = pulse[np.newaxis, PADDING_BEFORE : PADDING_BEFORE + CONFIG.length]

@@ -20,7 +20,6 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.recipes import load_recipe
 from cpunet.simulation.again import SameHits, StoredSimulation
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
@@ -29,7 +28,7 @@ from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.train import train
-from synthetic import prepared_truth
+from synthetic import load_recipe, prepared_truth
 
 # a small crystal: its library is built in a second
 DETECTOR = read_detector(

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from cpunet.networks.positional_unet import GruDiscriminator, InterpolatedEmbedding
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import GruConfig
+from synthetic import load_recipe
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")
 

@@ -15,8 +15,7 @@ from cpunet.networks.learned_response import (
     LearnedResponse,
     StepResponse,
 )
-from cpunet.networks.response_layer import PADDING_BEFORE
-from cpunet.recipes import load_recipe
+from synthetic import PADDING_BEFORE, load_recipe
 
 CONFIG = load_recipe("cpunet").generator
 DT_NS, POLE_NS, DECAY_US = 16.0, 40.0, 60.0

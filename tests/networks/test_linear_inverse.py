@@ -7,7 +7,7 @@ import torch
 
 from cpunet.networks import generators
 from cpunet.networks.generators import LinearInverse, stretch
-from cpunet.recipes import load_recipe
+from synthetic import load_recipe
 
 STRETCHES = {"before": 12, "after": 20, "baseline": (12, 8), "level_samples": 8}
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from cpunet.networks.positional_unet import PositionalUNet, positional_map
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PunetConfig
+from synthetic import load_recipe
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")
 

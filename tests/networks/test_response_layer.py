@@ -9,14 +9,13 @@ import torch
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
 from cpunet.networks.response_layer import (
-    PADDING_AFTER,
-    PADDING_BEFORE,
     DriftClock,
     ElectronicsResponse,
     fast_length,
 )
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ResponseConfig
+from synthetic import PADDING_AFTER, PADDING_BEFORE
 
 DT_NS, FINE_PER_SAMPLE, SAMPLES = 16.0, 16, 800
 RINGING = {"frequency_MHz": 5.0, "fraction": 0.1, "damping_ns": 160.0}

@@ -19,8 +19,7 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.seen import apart, go_down, second_rate
 from cpunet.pulses.writing import PulseWriter
-from cpunet.recipes import load_recipe
-from synthetic import waveform_table, write_pulses
+from synthetic import load_recipe, waveform_table, write_pulses
 
 RECIPE = load_recipe("fast")
 FEP = parse_selection("FEP", RECIPE.peaks)

@@ -250,7 +250,7 @@ def test_the_lh5_library_reads_what_was_written(tmp_path_factory, waveforms, dt_
     pulses = Pulses.of(waveforms, dt_ns=dt_ns, energy_kev=energy, event_number=numbers)
     blocks = (pulses[start : start + size] for start in range(0, n, size))
     columns = {"drift_time": (np.arange(n) * 1.5, "ns"), "is_valid": (numbers > 0, "")}
-    assert write_pulses(path, blocks, columns=columns, t0_ns=-8.0) == n
+    assert write_pulses(path, blocks, columns=columns) == n
 
     table = lh5.read("geds/sim", path)
     assert isinstance(table, Table)

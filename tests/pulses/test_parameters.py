@@ -20,8 +20,7 @@ from cpunet.pulses.parameters import (
     tail_slope,
 )
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, TIME_POINTS, all_parameters
-from cpunet.recipes import load_recipe
-from synthetic import PREPARATION
+from synthetic import PREPARATION, load_recipe
 
 DT_NS = 16.0
 TIME = np.arange(800.0)
@@ -77,14 +76,16 @@ def production_chain(waveforms: np.ndarray) -> np.ndarray:
 def test_current_amplitude_equals_the_production_chain(noise):
     waveforms = multi_site(400, noise, seed=1)
     expected = production_chain(waveforms)
-    assert np.abs(current_amplitude(waveforms) - expected).max() < 1e-6
+    assert np.abs(current_amplitude(waveforms, 16.0) - expected).max() < 1e-6
 
 
 def test_current_amplitude_finds_a_maximum_far_from_the_steepest_sample():
     # a lone spike of one sample is averaged away, a broad ramp elsewhere is not
     pulse = np.clip((TIME - 600) / 20, 0, 1)
     pulse[100] += 0.08
-    assert current_amplitude(pulse[np.newaxis].astype(np.float32)) == pytest.approx(0.05, 1e-4)
+    assert current_amplitude(pulse[np.newaxis].astype(np.float32), 16.0) == pytest.approx(
+        0.05, 1e-4
+    )
 
 
 @given(
@@ -118,7 +119,7 @@ def test_current_amplitude_of_measured_traces_equals_the_production_chain(refere
         traces = file["geds/raw/waveform/values"][:300].astype(np.float32)
     traces -= traces[:, :200].mean(axis=1, keepdims=True)
     traces /= traces.max(axis=1, keepdims=True)
-    assert np.abs(current_amplitude(traces) - production_chain(traces)).max() < 1e-6
+    assert np.abs(current_amplitude(traces, 16.0) - production_chain(traces)).max() < 1e-6
 
 
 def parameters_of(waveforms: np.ndarray) -> dict[str, np.ndarray]:

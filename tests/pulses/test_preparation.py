@@ -124,7 +124,7 @@ class TestMeasured:
         assert prepared.codes.tolist() == [Rejection.WINDOW_OUTSIDE_RECORD] * 2 + [0]
         assert prepared.rejections == {"window_outside_record": 2}
         assert prepared.index.tolist() == [2]
-        assert len(prepared_of(late, max_padding_after=200)) == 1
+        assert len(prepared_of(late, padding_after_ns=3200)) == 1
 
     def test_what_is_not_a_pulse_is_counted_by_reason(self) -> None:
         good = measured()[0]
@@ -250,8 +250,8 @@ def test_real_traces(reference_data) -> None:  # type: ignore[no-untyped-def]
     assert (codes[good] == Rejection.ACCEPTED).mean() > 0.98
 
 
-SIZES = {"samples_before": 20, "samples_after": 20, "baseline_samples": 10, "tail_samples": 2}
-SIZES |= {"decay_fit_samples": 10, "max_padding_before": 5}
+SIZES = {"before_ns": 320, "after_ns": 320, "baseline_ns": 160, "tail_ns": 32}
+SIZES |= {"decay_fit_ns": 160, "padding_before_ns": 80}
 SHORT = CONFIG.model_copy(update=SIZES)
 
 

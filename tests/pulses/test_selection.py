@@ -15,9 +15,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks, parse_selection
 from cpunet.pulses.preparation import Prepared, apply_cuts, fit_cuts, prepare
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import CutConfig, PeakConfig
-from synthetic import PREPARATION
+from synthetic import PREPARATION, load_recipe
 
 LINES = {
     "FEP": PeakConfig(energy_kev=2614.511, half_width_kev=5),

@@ -8,18 +8,17 @@ import pytest
 
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.preparation import Prepared, prepare
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
+from synthetic import load_recipe, small_sides
 from synthetic import same_random_numbers as same_random_numbers
-from synthetic import small_sides
 
 # 64-sample pulses and the narrowest networks: an iteration takes milliseconds.
 TINY = (
-    "preparation.samples_before=32",
-    "preparation.samples_after=32",
-    "preparation.baseline_samples=16",
-    "preparation.tail_samples=2",
-    "preparation.decay_fit_samples=16",
+    "preparation.before_ns=512",
+    "preparation.after_ns=512",
+    "preparation.baseline_ns=256",
+    "preparation.tail_ns=32",
+    "preparation.decay_fit_ns=256",
     "generator.width=2",
     "discriminator.embedding_rows=20",
     "discriminator.embedding_dim=4",
@@ -30,9 +29,9 @@ TINY = (
     "training.batch_size=4",
     "training.statistics_batches=2",
     "training.log_interval=3",
-    "training.losses.baseline_len=16",
-    "training.losses.rising_edge_len=24",
-    "training.losses.tail_len=24",
+    "training.losses.baseline_ns=256",
+    "training.losses.rising_edge_ns=384",
+    "training.losses.tail_ns=384",
 )
 
 

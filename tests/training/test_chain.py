@@ -13,7 +13,6 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.recipes import load_recipe
 from cpunet.training.networks import outside_noise
 from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
@@ -21,7 +20,15 @@ from cpunet.training.train import train
 from cpunet.translation.file_translation import Counts
 from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
-from synthetic import Files, after_pole_and_decay, in_traces, sampled, two_sites, write_pulses
+from synthetic import (
+    Files,
+    after_pole_and_decay,
+    in_traces,
+    load_recipe,
+    sampled,
+    two_sites,
+    write_pulses,
+)
 
 DT_NS, FINE = 16.0, 16
 POLE_NS, DECAY_US, NOISE_KEV, KEV = 70.0, 60.0, 2.0, 2614.511

@@ -17,15 +17,23 @@ from torch import nn
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import NOISE_BINS, ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes import load_recipe
 from cpunet.training.closed_forms import learned_chain, propagated, true_chain_of
 from cpunet.training.diagnosis import beyond, diagnosis, parts_off
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
-from synthetic import FACTS, one_line, status_of, write_chain, write_run
+from synthetic import (
+    FACTS,
+    NOISE_BINS,
+    NOISE_SAMPLES,
+    load_recipe,
+    one_line,
+    status_of,
+    write_chain,
+    write_run,
+)
 
 DT_NS = 16.0
 # of the run's parameters: log_poles_ns are in the order of the recipe
@@ -114,7 +122,7 @@ def test_noise_is_told_in_kev(tmp_path):
     """A full charge is 0.8 e^(t/tau) high in prepared pulses; power falls by half at 8 MHz."""
     frequency_mhz = np.linspace(0, 500 / DT_NS, NOISE_BINS)
     shape = 1 / (1 + (frequency_mhz / 8) ** 4)
-    mean = (2 * shape.sum() - shape[0] - shape[-1]) / (2 * (NOISE_BINS - 1))
+    mean = (2 * shape.sum() - shape[0] - shape[-1]) / (NOISE_SAMPLES)
     height = 0.8 * np.exp((397.5 * DT_NS + 500) / 54_600)  # aligned some 500 ns after the step
     density = (1.7 * height) ** 2 * shape / mean
     numbers = values(

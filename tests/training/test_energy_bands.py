@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.recipes import load_recipe
 from cpunet.training.pulse_sets import HEAVIEST, MIN_PULSES, WIDEST, _continuum, energy_bands
+from synthetic import load_recipe
 
 PEAKS = load_recipe("fast").peaks
 FEP = PEAKS["FEP"].energy_kev

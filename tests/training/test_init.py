@@ -14,7 +14,6 @@ from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
 from cpunet.training.run import Run
 from cpunet.training.train import train
@@ -23,6 +22,7 @@ from synthetic import (
     SMALL_NETWORK,
     after_pole,
     decay,
+    load_recipe,
     one_line,
     phased_edges,
     write_pulses,
@@ -188,7 +188,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
 def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> None:
     shorter = load_recipe(
         "paper",
-        ["generator.width=2", "preparation.samples_after=384", "training.losses.tail_len=334"],
+        ["generator.width=2", "preparation.after_ns=6144", "training.losses.tail_ns=5344"],
     )
     one_line(
         lambda: train(files["sim"], files["one"], tmp_path / "a", recipe=shorter, init=network),

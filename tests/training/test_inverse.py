@@ -11,13 +11,18 @@ import torch
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import NOISE_BINS, LinearInverse, ResponseGenerator
-from cpunet.networks.response_layer import PADDING_BEFORE
+from cpunet.networks.generators import LinearInverse, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
 from cpunet.training.inverse import fit_inverse
-from synthetic import drifting, two_sites
+from synthetic import (
+    NOISE_BINS,
+    NOISE_SAMPLES,
+    PADDING_BEFORE,
+    drifting,
+    load_recipe,
+    two_sites,
+)
 from unpaired import crossing
 
 RECIPE = load_recipe("fast", ["generator.poles_ns=[50, 50]", "generator.decay_us=60"])
@@ -47,7 +52,7 @@ def as_simulated(windows: FloatArray) -> FloatArray:
 def readout(noise_kev: float) -> ResponseGenerator:
     generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
     density = np.full(NOISE_BINS, noise_kev**2)
-    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
+    generator.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
     return generator
 
 
@@ -160,7 +165,7 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     generator = readout(0.0)
     frequency = np.linspace(0, 0.5, NOISE_BINS)
     density = 400 / (1 + (frequency / 0.004) ** 2)  # slower than the edge
-    generator.set_noise(BaselineNoise(density, 2 * (NOISE_BINS - 1), DT_NS, 100))
+    generator.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
     sim = charge(1200, seed=1)
     inverse = fit_inverse(generator, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
     windows = ren(generator, held_out, FEP_KEV)

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from cpunet.networks.learned_response import StepResponse
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training import fitter
 from cpunet.training.differentiable import DifferentiableSet
@@ -18,6 +17,7 @@ from cpunet.training.moments import Readings
 from cpunet.training.optimal_weights import ConditionalFunctions
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem
+from synthetic import load_recipe
 from unpaired import (
     CHAIN,
     DT_NS,

@@ -12,9 +12,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
 from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, Readings
-from synthetic import two_sites
+from synthetic import load_recipe, two_sites
 from unpaired import at_half_maximum
 
 RECIPE = load_recipe("fast")
@@ -110,7 +109,7 @@ def test_the_density_of_the_current_amplitude_is_that_of_its_definition(
     aligned = at_half_maximum(
         torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
     )
-    amplitude = np.log(current_amplitude(aligned.numpy()))
+    amplitude = np.log(current_amplitude(aligned.numpy(), 16.0))
     edges = np.quantile(amplitude, np.linspace(0.02, 0.995, CONFIG.amplitude_bins + 1))
     centres = 0.5 * (edges[1:] + edges[:-1])
     widths = np.maximum(np.diff(edges), CONFIG.amplitude_width)

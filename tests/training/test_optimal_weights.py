@@ -13,13 +13,12 @@ from cpunet.electronics.finishing import finish
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import current_amplitude
-from cpunet.recipes import load_recipe
 from cpunet.training.moments import Moments, Values
 from cpunet.training.optimal_weights import Parts, Sums, WeightedMeans, jackknife_bias, refine
 from cpunet.training.response_fit import amplitude_shift
 from cpunet.training.response_problem import Band, Parameters, ResponseProblem, SmoothParameters
 from cpunet.training.translated import Noise, SimulatedSide
-from synthetic import drifting, two_sites
+from synthetic import drifting, load_recipe, two_sites
 
 DT_NS, KEV, N = 16.0, 2614.5, 800
 RECIPE = load_recipe(
@@ -59,7 +58,7 @@ def band_behind(poles_ns: tuple[float, float]) -> Band:
         records, RECIPE.preparation, dt_ns=DT_NS, noise=WHITE, energy_kev=energies, seed=3
     ).windows
     moments = Moments.of_data(data, TRAINING, RECIPE.preparation)
-    noise = Noise.draw(WHITE, energies, record_length(800), 2, np.random.default_rng(4))
+    noise = Noise.draw(WHITE, energies, record_length(800, 16.0), 2, np.random.default_rng(4))
     return Band("FEP", SimulatedSide(charge(2), noise, moments, np.ones(N)), np.arange(N))
 
 
@@ -150,7 +149,7 @@ def test_an_amplitude_that_is_far_off_is_told_as_it_is(
     pulses = torch.from_numpy(charge(2))
     with torch.no_grad():
         translated, true = (
-            np.log(current_amplitude(response(poles, 0.05)(pulses).numpy()))
+            np.log(current_amplitude(response(poles, 0.05)(pulses).numpy(), 16.0))
             for poles in (poles_ns, (60.0, 40.0))
         )
     shift, error = amplitude_shift(response(poles_ns, 0.05), [band])

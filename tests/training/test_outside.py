@@ -10,10 +10,9 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import TraceNoise
-from cpunet.electronics.finishing import PADDING_BEFORE, with_room
+from cpunet.electronics.finishing import with_room
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Prepared, prepare
-from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import (
     CycleGan,
     Outside,
@@ -24,6 +23,7 @@ from cpunet.training.cyclegan import (
     weighted_l1,
     window_weights,
 )
+from synthetic import PADDING_BEFORE, load_recipe
 from unpaired import crossing
 
 CONFIG = load_recipe("paper").preparation

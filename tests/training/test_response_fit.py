@@ -13,7 +13,6 @@ import torch
 from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
-from cpunet.recipes import load_recipe
 from cpunet.training import response_starts
 from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
 from cpunet.training.moments import Moments, Readings
@@ -22,6 +21,7 @@ from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
 from cpunet.training.response_starts import drift_if_needed, with_settings
 from cpunet.training.translated import Noise, SimulatedSide
+from synthetic import load_recipe
 from unpaired import (
     CHAIN,
     DT_NS,
@@ -202,7 +202,7 @@ def asked(problem: Problem) -> ResponseProblem:
     recipe = load_recipe("fast", FEW)
     generator, training = recipe.matching
     few = problem.sim[:64]
-    length = record_length(few.waveforms.shape[1])
+    length = record_length(few.waveforms.shape[1], few.dt_ns)
     drawn = Noise.draw(problem.noise, few.energy_kev, length, 2, np.random.default_rng(0))
     moments = Moments.of_data(problem.data.waveforms, training, recipe.preparation)
     band = Band("all", SimulatedSide(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))

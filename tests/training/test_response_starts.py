@@ -11,7 +11,6 @@ import pytest
 
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes import load_recipe
 from cpunet.training import fitter as fitter_module
 from cpunet.training import response_fit, response_starts
 from cpunet.training.fitter import (
@@ -25,6 +24,7 @@ from cpunet.training.fitter import (
 )
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
+from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, measured_with
 
 SEARCHES = ["fit", "ringing_if_better", "free_decay_if_better"]  # of a hopeless fit

@@ -9,9 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan, Step, fake_loss, real_loss, window_weights
-from synthetic import LOSS_NAMES
+from synthetic import LOSS_NAMES, load_recipe
 
 pytestmark = [
     pytest.mark.usefixtures("same_random_numbers"),

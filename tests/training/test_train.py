@@ -12,11 +12,10 @@ import torch
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
-from synthetic import KEV, SMALL_NETWORK, Files, write_files, write_run
+from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files, write_run
 
 RECIPE = load_recipe(
     "paper",

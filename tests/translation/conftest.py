@@ -10,10 +10,9 @@ import pytest
 
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.training.loop import train
-from synthetic import SMALL_NETWORK, decaying_traces, edges, write_run
+from synthetic import SMALL_NETWORK, decaying_traces, edges, load_recipe, write_run
 
 DT_NS = 16.0
 

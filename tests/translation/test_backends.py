@@ -12,19 +12,20 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp, TraceNoise
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import NOISE_BINS
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
-from cpunet.recipes import load_recipe
 from cpunet.training.cyclegan import CycleGan, Outside
 from cpunet.training.inverse import fit_inverse
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 from synthetic import (
     FACTS,
+    NOISE_BINS,
+    NOISE_SAMPLES,
     after_pole_and_decay,
     in_traces,
+    load_recipe,
     sampled,
     two_sites,
     write_chain,
@@ -223,7 +224,7 @@ DT_NS, RMS_KEV = 16.0, 6.0
 @pytest.fixture(scope="module")
 def noisy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network that was not trained."""
-    noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), 2 * (NOISE_BINS - 1), DT_NS, 100)
+    noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), NOISE_SAMPLES, DT_NS, 100)
     outside = Outside(TraceNoise(noise), np.ones(1), NOISY.preparation)
     torch.manual_seed(0)
     model = CycleGan(NOISY, outside)

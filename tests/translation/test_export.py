@@ -19,11 +19,10 @@ from cpunet.errors import CpunetError
 from cpunet.networks.generators import LinearInverse, ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes import load_recipe
 from cpunet.translation.dspeed_processor import ren
 from cpunet.translation.export import export_onnx, graph_of, write_onnx
 from cpunet.translation.translator import IREN, REN
-from synthetic import waveform_table, write_chain
+from synthetic import load_recipe, waveform_table, write_chain
 
 
 def fitted(chain: ResponseGenerator) -> None:

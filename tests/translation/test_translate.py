@@ -27,7 +27,6 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile, open_pulses
-from cpunet.recipes import load_recipe
 from cpunet.translation import file_translation
 from cpunet.translation.file_translation import Counts, noise_seed
 from cpunet.translation.forms import to_adc
@@ -39,6 +38,7 @@ from synthetic import (
     decay,
     edges,
     in_traces,
+    load_recipe,
     nearly_full_disk,
     waveform_table,
     write_chain,

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from cpunet.pulses.shape_parameters import data_axis
-from cpunet.recipes import load_recipe
 from cpunet.settings import plain
 from cpunet.validation import comparisons
 from cpunet.validation.comparisons import (
@@ -29,6 +28,7 @@ from cpunet.validation.comparisons import (
     resampled_twice,
     wasserstein,
 )
+from synthetic import load_recipe
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 50})
 UNIT = hist.axis.Regular(10, 0.0, 1.0)

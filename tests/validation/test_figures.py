@@ -12,13 +12,12 @@ from scipy.special import ndtr
 
 from cpunet.pulses.parameters import PARAMETERS, align_half_maximum
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
-from cpunet.recipes import load_recipe
 from cpunet.training.figures import sides_figure
 from cpunet.validation import run_figures
 from cpunet.validation.comparisons import compare
 from cpunet.validation.run_figures import nearest, shape_figure
-from cpunet.validation.slices import MeanPulse
-from synthetic import LOSS_NAMES, require_drawn
+from cpunet.validation.slices import MeanPulse, around_half
+from synthetic import LOSS_NAMES, load_recipe, require_drawn
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 
@@ -152,7 +151,7 @@ def test_the_nearest_pulse_is_that_of_a_plain_loop():
         np.sqrt(np.mean((align_half_maximum(w[np.newaxis], 100, 150)[0] - wanted) ** 2))
         for w in windows
     ]
-    row, found = nearest(windows, wanted)
+    row, found = nearest(around_half(windows, 16.0), wanted)
     assert row == int(np.argmin(rms))
     assert found == pytest.approx(min(rms), rel=1e-4)
 
@@ -161,12 +160,12 @@ def test_pulses_without_a_crossing_are_never_nearest():
     windows = edges([5.0, 6.0, 7.0])
     windows[1] = np.nan
     windows[0] = 0
-    assert nearest(windows, shape(5.0))[0] == 2
+    assert nearest(around_half(windows, 16.0), shape(5.0))[0] == 2
 
 
 def test_a_pulse_of_which_little_is_in_the_record_is_not_compared():
     windows = np.concatenate([edges([9.0], centre=595.0), edges([5.0])])
-    assert nearest(windows, shape(9.0))[0] == 1
+    assert nearest(around_half(windows, 16.0), shape(9.0))[0] == 1
 
 
 def test_the_counts_of_pulses_are_those_of_the_files():

@@ -19,9 +19,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from cpunet.plotting import line, styled
-from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
-from synthetic import write_report
+from synthetic import load_recipe, write_report
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 TESTED = {"auc": 0.52, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}

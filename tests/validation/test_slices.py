@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.parameters import align_half_maximum
 from cpunet.validation.methods import true_responses
 from cpunet.validation.run_figures import shape_figure
 from cpunet.validation.slices import (
-    AFTER,
-    BEFORE,
+    BEFORE_NS,
     Slices,
+    around_half,
     slice_edges,
     sliced,
 )
@@ -36,7 +35,7 @@ def pulses(rng, n, width=5.0, noise=0.002):
 
 
 def superpulses(windows, times, edges) -> Slices:
-    return sliced(align_half_maximum(windows, BEFORE, AFTER), times, edges)
+    return sliced(around_half(windows, 16.0), times, edges)
 
 
 def drawn(rng, n, edges, **kwargs) -> Slices:
@@ -61,7 +60,7 @@ def test_superpulses_are_those_of_a_plain_loop():
     found = superpulses(windows, times, edges)
     for pulse, (low, high) in zip(found.pulses, ((400, 900), (900, 1500.01)), strict=True):
         rows = [i for i in range(90) if low <= times[i] < high and i != 4]
-        aligned = align_half_maximum(windows[rows], BEFORE, AFTER).astype(float)
+        aligned = around_half(windows[rows], 16.0).astype(float)
         assert pulse.n == len(rows)
         np.testing.assert_allclose(pulse.mean, aligned.mean(axis=0), atol=1e-6)
         expected = aligned.std(axis=0, ddof=1) / np.sqrt(len(rows))
@@ -84,7 +83,7 @@ def test_a_known_difference_is_found_where_it_is():
     assert np.nanmax(np.abs(same)) == 0
     # the crossing lies at sample 150-152, and the higher maximum moves it a little
     assert np.nanmax(off) == pytest.approx(0.01, rel=0.15)
-    assert np.nanargmax(np.abs(off)) > BEFORE + 20
+    assert np.nanargmax(np.abs(off)) > BEFORE_NS / 16 + 20
 
 
 def test_nothing_in_a_slice_is_no_failure():

@@ -13,7 +13,6 @@ from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import flat
 from cpunet.translation.translator import REN
@@ -24,7 +23,7 @@ from cpunet.validation.tune import (
     tune,
     with_values,
 )
-from synthetic import KEV, SMALL_NETWORK, Files, write_files
+from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files
 
 SPACE = (
     "search={generator.width: {choices: [2, 4]}, "

@@ -15,7 +15,6 @@ from cpunet.errors import CpunetError
 from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.recipes import load_recipe
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.training.train import train
@@ -23,7 +22,7 @@ from cpunet.validation.drawings import drawings
 from cpunet.validation.evaluation import Evaluation, _compared, evaluate
 from cpunet.validation.methods import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
-from synthetic import after_pole, decay, phased_edges, write_pulses
+from synthetic import after_pole, decay, load_recipe, phased_edges, write_pulses
 
 RECIPE = load_recipe(
     "fast",

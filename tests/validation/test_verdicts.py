@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cpunet.recipes import load_recipe
 from cpunet.validation.comparisons import compare
 from cpunet.validation.verdicts import summary, verdict, verdict_table
+from synthetic import load_recipe
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 60})
 

@@ -32,6 +32,7 @@ def validate(
     *,
     truth: str | Path | None = None,
     baselines: bool = True,
+    peak: str = "",
     max_pulses: int = 50_000,
     seed: int = 0,
     read: ReadOptions = ReadOptions(),
@@ -56,6 +57,8 @@ def validate(
         Noise-free responses of the simulated pulses (.npz), if they are known.
     baselines
         Fit the baseline methods too, which takes most of the time.
+    peak
+        Further energies to score in keV, as ``200-400`` or ``200-400,400-1000``.
     max_pulses
         Pulses of a side that are compared: of more, a random sample. Some 30 kB each.
     seed
@@ -85,7 +88,7 @@ def validate(
     if max_pulses < 100:
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
     sim, data = read.files(sim, data)
-    how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses}
+    how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses, "peak": peak}
     how |= {"seed": require_seed(seed), "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)
     if data.table == ALL:
