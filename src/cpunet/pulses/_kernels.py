@@ -201,8 +201,8 @@ _ROUNDS = 4
 # within that sample: for a constant current, its mean in the first period is half the rise.
 _MAX_FIRST = 2.0
 # A pulse has begun where it exceeds a hundredth of its height and is clear of the noise.  The
-# baseline ends somewhat earlier, since the rise starts below that threshold.
-_BEGUN_FRACTION, _BEGUN_RMS, BEGUN_MARGIN_NS = 0.01, 8.0, 256.0
+# baseline ends a microsecond earlier, since far from the contact charge induces less than that.
+_BEGUN_FRACTION, _BEGUN_RMS, BEGUN_MARGIN_NS = 0.01, 8.0, 960.0
 # In a thousand samples, noise alone reaches a maximum of three to four RMS; so much above that
 # is a pulse.
 _MIN_TOP_RMS, _MIN_HEIGHT_RMS = 8.0, 5.0
