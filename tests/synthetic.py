@@ -303,7 +303,8 @@ def write_chain(
 ) -> Path:
     """Write a run of a readout chain that was not fitted, with white noise, as changed."""
     recipe = load_recipe("fast", settings)
-    chain = ResponseGenerator(recipe.matching.generator, DT_NS)
+    dt_ns = facts.get("dt_ns", DT_NS)
+    chain = ResponseGenerator(recipe.matching.generator, dt_ns)
     if noise_kev:
         density = np.full(NOISE_BINS, noise_kev**2)
         chain.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))

@@ -77,7 +77,7 @@ def test_a_run_of_a_network(tmp_path):
     from cpunet.training.cyclegan import CycleGan
 
     tiny = ("generator.width=2", "discriminator.embedding_dim=2", "discriminator.hidden=2")
-    recipe = load_recipe("paper", tiny)
+    recipe = load_recipe("paper", tiny).at(16)
     write_run(tmp_path, CycleGan(recipe), recipe, FACTS)
     run = cpunet.Run.load(tmp_path)
     assert repr(run) == f"<Run {tmp_path}: paper, FEP>"

@@ -79,7 +79,7 @@ def test_values_of_numpy_are_plain() -> None:
 
 
 def test_the_recipe_that_matches_a_response():
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     generator, training = recipe.matching
     assert generator.name == "response"
     assert recipe.discriminator is None
@@ -93,7 +93,9 @@ def test_the_recipe_that_matches_a_response():
 def test_all_recipes_see_the_same_pulses():
     fast, *others = (load_recipe(name) for name in list_recipes())
     for other in others:
-        assert (other.peaks, other.preparation) == (fast.peaks, fast.preparation)
+        aligned = {"align_at": other.preparation.align_at}  # the paper's as published
+        wanted = fast.preparation.model_copy(update=aligned)
+        assert (other.peaks, other.preparation) == (fast.peaks, wanted)
         assert (other.cuts, other.scores) == (fast.cuts, fast.scores)
 
 
@@ -155,9 +157,8 @@ def test_values_are_overridden_in_turn():
         ("training.batch_size=[", "not YAML"),
         ("training.rate_generators=.nan", "training.rate_generators: "),
         ("discriminator.value_range=[1, 0]", "discriminator.value_range: must go from a lower"),
-        ("discriminator.samples_per_step=7", "samples_per_step (7)"),
         ("preparation.before_ns=4800", "the loss windows cover 12800 ns"),
-        ("preparation.baseline_samples=400", "baseline_samples must be fewer"),
+        ("preparation.baseline_ns=6400", "baseline_ns must be less than before_ns"),
     ],
 )
 def test_wrong_settings_are_named(override, part):
@@ -168,15 +169,23 @@ def test_wrong_settings_are_named(override, part):
     ("override", "part"),
     [
         ("training.method=cyclegan", "training"),
-        ("training.segments=[0.5, 1]", "training.segments.0: "),
+        ("training.segments_ns=[a, 1]", "training.segments_ns.0: "),
         ("generator.slow_ns=[100, 100.0]", "times must differ"),
-        ("training.segments=[3, 1]", "segments must be in rising order"),
+        ("training.segments_ns=[3, 1]", "segments_ns must be in rising order"),
+        ("preparation.align_at=0.999", "align_at must be half_height"),
         ("search={a: {low: 1, choices: [1, 2]}}", "give either low and high, or choices"),
         ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),
     ],
 )
 def test_wrong_settings_of_a_matching_are_named(override, part):
     one_line(lambda: load_recipe("fast", [override]), part)
+
+
+@pytest.mark.parametrize("dt_ns", [1, 2, 4, 8, 10, 12.5, 16])
+def test_windows_of_networks_are_halved_four_times_at_any_period(dt_ns):
+    window = load_recipe("paper").at(dt_ns).preparation
+    assert window.length % 16 == 0
+    assert window.length * dt_ns == pytest.approx(12_800, abs=16 * dt_ns)
 
 
 def test_values_of_a_file_and_of_words(tmp_path: Path) -> None:

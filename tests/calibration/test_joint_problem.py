@@ -255,7 +255,7 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(sides):
     """Noise begins with a window, so that a jump by a sample would change it."""
     one, time = problem(*sides), np.arange(1200.0)
     flat = np.linspace(100, 101, 21)[:, np.newaxis]  # samples to the flat top
-    base, longer = (np.clip((time - 500) / (flat + x) + 0.5, 0, 1) for x in (0.0, 1.0))
+    base, longer = (np.clip((time - 450) / (flat + x), 0, 1) for x in (0.0, 1.0))
     base, slope = base.astype(np.float32), (longer - base).astype(np.float32)
     centre = np.zeros(2)
     slopes = {0: Derivative(slope, centre, half_maxima(base, np.zeros(len(base))))}

@@ -101,7 +101,7 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
     records = shape(600, 1200).astype(np.float32)
     records[3] = 0  # cannot be prepared
     given = {"dt_ns": DT_NS, "noise": noise, "energy_kev": np.full(600, 1592.5), "seed": 3}
-    noisy, _, clean = finish(records, CONFIG, **given)
+    noisy, _, clean, _ = finish(records, CONFIG, **given)
     np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS).windows)
     assert np.isnan(noisy[3]).all()
 
@@ -109,7 +109,7 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
 def test_bad_input_is_named(noise) -> None:
     with pytest.raises(CpunetError, match="only 0 of 40 traces have a known energy"):
         BaselineNoise.of(Baselines.of([Pulses.of(traces(40).waveforms, dt_ns=DT_NS)], CONFIG))
-    with pytest.raises(CpunetError, match="samples before the pulse; the noise needs 400"):
+    with pytest.raises(CpunetError, match="ns before the pulse; the noise needs 6400"):
         BaselineNoise.of(Baselines.of([traces(start=380)], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
@@ -267,7 +267,7 @@ def test_prepared_windows_fall_back_on_their_beginnings() -> None:
 def test_traces_that_begin_late_fall_back_too() -> None:
     noise, note = measured_noise(as_input(white_traces(start=380)), FAST)
     assert note is not None
-    assert "samples before the pulse; the noise needs 400 or more" in note
+    assert "ns before the pulse; the noise needs 6400 or more" in note
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
 
 

@@ -214,7 +214,7 @@ def test_slow_decays_are_told_by_their_levels():
     [
         (lambda raw: raw[slice(0, 10)], "only 10 of 10 traces can be prepared"),
         (lambda raw: raw.with_waveforms(-raw.waveforms), "can be prepared"),
-        (lambda raw: raw.with_waveforms(raw.waveforms[:, 430:]), "window_outside_record"),
+        (lambda raw: raw.with_waveforms(raw.waveforms[:, 430:]), "pulse_at_edge"),
         (lambda raw: Pulses.of(raw.waveforms, dt_ns=16), "have a known energy"),
     ],
 )

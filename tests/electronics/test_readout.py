@@ -108,7 +108,7 @@ def test_ornl_decays_as_measured():
         ({"bandwidth_poles_ns": [-40]}, "bandwidth_poles_ns"),
         ({"slow": {"fraction": 0.1, "tau_ns": 0}}, "slow.tau_ns"),
         ({"decays": [{"fraction": 0.9, "tau_us": 50}]}, "decays"),
-        ({"n_pre": 1400}, "n_pre"),
+        ({"before_ns": 22_400}, "before_ns"),
         ({"baseline_mean_adc": 70000}, "baseline_mean_adc"),
         ({"noise": {"rms_kev": 1}}, "noise"),
         ({"gain_adc_per_kev": float("inf")}, "gain_adc_per_kev"),
@@ -219,7 +219,7 @@ def test_shares_of_disturbed_traces(traces: RawTraces):
 
 
 def test_tails_follow_the_law_and_all_decays_of_the_chain():
-    chain = altered("ornl", length=1200, **rates(3))
+    chain = altered("ornl", record_ns=19_200, **rates(3))
     steps = Pulses.of(np.ones((4000, 10)), dt_ns=4, energy_kev=np.full(4000, 1000.0))
     added_kev, tails_kev, _ = draw_other_pulses(steps, chain, np.random.default_rng(1))
     law = TailsLaw(3, 54.6, chain.other_pulses_kev)
@@ -267,7 +267,7 @@ def test_saturation_is_flagged_and_clipped(pulses: Pulses):
 
 def test_energies_have_the_resolution(pulses: Pulses):
     line = Pulses.of(np.ones((4000, 1)), dt_ns=4, energy_kev=np.full(4000, 2614.5))
-    short = altered(length=40, n_pre=10)
+    short = altered(record_ns=640, before_ns=160)
     assert 2.355 * read_out(line, short, seed=1).energy_kev.std() == pytest.approx(
         2.6, rel=0.05
     )

@@ -9,7 +9,8 @@ from cpunet.networks import generators
 from cpunet.networks.generators import LinearInverse, stretch
 from synthetic import load_recipe
 
-STRETCHES = {"before": 12, "after": 20, "baseline": (12, 8), "level_samples": 8}
+# of 12, 20, 12 to 8, and 8 samples
+STRETCHES = {"before_ns": 192, "after_ns": 320, "baseline_ns": (192, 128), "level_ns": 128}
 
 
 def edges(*starts: int) -> torch.Tensor:
@@ -21,7 +22,7 @@ def edges(*starts: int) -> torch.Tensor:
 @pytest.fixture
 def identity(monkeypatch: pytest.MonkeyPatch) -> LinearInverse:
     """Gives back what it gets in the region about the half maximum."""
-    monkeypatch.setattr(generators, "AFTER", 8)
+    monkeypatch.setattr(generators, "AFTER_NS", 128.0)
     config = load_recipe("fast").matching.training.model_copy(update=STRETCHES)
     network = LinearInverse(60, config)
     network.half_height.fill_(0.5)

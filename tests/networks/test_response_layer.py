@@ -30,8 +30,8 @@ def electronics(poles: tuple[float, ...], ringing: dict | None = None) -> Electr
             "slow": {"fraction": 0.065, "tau_ns": 400.0},
             "ringing": ringing,
             "decays": [{"fraction": 0.96, "tau_us": 80.0}, {"fraction": 0.04, "tau_us": 4.0}],
-            "n_pre": PADDING_BEFORE,
-            "length": PADDING_BEFORE + SAMPLES + PADDING_AFTER,
+            "before_ns": DT_NS * PADDING_BEFORE,
+            "record_ns": DT_NS * (PADDING_BEFORE + SAMPLES + PADDING_AFTER),
         }
     )
 

@@ -247,7 +247,9 @@ def test_the_lh5_library_reads_what_was_written(tmp_path_factory, waveforms, dt_
     n = len(waveforms)
     energy = data.draw(arrays(np.float64, n))
     numbers = data.draw(arrays(np.int64, n))
-    pulses = Pulses.of(waveforms, dt_ns=dt_ns, energy_kev=energy, event_number=numbers)
+    pulses = Pulses.of(
+        waveforms, dt_ns=dt_ns, energy_kev=energy, event_number=numbers, t0_ns=-8.0
+    )
     blocks = (pulses[start : start + size] for start in range(0, n, size))
     columns = {"drift_time": (np.arange(n) * 1.5, "ns"), "is_valid": (numbers > 0, "")}
     assert write_pulses(path, blocks, columns=columns) == n

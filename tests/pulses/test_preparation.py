@@ -74,7 +74,7 @@ def by_definition(trace: Array) -> tuple[Array, int]:
 class TestMeasured:
     def test_follows_the_definition(self) -> None:
         raw = measured(n=50)
-        prepared = prepared_of(raw)
+        prepared = prepared_of(raw, align_at=0.999)
         assert len(prepared) == 50
         for i, trace in enumerate(raw):
             window, align = by_definition(trace)
@@ -121,8 +121,9 @@ class TestMeasured:
     def test_records_too_short_are_counted(self) -> None:
         early, late = measured(start=100.0), measured(start=900.0)
         prepared = prepared_of(np.concatenate([early, late, measured()]))
-        assert prepared.codes.tolist() == [Rejection.WINDOW_OUTSIDE_RECORD] * 2 + [0]
-        assert prepared.rejections == {"window_outside_record": 2}
+        assert prepared.codes.tolist() == [Rejection.PULSE_AT_EDGE] * 2 + [0]
+        assert prepared.rejections == {"pulse_at_edge": 2}
+        assert prepared_of(early[:, :500]).rejections == {"window_outside_record": 1}
         assert prepared.index.tolist() == [2]
         assert len(prepared_of(late, padding_after_ns=3200)) == 1
 
@@ -181,7 +182,7 @@ class TestSaturation:
 class TestSimulated:
     def test_scaled_to_one_aligned_and_padded(self) -> None:
         raw = 3 + 2 * simulated(n=20)
-        prepared = prepared_of(raw, "simulated")
+        prepared = prepared_of(raw, "simulated", align_at=0.999)
         assert len(prepared) == 20
         windows = prepared.pulses.waveforms
         assert np.all(windows.min(1) == 0)

@@ -123,7 +123,8 @@ def test_noise_is_told_in_kev(tmp_path):
     frequency_mhz = np.linspace(0, 500 / DT_NS, NOISE_BINS)
     shape = 1 / (1 + (frequency_mhz / 8) ** 4)
     mean = (2 * shape.sum() - shape[0] - shape[-1]) / (NOISE_SAMPLES)
-    height = 0.8 * np.exp((397.5 * DT_NS + 500) / 54_600)  # aligned some 500 ns after the step
+    # aligned at the half rise of poles of 60 and 40 ns, some 80 ns after the step
+    height = 0.8 * np.exp((397.5 * DT_NS + 80) / 54_600)
     density = (1.7 * height) ** 2 * shape / mean
     numbers = values(
         write_response(tmp_path / "a", "generator.decay_us=54.6", noise_density=density)
@@ -371,8 +372,9 @@ def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]])
     assert propagated(RESPONSE, covariance, numbers) == {}
 
 
-EDGES = [-100, -60, -40, -25, -15, -8, 0, 8, 15, 22, 30, 40, 52, 66, 84, 110, 140, 300]
-QUIET = {f"samples {a} to {b}": 0.5 for a, b in pairwise(EDGES)}
+EDGES = [-1600, -960, -640, -400, -240, -128, 0, 128, 240, 352, 480, 640, 832, 1056, 1344]
+EDGES += [1760, 2240, 4800]
+QUIET = {f"{a} to {b} ns": 0.5 for a, b in pairwise(EDGES)}
 QUIET |= {f"current amplitude, bin {i}": -0.5 for i in range(1, 9)} | {"tail slope": 0.3}
 
 
@@ -382,10 +384,10 @@ def off(size: float, *starts: str) -> dict[str, float]:
 
 def test_each_part_is_named():
     assert diagnosis(QUIET) == []
-    assert list(parts_off(off(12, "tail", "samples 110", "samples 140"))) == ["tail"]
+    assert list(parts_off(off(12, "tail", "1760 to", "2240 to"))) == ["tail"]
     assert list(parts_off(off(-9, "current"))) == ["current amplitude"]
-    assert list(parts_off(off(20, "samples 22", "samples 30"))) == ["top"]
-    (line,) = diagnosis(off(-30, "samples -60", "samples -40"))
+    assert list(parts_off(off(20, "352 to", "480 to"))) == ["top"]
+    (line,) = diagnosis(off(-30, "-960 to", "-640 to"))
     assert line.startswith("the onset is off by 19 σ: no readout shapes it")
     assert "cpunet calibrate" in line
 
@@ -393,7 +395,7 @@ def test_each_part_is_named():
 def test_physics_come_first_though_more_is_off_elsewhere():
     pulls = dict(QUIET)
     pulls |= {name: 40.0 for name in pulls if name.startswith("current")}
-    pulls |= {name: 15.0 for name in pulls if name.startswith("samples -")}
+    pulls |= {name: 15.0 for name in pulls if name.startswith("-")}
     assert list(parts_off(pulls)) == ["onset", "current amplitude"]
 
 

@@ -12,7 +12,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
-from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, Readings
+from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, Readings, stretch_name
 from synthetic import load_recipe, two_sites
 from unpaired import at_half_maximum
 
@@ -88,7 +88,7 @@ def test_stretches_are_deviations_in_robust_standard_deviations(moments, windows
     centre = np.median(means)
     sigma = 1.4826 * np.median(np.abs(means - centre))
     wanted = np.clip((means - centre) / sigma, -CONFIG.clip, CONFIG.clip)
-    found = moments.values[:, column(moments, f"samples {first} to {stop}")]
+    found = moments.values[:, column(moments, stretch_name(*CONFIG.segments_ns[6:8]))]
     np.testing.assert_allclose(found, wanted, atol=0.02)
 
 

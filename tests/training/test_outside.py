@@ -217,7 +217,7 @@ def test_what_cannot_be_prepared_is_cut_where_it_lies():
 
 
 def test_a_cycle_is_not_asked_for_noise_but_for_the_pulse():
-    weights = window_weights(load_recipe("paper").training.losses)
+    weights = window_weights(load_recipe("paper").training.losses, 800)
     clean = windows()
     torch.manual_seed(0)
     data = clean + 0.002 * torch.randn_like(clean)

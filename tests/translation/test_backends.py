@@ -275,7 +275,7 @@ def test_other_pulses_are_added_with_the_noise(noisy_run, prepared_sim):
         len(prepared_sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
     )
     drawn = Drawn(generator=ren.seeded(1), piled=piled, **energies)
-    result, _ = ren.apply_with_codes(prepared_sim, drawn)
+    result = ren.apply_with_codes(prepared_sim, drawn).windows
     step = result[4] - plain[4]
     # 0.2 of the height of 1, less by the scale: the tail is higher too
     assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)

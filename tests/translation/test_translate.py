@@ -151,6 +151,13 @@ def names(folder):
 # --- what is written
 
 
+def require_deposit(half_ns):
+    """The half rise of a translated pulse is that of the charge, delayed by two poles."""
+    half = (charge() < 0.5).sum(axis=1) * DT_NS
+    assert np.isfinite(half_ns).all()
+    assert (np.abs(half_ns - half - 60) < 80).all(), half_ns - half
+
+
 def test_all_other_columns_are_kept(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5", **many_columns())
     translate(run, source, tmp_path / "out.lh5")
@@ -163,7 +170,7 @@ def test_all_other_columns_are_kept(run, tmp_path):
     assert (waveform.values.nda.shape, waveform.values.nda.dtype) == ((N, 800), np.float32)
     assert np.isfinite(waveform.values.nda).all()
     assert (waveform.dt.attrs["units"], set(waveform.dt.nda)) == ("ns", {DT_NS})
-    assert set(waveform.t0.nda) == {-400 * DT_NS}  # sample 400 is where the pulse is aligned
+    require_deposit(waveform.t0.nda + 400 * DT_NS)  # sample 400 is where the pulse is aligned
     for name in set(before) - {"waveform", "rejection"}:
         assert plain(after[name]) == plain(before[name]), name
         assert after[name].attrs.get("units") == before[name].attrs.get("units")
@@ -425,7 +432,7 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     traces = table.waveform.values.nda
     assert (traces.dtype, traces.shape) == (np.uint16, (N, length))
     assert table.waveform.values.attrs["sample_units"] == "ADC"
-    assert (table.waveform.t0.nda == -n_pre * DT_NS).all()
+    require_deposit(table.waveform.t0.nda + n_pre * DT_NS)
     # the stored data: baseline 14000, and 10 ADC per keV and prepared unit
     energy = table.energy.nda
     assert traces[:, :200].mean() == pytest.approx(14_000, abs=2)
@@ -502,7 +509,7 @@ def test_learned_tails_are_those_behind_the_cuts(busy, tmp_path):
     assert left.max() < 40
     assert (left > 5).mean() == pytest.approx(0.13, abs=0.04)
     # behind a baseline that falls tails lie lower, and are scaled up to the same level
-    higher = values(out)[:, 410:440].mean(axis=1)
+    higher = values(out)[:, 430:460].mean(axis=1)
     share = left / lh5.read("geds/ren/energy", out).nda
     assert np.corrcoef(share, higher)[0, 1] > 0.4
     translate(busy, source, tmp_path / "rate.lh5", tails="1")
@@ -548,7 +555,7 @@ def test_piled_up_pulses_are_within_raw_traces_and_told(busy, tmp_path):
         at = ADC.n_pre + int(after_ns[row] / DT_NS)
         assert added[at - 100 : at - 60].mean() == pytest.approx(0, abs=15)
         wanted = kev[row] * 0.9 * 26145.11 / 2614.511
-        assert added[at + 5 : at + 15].mean() == pytest.approx(wanted, rel=0.1, abs=40)
+        assert added[at + 40 : at + 50].mean() == pytest.approx(wanted, rel=0.1, abs=40)
 
 
 def test_piled_up_pulses_are_within_windows(busy, tmp_path):
@@ -563,7 +570,10 @@ def test_piled_up_pulses_are_within_windows(busy, tmp_path):
     assert tilt[count == 0].max() < 0.03
     inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)
     assert inside.sum() >= 3
-    assert (values(out)[inside].max(axis=1) > 0.05).all()
+    heights = values(out)[inside].max(axis=1)
+    # those within the tail are rejected, as they are in data
+    assert (heights[np.isfinite(heights)] > 0.05).all()
+    assert np.isfinite(heights).any()
 
 
 @pytest.mark.parametrize(

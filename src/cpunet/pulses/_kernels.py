@@ -457,6 +457,9 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
         # no samples for the baseline, or more to fill in than is allowed
         before = min(s.max_padding_before, s.baseline_samples - 1)
         if start < -before or stop > length + s.max_padding_after:
+            highest, quiet_base = highest_of(trace), mean_of(trace[:quiet])
+            if highest - quiet_base < _MAX_RISE * (highest - lowest_of(trace)):
+                return NO_AMPLITUDE  # the pulse goes down
             short = length + before + s.max_padding_after < len(window)
             return WINDOW_OUTSIDE_RECORD if short else PULSE_AT_EDGE
         base = mean

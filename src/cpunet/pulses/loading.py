@@ -48,8 +48,16 @@ _REMEDIES = {
     Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
     Rejection.SATURATED: "select lower energies or another channel",
     Rejection.WINDOW_OUTSIDE_RECORD: (
-        "give longer records or allow more max_padding_before and max_padding_after"
+        "give longer records, or allow more preparation.padding_before_ns and padding_after_ns"
     ),
+    Rejection.PULSE_AT_EDGE: (
+        "give records with more before and after the pulse, or allow more "
+        "preparation.padding_before_ns and padding_after_ns"
+    ),
+    Rejection.NO_PLATEAU: (
+        "give a longer preparation.after_ns: the charge is not collected in time"
+    ),
+    Rejection.SECOND_PULSE: "check the rate: another pulse follows in nearly all traces",
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
     Rejection.ENERGY_UNKNOWN: (

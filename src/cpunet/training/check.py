@@ -184,7 +184,7 @@ def check(
     recipe
         ``fast``, ``cpunet``, ``paper``, or a YAML file.
     settings
-        Override a value of the recipe, as ``preparation.length=600`` (repeatable).
+        Override a value of the recipe, as ``preparation.after_ns=9600`` (repeatable).
     peak
         Energies to train on: FEP, SEP, DEP or a range in keV, as ``300-``, or several.
     read
@@ -294,9 +294,18 @@ def _count(one: InputSet, side: str) -> Finding:
 REMEDIES = {
     Rejection.SATURATED: "saturated traces have lost their top; choose lower energies",
     Rejection.WINDOW_OUTSIDE_RECORD: (
-        "the traces end too soon before or after the pulse; write longer ones, or allow more "
-        "padding (preparation.max_padding_before, max_padding_after in `settings`)"
+        "the traces are shorter than the window; write longer ones, or allow more padding "
+        "(preparation.padding_before_ns, padding_after_ns in `settings`)"
     ),
+    Rejection.PULSE_AT_EDGE: (
+        "the traces end too soon before or after the pulse; write longer ones, or allow more "
+        "padding (preparation.padding_before_ns, padding_after_ns in `settings`)"
+    ),
+    Rejection.NO_PLATEAU: (
+        "pulses still rise long after half of their height: drift is longer than the window; "
+        "lengthen it (preparation.after_ns in `settings`)"
+    ),
+    Rejection.SECOND_PULSE: "another pulse follows within the window: in-trace pile-up",
     Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
     Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
     Rejection.BASELINE_SLOPE: ("baselines are not flat: pile-up tails (cpunet info --quality)"),

@@ -269,6 +269,7 @@ def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
 
     Examples
     --------
+    >>> from cpunet.validation.slices import around_half
     >>> time = np.arange(400.0)
     >>> pulses = np.array([1 / (1 + np.exp((200 - time) / width)) for width in (2, 5, 9)])
     >>> aligned = around_half(pulses, dt_ns=16)
