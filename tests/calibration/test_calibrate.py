@@ -58,10 +58,10 @@ def stand(tmp_path_factory) -> Path:
 def calibrated_and_reads(
     stand, tmp_path_factory, reads
 ) -> tuple[cpunet.Calibration, Counter[Path]]:
-    """A search of one short round, for a chain of few parameters; how often files were read."""
+    """A search of two short rounds, for a chain of few parameters; how often files were read."""
     reads.clear()
     with pytest.MonkeyPatch.context() as patch:
-        for name, few in {"ROUNDS": 1, "STEPS": 6, "FIRST_STEPS": 8}.items():
+        for name, few in {"ROUNDS": 2, "STEPS": 6, "FIRST_STEPS": 8}.items():
             patch.setattr(f"cpunet.calibration.search.{name}", few)
         run = calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
     return run, reads.copy()

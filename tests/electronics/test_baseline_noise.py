@@ -265,7 +265,7 @@ def test_prepared_windows_fall_back_on_their_beginnings() -> None:
 
 
 def test_traces_that_begin_late_fall_back_too() -> None:
-    noise, note = measured_noise(as_input(white_traces(start=380)), FAST)
+    noise, note = measured_noise(as_input(white_traces(1200, start=380)), FAST)
     assert note is not None
     assert "ns before the pulse; the noise needs 6400 or more" in note
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
