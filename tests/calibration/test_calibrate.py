@@ -58,7 +58,7 @@ def stand(tmp_path_factory) -> Path:
 def calibrated_and_reads(
     stand, tmp_path_factory, reads
 ) -> tuple[cpunet.Calibration, Counter[Path]]:
-    """A search of two short rounds, for a chain of few parameters; how often files were read."""
+    """A search of two short rounds for few parameters; how often files were read."""
     reads.clear()
     with pytest.MonkeyPatch.context() as patch:
         for name, few in {"ROUNDS": 2, "STEPS": 6, "FIRST_STEPS": 8}.items():

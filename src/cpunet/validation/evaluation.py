@@ -77,7 +77,7 @@ def evaluate(
     *,
     truth: Path | None = None,
     baselines: bool = True,
-    peak: str = "",
+    further: str = "",
     max_pulses: int = MAX_PULSES,
     seed: int = 0,
 ) -> Evaluation:
@@ -90,8 +90,8 @@ def evaluate(
     """
     recipe, trained_on = run.recipe, run.peak
     ren = REN.of(run, resolve_device("auto"))
-    further = peak.replace(" ", "").split(",") if peak else []
-    names = list(dict.fromkeys([*recipe.peaks, trained_on, *further]))
+    others = further.replace(" ", "").split(",") if further else []
+    names = list(dict.fromkeys([*recipe.peaks, trained_on, *others]))
     selection = _selected(recipe, names)
     sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
     data_set = load_pulses(data, "measured", recipe, selection, max_pulses=max_pulses)

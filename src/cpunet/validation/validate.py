@@ -88,7 +88,7 @@ def validate(
     if max_pulses < 100:
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
     sim, data = read.files(sim, data)
-    how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses, "peak": peak}
+    how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses, "further": peak}
     how |= {"seed": require_seed(seed), "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)
     if data.table == ALL:
