@@ -139,7 +139,8 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
     # networks with noise outside are prepared alike
-    paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
+    aligned = "preparation.align_at=half_height"  # as these windows are
+    paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2", aligned])
     chosen = parse_selection("FEP", paper.peaks)
     sim = load_pulses(files.sim, "simulated", paper, chosen)
     measured = load_pulses(data, "measured", paper, chosen)

@@ -311,7 +311,8 @@ class HeldOut:
         """
         sides = self.fit_sim, self.fit_data
         with TemporaryDirectory() as folder:
-            job = TrainingJob(recipe, "", seed, device, *sides, Path(folder))
+            whole = recipe.at(sides[0].dt_ns)
+            job = TrainingJob(whole, "", seed, device, *sides, Path(folder))
             return REN.of(job.trained(None), device)
 
 
