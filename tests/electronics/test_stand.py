@@ -66,11 +66,14 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return built
 
 
-def made(out: Path, seed: int = 0, shift: tuple[str, ...] = ()) -> dict[str, npt.NDArray[Any]]:
+def made(
+    out: Path, seed: int = 0, shift: tuple[str, ...] = (), dt_ns: float = 16
+) -> dict[str, npt.NDArray[Any]]:
     """Everything in the files of a stand but where and when it was made."""
-    stand = make_stand(out, **SMALL, shift=shift, seed=seed)
+    period = {"dt_ns": dt_ns}
+    stand = make_stand(out, **SMALL, shift=shift, seed=seed, settings=period)
     assert str(load(out)) == str(stand)
-    assert load(out).electronics == read_electronics("ornl")
+    assert load(out).electronics == read_electronics("ornl", period)
     assert tuple(sorted(path.name for path in out.iterdir())) == FILES
     content: dict[str, npt.NDArray[Any]] = {}
     for name in ("sim.lh5", "data.lh5"):
@@ -150,18 +153,46 @@ def test_no_ringing_is_invented_for_a_fast_decay(tmp_path: Path) -> None:
     assert fit["chi_square"] < GOOD_FIT * fit["moments"]
 
 
+def test_a_stand_of_any_period_is_the_same_stand(tmp_path: Path) -> None:
+    """Means over 80 ns, a multiple of all periods, do not depend on the period."""
+
+    def means(waveforms: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return waveforms.reshape(len(waveforms), -1, round(80 / dt_ns)).mean(axis=2)
+
+    expected: list[npt.NDArray[Any]] = []
+    for dt_ns in (16, 10, 8, 4):
+        arrays = made(tmp_path / str(dt_ns), dt_ns=dt_ns)
+        for table, lasts_ns in (("sim.lh5/geds/sim", 3600), ("data.lh5/geds/raw", 22_400)):
+            assert (arrays[f"{table}/waveform/dt"] == dt_ns).all()
+            assert arrays[f"{table}/waveform/values"].shape[1] == lasts_ns / dt_ns
+        assert arrays["truth.npz/n_pre"] == 8000 / dt_ns
+        these = [
+            means(arrays["truth.npz/response"]),
+            means(arrays["sim.lh5/geds/sim/waveform/values"]),
+            arrays["sim.lh5/geds/sim/energy"],
+        ]
+        expected = expected or these
+        for values, same in zip(these, expected, strict=True):
+            np.testing.assert_allclose(values, same, atol=1e-4)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("shift", "temperatures"), [((), [85.0]), (("default",), [85.0, 87.0])]
+    ("shift", "temperatures", "dt_ns"),
+    [((), [85.0], 16), (("default",), [85.0, 87.0], 16), ((), [85.0], 10)],
 )
 def test_pulses_of_a_library_are_those_drifted_one_by_one(
-    libraries: list[float], tmp_path: Path, shift: tuple[str, ...], temperatures: list[float]
+    libraries: list[float],
+    tmp_path: Path,
+    shift: tuple[str, ...],
+    temperatures: list[float],
+    dt_ns: float,
 ) -> None:
-    by_library = made(tmp_path / "library", shift=shift)
+    by_library = made(tmp_path / "library", shift=shift, dt_ns=dt_ns)
     assert libraries == temperatures
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LIMIT, sum(EVENTS.values()) + 1)
-        drifted = made(tmp_path / "drifted", shift=shift)
+        drifted = made(tmp_path / "drifted", shift=shift, dt_ns=dt_ns)
     assert len(libraries) == len(temperatures)
     values = "waveform/values"
     for name in ("truth.npz/response", f"sim.lh5/geds/sim/{values}"):
@@ -177,7 +208,7 @@ def test_pulses_of_a_library_are_those_drifted_one_by_one(
     assert told == json.loads((tmp_path / "drifted" / "stand.json").read_text())
 
 
-@pytest.mark.parametrize("preset", ["ornl", "legend200"])
+@pytest.mark.parametrize("preset", ["ornl", "legend200", "mjd"])
 def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None:
     values = {"self_repulsion": 0.3, "hole_velocity_low_factor": 0.95}
     settings = SimulationSettings(**values)
@@ -218,13 +249,18 @@ def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
 
 def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
     for settings, said in (
+        ({"dt_ns": 0.05}, "dt_ns: Input should be greater than or equal to 1"),
         ({"dt_ns": 3000}, "dt_ns: Input should be less than or equal to 200"),
-        ({"step_ns": 8}, "a stand needs steps of at most 4 ns; lower it"),
+        ({"dt_ns": 12.5}, "dt_ns must be a multiple of step_ns, 1 ns; add step_ns=0.5$"),
+        ({"dt_ns": 3.001}, "multiple of step_ns, 1 ns; choose another$"),
+        ({"step_ns": 8}, "step_ns = 8: a stand needs steps of at most 4 ns; lower it$"),
+        ({"record_ns": 20}, "before_ns must be at least dt_ns and less than record_ns"),
         ({"earlier_pulses.rate_kHz": 1e300}, "earlier_pulses.rate_kHz: Input should be less"),
         ({"bias": 3}, "bias: no such setting"),
     ):
-        with pytest.raises(CpunetError, match=said):
+        with pytest.raises(CpunetError, match=said) as raised:
             make_stand(tmp_path / "a", **SMALL, settings=settings)
+        assert "\n" not in str(raised.value)
     with pytest.raises(CpunetError, match="`events` FEP=0: give at least 1 event"):
         make_stand(tmp_path / "a", events="FEP=0")
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from cpunet.pulses.parameters import (
     PARAMETERS,
     align_half_maximum,
     current_amplitude,
+    current_amplitude_kernel,
     drift_time,
     pulse_parameters,
     tail_slope,
@@ -86,6 +87,51 @@ def test_current_amplitude_finds_a_maximum_far_from_the_steepest_sample():
     assert current_amplitude(pulse[np.newaxis].astype(np.float32), 16.0) == pytest.approx(
         0.05, 1e-4
     )
+
+
+def sampled(decay_ns: float, dt_ns: float, means: bool) -> np.ndarray:
+    """Step responses of two poles at phases of the clock, at times or as means of periods."""
+    start = 4000 + np.linspace(0, 1, 16, endpoint=False)[:, np.newaxis] * dt_ns
+
+    def since(time: np.ndarray) -> np.ndarray:
+        return np.clip(time - start, 0, None) / decay_ns
+
+    time = np.arange(8000 / dt_ns) * dt_ns
+    if not means:
+        return (1 - np.exp(-since(time)) * (1 + since(time))).astype(np.float32)
+    ends = since(np.append(time, 8000.0) - dt_ns / 2)
+    integral = ends - 2 + (ends + 2) * np.exp(-ends)
+    return (np.diff(integral) * decay_ns / dt_ns).astype(np.float32)
+
+
+@pytest.mark.parametrize("dt_ns", [1.0, 2.0, 4.0, 8.0, 10.0])
+@pytest.mark.parametrize("means", [False, True])
+@pytest.mark.parametrize("decay_ns", [20.0, 50.0, 150.0])
+def test_the_current_amplitude_per_ns_is_the_same_at_any_period(decay_ns, means, dt_ns):
+    per_ns, wanted = (
+        np.median(current_amplitude(sampled(decay_ns, dt, means), dt)) / dt
+        for dt in (dt_ns, DT_NS)
+    )
+    assert per_ns == pytest.approx(wanted, rel=6e-3)
+
+
+@pytest.mark.parametrize("dt_ns", [1.0, 4.0, 10.0, 16.0, 32.0])
+def test_current_amplitude_of_a_ramp_is_its_slope_per_sample(dt_ns):
+    time = np.arange(-3200, 6400, dt_ns)
+    ramp = np.clip(time / 3200, 0, 1).astype(np.float32)
+    assert current_amplitude(ramp[np.newaxis], dt_ns) == pytest.approx(dt_ns / 3200, rel=1e-4)
+
+
+@pytest.mark.parametrize("dt_ns", [1.0, 4.0, 10.0, 12.5, 16.0, 32.0])
+def test_current_amplitude_is_that_of_its_kernel(dt_ns):
+    pulses = sampled(20.0, dt_ns, means=False)[:3]
+    weights = current_amplitude_kernel(dt_ns)
+    np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-4)
+    highest = [
+        max(np.convolve(np.diff(pulse), row[::-1], "valid").max() for row in weights)
+        for pulse in pulses
+    ]
+    assert current_amplitude(pulses, dt_ns) == pytest.approx(highest, rel=1e-4)
 
 
 @given(

@@ -183,7 +183,10 @@ class Electronics(Config):
             )
         nyquist_MHz, lines = 500 / self.dt_ns, self.noise.spectrum.lines
         if any(line.frequency_MHz >= nyquist_MHz for line in lines):
-            raise ValueError(f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate")
+            raise ValueError(
+                f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate; leave them "
+                "out or lower dt_ns"
+            )
         return self
 
     @property

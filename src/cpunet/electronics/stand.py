@@ -339,7 +339,9 @@ def stand_sides(
 
 
 def _fine_ns(dt_ns: float, step_ns: float) -> float:
-    """Longest period of pulses with whole steps, and at least two samples in one of `dt_ns`.
+    """Period of the pulses that the chain follows: whole steps, and a part of `dt_ns`.
+
+    It is the longest of at most 4 ns and, unless a step is as long, half of `dt_ns`.
 
     Examples
     --------
@@ -349,12 +351,10 @@ def _fine_ns(dt_ns: float, step_ns: float) -> float:
     2.5
     """
     steps = round(dt_ns / step_ns)
-    parts = next(
-        n
-        for n in range(min(2, steps), steps + 1)
-        if steps % n == 0 and dt_ns <= n * _COARSEST_NS
+    parts = range(2, steps)
+    return dt_ns / next(
+        (n for n in parts if steps % n == 0 and dt_ns <= n * _COARSEST_NS), steps
     )
-    return dt_ns / parts
 
 
 def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindow]) -> Labels:

@@ -97,9 +97,9 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     ``avg_current(1)`` → ``upsampler(16)`` → ``moving_window_multi(48, 3, 0)`` → ``min_max``,
     whose arithmetic is repeated here for several pulses at once.
 
-    There the difference of samples 16 ns apart, held for 16 ns, and where samples are means,
-    these, average the current, too.  At a shorter period :math:`\Delta t` a further moving
-    average over :math:`\sqrt{2.5\,(16^2 - \Delta t^2)}` ns has nearly the variance that
+    At 16 ns, the difference over a sample and holding it for a sample average the current, too,
+    as does the digitiser where samples are means.  At a shorter period :math:`\Delta t` a further
+    moving average over :math:`\sqrt{2.5\,(16^2 - \Delta t^2)}` ns has nearly the variance that
     they lack: of two such averages for samples at a time, of three for means.  Divided by the
     period, the amplitude of an edge is then the same within half a percent.
 
@@ -118,7 +118,8 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     Returns
     -------
     numpy.ndarray
-        Float64, shape ``(n,)``, in pulse heights per sample; NaN for a pulse with a NaN.
+        Float64, shape ``(n,)``, in pulse heights per sample; divide by the period to compare
+        periods.  NaN for a pulse with a NaN.
 
     Raises
     ------

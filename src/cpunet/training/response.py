@@ -199,7 +199,7 @@ def response(
     runs
         Runs of a readout chain, as of several detectors.
     truth
-        True readout: folder of a test stand, ornl, legend200, ringing, or a YAML file.
+        True readout: folder of a test stand, ornl, legend200, ringing, mjd, or a YAML file.
     out
         Folder for response.json and response.png.
     force
