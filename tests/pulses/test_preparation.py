@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
@@ -97,6 +97,9 @@ class TestMeasured:
         rise=st.floats(5, 60),
         seed=st.integers(0, 2**32 - 1),
     )
+    # no alignment of the first of these is the nearest to its own crossing: from 451 it is at
+    # 451.54, and from 452 at 451.49
+    @example(amplitude=500.0, start=410.0, rise=48.875, seed=536)
     def test_preparing_again_changes_nothing(
         self, amplitude: float, start: float, rise: float, seed: int
     ) -> None:
@@ -159,59 +162,6 @@ class TestMeasured:
         assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read == 5
         assert np.isfinite(prepared.pulses.waveforms).all()
         assert np.isfinite(prepared.scale).all()
-
-
-def arrived(time_ns: Array, tau_us: float) -> Array:
-    """Charge of a constant current over 600 ns from 0 on, with a decay."""
-    rise = np.clip(time_ns / 600, 0, 1)
-    return np.asarray(rise * np.exp(-np.clip(time_ns - 600, 0, None) / (1e3 * tau_us)))
-
-
-class TestHalfHeight:
-    @pytest.mark.parametrize("dt_ns", [1, 4, 8, 10, 16])
-    @pytest.mark.parametrize("tau_us", [50.0, 500.0, 1e9])
-    def test_the_nearest_sample_to_half_the_charge(self, dt_ns: float, tau_us: float) -> None:
-        begin = 8000 + np.linspace(0, dt_ns, 7, endpoint=False)[:, np.newaxis]
-        time = np.arange(round(17_000 / dt_ns)) * dt_ns - begin
-        raw = Pulses.of(100 + 2e4 * arrived(time, tau_us), dt_ns=dt_ns)
-        prepared = prepare(raw, CONFIG, "measured")
-        assert len(prepared) == 7
-        # the line through the tail continues the decay from 300 ns, where half is collected:
-        # 1 ns and its bend off
-        off = prepared.align_sample * dt_ns - begin[:, 0] - 300
-        assert np.abs(off).max() <= 0.5 * dt_ns + 4
-        assert prepared.pulses.t0_ns == pytest.approx(
-            (prepared.align_sample - CONFIG.at(dt_ns).samples_before) * dt_ns
-        )
-
-    @pytest.mark.parametrize("ratio", [50.0, 20.0, 10.0])
-    @pytest.mark.parametrize("tau_us", [60.0, 1e9])
-    def test_no_window_begins_inside_a_noisy_pulse(self, ratio: float, tau_us: float) -> None:
-        rng = np.random.default_rng(0)
-        time = np.arange(1400)[np.newaxis] * DT_NS - 9600
-        clean = 1e4 * np.repeat(arrived(time, tau_us), 400, axis=0)
-        slow = np.cumsum(rng.normal(0, 0.02, clean.shape), axis=1)
-        slow -= slow.mean(axis=1, keepdims=True)
-        raw = clean + 1e4 / ratio * (rng.normal(size=clean.shape) + slow)
-        prepared = prepare(Pulses.of(raw, dt_ns=DT_NS), CONFIG, "measured")
-        # logarithms of a tail need positive samples, which three sigma of ten do not threaten
-        assert len(prepared) >= 398
-        off_ns = prepared.align_sample * DT_NS - 9900
-        # half the height is off by noise over the slope of 1/600 ns
-        assert np.abs(off_ns).max() < 16 + 5 * 600 / ratio
-        first = prepared.pulses.waveforms[:, :20].mean(axis=1)
-        assert np.abs(first).max() < 5 * 0.8 / ratio
-
-    def test_what_follows_is_counted_by_reason(self) -> None:
-        time = np.arange(1400) * DT_NS - 9600
-        single = arrived(time, 60.0)
-        second = single + 0.3 * arrived(time - 4000, 60.0)
-        slow = single + 0.2 * np.clip((time - 1500) / 5000, 0, 1)
-        noise = np.random.default_rng(1).normal(0, 1e-3, (3, 1400))
-        raw = 1e4 * (np.stack([single, second, slow]) + noise)
-        prepared = prepare(Pulses.of(raw, dt_ns=DT_NS), CONFIG, "measured")
-        labels = [Rejection(int(code)).label for code in prepared.codes]
-        assert labels == ["accepted", "second_pulse", "no_plateau"]
 
 
 class TestSaturation:

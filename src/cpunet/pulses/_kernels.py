@@ -213,6 +213,11 @@ _MAX_RISE, _MAX_RISE_RMS = 0.1, 4.0
 _ROUNDING, _NEAREST = 2.0 * 2.0**-23, 0.501
 # Noise is averaged over this time before a pulse is searched.
 SMOOTHED_NS = 480.0
+# The level of half the height depends on the alignment: between two samples, noise can leave
+# no alignment that is the nearest to its own crossing.  A window that is normalised to rounding
+# is therefore aligned already if its crossing is within this time.  From half of the height to
+# 99.9 % a pulse takes longer: windows that are aligned there are aligned anew.
+PREPARED_NS, _NORMALISED = 128.0, 1e-5
 
 
 class Settings(NamedTuple):
@@ -231,6 +236,7 @@ class Settings(NamedTuple):
     saturation_run: int
     smoothed: int
     begun_margin: int
+    prepared: int
 
 
 @compiled
@@ -361,6 +367,16 @@ def _half_crossing(trace, smooth, align, level, s):  # type: ignore[no-untyped-d
 
 
 @compiled
+def _is_normalised(trace, base, s):  # type: ignore[no-untyped-def]
+    """Whether a trace as long as a window has the baseline and the scale of a prepared one."""
+    if s.simulated:
+        scale = np.float64(highest_of(trace))
+    else:
+        scale = tail_mean(trace, len(trace), s.tail_samples) / s.tail_level
+    return abs(base) < _NORMALISED and abs(scale - 1.0) < _NORMALISED
+
+
+@compiled
 def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     """The sample nearest to the crossing of half the height, base, height and rise."""
     length = len(trace)
@@ -368,7 +384,8 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     if length == s.samples_before + s.samples_after:  # prepared already?
         align = s.samples_before
         base, height, rise = _level_at(trace, align, s)
-        if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < _NEAREST:
+        near = max(s.prepared, _NEAREST) if _is_normalised(trace, base, s) else _NEAREST
+        if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < near:
             return align, base, height, rise
     top = highest_of(smooth)
     top_sample = first_at(smooth, top)
@@ -376,13 +393,16 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     if not s.simulated:
         base = mean_of(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
     align = crossing(smooth, top_sample, base + 0.5 * (top - base))
+    nearest, best = math.inf, (align, base, 0.0, 0.0)
     for _ in range(_ROUNDS):
         base, height, rise = _level_at(trace, align, s)
         time = _half_crossing(trace, smooth, align, base + 0.5 * height, s)
-        if abs(time - align) < _NEAREST:
+        if abs(time - align) < nearest:
+            nearest, best = abs(time - align), (align, base, height, rise)
+        if nearest < _NEAREST:
             break
         align = math.floor(time + 0.5)
-    return align, base, height, rise
+    return best
 
 
 @compiled

@@ -98,10 +98,10 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     whose arithmetic is repeated here for several pulses at once.
 
     At 16 ns, the difference over a sample and holding it for a sample average the current, too,
-    as does the digitiser where samples are means.  At a shorter period :math:`\Delta t` a further
-    moving average over :math:`\sqrt{2.5\,(16^2 - \Delta t^2)}` ns has nearly the variance that
-    they lack: of two such averages for samples at a time, of three for means.  Divided by the
-    period, the amplitude of an edge is then the same within half a percent.
+    as does the digitiser where samples are means.  At a shorter period :math:`\Delta t` a
+    further moving average over :math:`\sqrt{2.5\,(16^2 - \Delta t^2)}` ns has nearly the
+    variance that they lack: of two such averages for samples at a time, of three for means.
+    Divided by the period, the amplitude of an edge is then the same within half a percent.
 
     Each value of that chain is a positively weighted mean of the current some samples
     away.  The chain is therefore first run only around the steepest point of a

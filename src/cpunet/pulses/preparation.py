@@ -254,6 +254,7 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
         max_padding_after=config.samples(config.padding_after_ns),
         smoothed=config.samples(0.5 * _kernels.SMOOTHED_NS),
         begun_margin=config.samples(_kernels.BEGUN_MARGIN_NS),
+        prepared=config.samples(_kernels.PREPARED_NS),
         **{name: getattr(config, name) for name in _IN_SAMPLES},
     )
     codes, windows, numbers = _kernels.prepare_block(pulses.waveforms, settings)
