@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -75,6 +76,20 @@ def test_sides_that_fit(sides, check):
     assert picture.read_bytes().startswith(b"\x89PNG")
     again = check(sides.write_sim(), sides.write_data(), "--out", picture)
     assert "exists" in again.err.splitlines()[-1]
+
+
+def test_a_window_shorter_than_the_drift_is_named_with_the_setting_that_mends_it(sides, check):
+    files = sides.write_sim(), sides.write_data()
+    tight = ("preparation.before_ns=700", "preparation.baseline_ns=500")
+    fits = ("training.before_ns=600", "training.segments_ns=[-500, 0, 500]")
+    words = [word for setting in (*tight, *fits) for word in ("--set", setting)]
+    line = first(check(*files, *words))
+    assert "the window is shorter than the drift" in line
+    remedy = re.search(r"preparation\.before_ns=\d+", line)
+    assert remedy is not None
+    done = check(*files, *words, "--set", remedy[0])
+    assert "shorter than the drift" not in done.out
+    assert "another detector" not in done.out
 
 
 def test_another_peak(sides, check):

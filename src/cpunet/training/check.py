@@ -8,6 +8,7 @@ equally), and current amplitudes (a readout only makes pulses slower).
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,7 +34,7 @@ from cpunet.pulses.preparation import Kind, Rejection
 from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import Recipe
+from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.moments import spread
 
 if TYPE_CHECKING:
@@ -45,6 +46,8 @@ SPREAD_RATIO, SHARPER = 1.2, 1.08
 # Differences due to rounding, in sampling periods, and to chance, in standard deviations; and
 # number of parts of the pulses from which the latter are estimated.
 ROUNDING, SURE, PARTS = 2.0, 4.0, 8
+# Charge from which a pulse has begun, as much short of all of it has ended; quantile of times.
+BEGUN, LONGEST = 0.01, 0.99
 LOST = 0.1  # share of the selected pulses left out for one reason that causes a warning
 MAX_PULSES = 2000  # maximum number of pulses per side for shapes
 RISES = (0.1, 0.5)  # of the height: a readout adds the same time between them to all pulses
@@ -242,19 +245,29 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
             findings.append(_refusal(error))
     if len(sets) < 2:
         return CheckResult(findings)
-    return CheckResult([*findings, *compare_sides(sets["sim"], sets["data"], selection)], sets)
+    return CheckResult(
+        [*findings, *compare_sides(sets["sim"], sets["data"], selection, recipe.preparation)],
+        sets,
+    )
 
 
-def compare_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[Finding]:
+def compare_sides(
+    sim: InputSet, data: InputSet, selection: EnergySelection, preparation: PreparationConfig
+) -> list[Finding]:
     """Compare two prepared sets."""
     findings = [*_required(sim, data, selection)]
     if any(finding.level == Level.ERROR for finding in findings):
         return findings
+    too_short = [*_too_short(sim, preparation)]
+    findings += too_short
     for one, side in ((sim, "simulated"), (data, "measured")):
-        findings += [_count(one, side), *_left_out(one, side), *_lines(one, side, selection)]
+        findings += [_count(one, side), *_lines(one, side, selection)]
+        if not too_short:  # else pulses in their own baselines would be blamed on others
+            findings += _left_out(one, side)
     if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
         return findings  # too few to compare shapes
-    return [*findings, _spread(sim, data), _amplitude(sim, data)]
+    spreads = [] if too_short else [_spread(sim, data)]
+    return [*findings, *spreads, _amplitude(sim, data)]
 
 
 def _judged(text: str, remedy: str, fine: bool) -> Finding:
@@ -312,6 +325,35 @@ REMEDIES = {
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",
 }
+
+
+def _too_short(sim: InputSet, preparation: PreparationConfig) -> Iterator[Finding]:
+    """Warn if simulated pulses reach into the baseline or the tail of a window."""
+    if preparation.align_at != "half_height":
+        return
+    waveforms, at = _of_height_one(sim), preparation.at(sim.dt_ns).samples_before
+    begin = at - (waveforms > BEGUN).argmax(axis=1)
+    end = waveforms.shape[1] - (waveforms[:, ::-1] < 1 - BEGUN).argmax(axis=1) - at
+    rooms = {
+        "before_ns": (
+            begin,
+            preparation.before_ns - preparation.baseline_ns,
+            "begin",
+            "before",
+        ),
+        "after_ns": (end, preparation.after_ns - preparation.decay_fit_ns, "rise", "after"),
+    }
+    for name, (samples, room_ns, what, where) in rooms.items():
+        longest_ns = float(np.quantile(samples, LONGEST)) * sim.dt_ns
+        if longest_ns > room_ns:
+            wanted = getattr(preparation, name) + longest_ns - room_ns
+            yield Finding(
+                Level.WARNING,
+                f"the window is shorter than the drift: pulses {what} up to "
+                f"{longest_ns:.0f} ns {where} half of their height, for which it has "
+                f"{room_ns:.0f} ns",
+                f"preparation.{name}={100 * math.ceil(wanted / 100)} in `settings`",
+            )
 
 
 def _left_out(one: InputSet, side: str) -> Iterator[Finding]:

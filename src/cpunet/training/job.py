@@ -191,7 +191,7 @@ class Training:
         sim, data = read(selection)
         require_same_sampling(sim, data)
         require_both_sides(sim, data, selection)
-        for finding in compare_sides(sim, data, selection):
+        for finding in compare_sides(sim, data, selection, recipe.preparation):
             if finding.level != Level.FINE:
                 log.warning(finding)
         away = continuum(recipe)
