@@ -55,6 +55,14 @@ def test_the_poles_of_a_base_follow_from_its_rise(step, pole_ns):
     assert step.pole_ns() == pytest.approx(pole_ns, rel=0.03)
 
 
+@pytest.mark.parametrize("dt_ns", [4.0, 10.0, 16.0])
+def test_the_delay_is_the_half_rise_of_two_poles(dt_ns):
+    response = LearnedResponse(CONFIG, dt_ns)
+    response.step.set_base(POLE_NS, 0.0)
+    # 1 - (1 + t) e^(-t) is 1/2 at 1.6783
+    assert response.delay_ns() == pytest.approx(1.6783 * POLE_NS, abs=1)
+
+
 def test_a_record_is_the_step_response_summed_over_the_current(step):
     response = LearnedResponse(CONFIG, DT_NS)
     response.step = step

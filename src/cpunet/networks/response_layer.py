@@ -128,6 +128,7 @@ def at_times(windows: Tensor, times: Tensor) -> Tensor:
 # Charge is zero before a window and constant after it, but decays outlast the record: their
 # kernel is cut, and the transform is long enough to avoid wrap-around.
 MIN_FACTOR = 1.6
+STEP_NS = 12_800.0  # of the response to a step whose half rise is the delay
 IMAGES = 3  # images of the spectrum on either side
 
 
@@ -186,7 +187,8 @@ class Readout(nn.Module):
     @torch.no_grad()
     def delay_ns(self) -> float:
         """Time in ns at which the response to a step is half as high as its maximum."""
-        padded = padded_length(record_length(0, dt_ns := float(self.dt_ns)))
+        dt_ns = float(self.dt_ns)
+        padded = padded_length(record_length(round(STEP_NS / dt_ns), dt_ns))
         lead = padding(dt_ns)[0]
         step = torch.fft.irfft(self.transfer(padded), padded).roll(lead)[: padded - lead]
         after = int((step >= 0.5 * step.max()).int().argmax())
