@@ -34,9 +34,10 @@ from cpunet.networks.response_layer import (
 )
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, ResponseConfig
 
-# Knots of the step response in ns: at every sample from FIRST to DENSE, then SPARSE logarithmic
-# ones up to LAST, and an exponential beyond.
-FIRST, DENSE, LAST, SPARSE = -128.0, 768.0, 7040.0, 20
+# Knots of the step response in ns: every APART or nearly so from FIRST to DENSE, then SPARSE
+# logarithmic ones up to LAST, and an exponential beyond.  Coordinates are the leading
+# eigenvectors of their covariance: denser knots would give those of the edge more weight.
+FIRST, DENSE, LAST, APART, SPARSE = -128.0, 768.0, 7040.0, 16.0, 20
 # The prior: width of the deviations from the base, factor of it about time 0 and how far that
 # reaches in ns, time from which times count logarithmically, and correlation length.
 WIDTH, EDGE, EDGE_NS, LINEAR_NS, LENGTH = 0.03, 5.0, 192.0, 96.0, 0.5
@@ -71,7 +72,8 @@ class StepResponse(Readout):
 
     def __init__(self, config: LearnedConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
-        dense = np.arange(round(FIRST / dt_ns), round(DENSE / dt_ns) + 1)
+        apart = max(1, round(APART / dt_ns))
+        dense = apart * np.arange(round(FIRST / dt_ns / apart), round(DENSE / dt_ns / apart) + 1)
         sparse = np.round(np.geomspace(DENSE, LAST, SPARSE) / dt_ns).astype(int)
         lags = np.unique(np.concatenate([dense, sparse]))
         double = torch.float64
