@@ -73,7 +73,9 @@ class StepResponse(Readout):
     def __init__(self, config: LearnedConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
         apart = max(1, round(APART / dt_ns))
-        dense = apart * np.arange(round(FIRST / dt_ns / apart), round(DENSE / dt_ns / apart) + 1)
+        dense = apart * np.arange(
+            round(FIRST / dt_ns / apart), round(DENSE / dt_ns / apart) + 1
+        )
         sparse = np.round(np.geomspace(DENSE, LAST, SPARSE) / dt_ns).astype(int)
         lags = np.unique(np.concatenate([dense, sparse]))
         double = torch.float64
