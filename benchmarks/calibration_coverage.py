@@ -149,7 +149,7 @@ def _shift(physics: Physics, coordinates: np.ndarray) -> dict[str, float]:
 def _search(
     stand: cpunet.Stand, before: Physics, drawn: np.ndarray, seed: int, simulated: int
 ) -> tuple[Search, np.ndarray]:
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     selection = parse_selection("2000-2700", recipe.peaks)
     sim = load_pulses(stand.sim, "simulated", recipe, selection).prepared
     measured = load_pulses(stand.data, "measured", recipe, selection)

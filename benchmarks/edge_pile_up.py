@@ -61,7 +61,7 @@ def second_maxima(edges: Values) -> Values:
 
 def passed(folder: Path) -> tuple[Prepared, npt.NDArray[np.int64], dict[str, Values]]:
     """Measured pulses that pass the quality cuts, their gamma lines, and all their labels."""
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     known = dict(np.load(folder / "data_labels.npz"))
     raw = open_pulses(folder / "data.lh5").read()
     raw = raw[np.flatnonzero(known["label"] < len(LINES))]

@@ -36,7 +36,7 @@ def first(pulses: Pulses, n: int) -> Pulses:
 
 
 def one(stand: Path, n: int) -> dict[str, float]:
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     selection = parse_selection("FEP", recipe.peaks)
     files = [PulseFile(stand / f"{side}.lh5") for side in ("sim", "data")]
     sim = load_pulses(files[0], "simulated", recipe, selection).prepared.pulses

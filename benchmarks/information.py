@@ -42,7 +42,7 @@ from cpunet.training.run import Run
 from cpunet.training.translated import Noise, SimulatedSide
 from cpunet.translation.translator import REN
 
-RECIPE = load_recipe("fast")
+RECIPE = load_recipe("fast").at(16)
 CONFIG, TRAINING = RECIPE.matching
 
 

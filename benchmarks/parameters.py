@@ -80,7 +80,7 @@ def rate(work: Callable[[], object], n: int) -> float:
 
 
 def main() -> None:
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     waveforms = prepared()
     pulses = Pulses.of(waveforms, dt_ns=DT_NS)
     settings = recipe.preparation, recipe.scores

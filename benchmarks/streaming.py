@@ -54,7 +54,7 @@ def write_input(path: Path, n: int) -> None:
 
 def write_fast_run(folder: Path) -> None:
     """Write an unfitted run of recipe `fast`, with white noise of 2 keV."""
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     chain = ResponseGenerator(recipe.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.full(4097, 4.0), 8192, DT_NS, 100))
     facts = {"dt_ns": DT_NS, "peak": "FEP", "seconds": 0, "seed": 0, "device": "cpu"}

@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     source = open_pulses(arguments.file, kev_per_adc=arguments.kev_per_adc)
-    preparation = load_recipe("fast").preparation
+    preparation = load_recipe("fast").at(16).preparation
     tails = PileUpTails.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
     raw = next(iter(source.blocks(4096)))
     console = Console()

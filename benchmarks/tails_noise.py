@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--decay-us", type=float, default=60.0)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    config = load_recipe("fast").preparation
+    config = load_recipe("fast").at(16).preparation
     raw = open_pulses(arguments.folder / "data.lh5").read()
     law = TailsLaw(
         arguments.rate_khz, arguments.decay_us, read_electronics("ornl").other_pulses_kev

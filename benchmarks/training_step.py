@@ -41,7 +41,7 @@ def work(
     torch.set_default_device(device)
     torch.manual_seed(0)
     keep_freed_memory()
-    recipe = load_recipe(recipe_name, settings)
+    recipe = load_recipe(recipe_name, settings).at(16)
     batch, length = recipe.cyclegan.training.batch_size, recipe.preparation.length
     rng = np.random.default_rng(0)
     ramps = (np.arange(length) - length / 2) / rng.uniform(20, 90, (2, batch, 1, 1)) + 1

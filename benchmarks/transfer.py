@@ -27,7 +27,7 @@ from cpunet.validation.evaluation import evaluate
 
 def few_of(data: PulseFile, pulses: int, folder: Path) -> PulseFile:
     """A file with that many traces of the training peak."""
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(16)
     select = parse_selection("FEP", recipe.peaks).select
     kept: list[Pulses] = []
     for block in data.open().blocks():
@@ -65,7 +65,7 @@ def main() -> None:
             (f"from the other, {arguments.pulses} pulses", known, few),
         ):
             run = folder / title.replace(" ", "_").replace(",", "")
-            recipe = load_recipe("fast")
+            recipe = load_recipe("fast").at(16)
             made = train(sim, measured, run, recipe=recipe, init=start, device="cpu")
             truth = arguments.stand / "truth.npz"
             scored = evaluate(made, sim, data, truth=truth, baselines=False)

@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--pulses", type=int, default=32, help="of a batch of the large U-Net")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    fast = load_recipe("fast")
+    fast = load_recipe("fast").at(16)
     chain = ResponseGenerator(fast.matching.generator, DT_NS).to(given.device)
     chain.set_noise(BaselineNoise(np.ones(4097), 8192, DT_NS, 100))
     response = ResponseBackend(chain, fast.preparation)
@@ -64,7 +64,7 @@ def main() -> None:
             response(pulses[rows], drawn)
 
     def unet(width: int, n: int) -> float:
-        recipe = load_recipe("paper", [f"generator.width={width}"])
+        recipe = load_recipe("paper", [f"generator.width={width}"]).at(16)
         network = PositionalUNet(recipe.cyclegan.generator, 800).to(given.device)
         drawn = Drawn(generator=torch.Generator(given.device))
         return rate(partial(NetworkBackend(network, fast.preparation), pulses[:n], drawn), n)

@@ -99,7 +99,7 @@ def main() -> None:
     given = parser.parse_args()
     keep_freed_memory()
     settings = {"generator.width": given.width, "generator.dropout": given.dropout}
-    recipe = load_recipe("paper", settings | {"training.noise": "baselines"})
+    recipe = load_recipe("paper", settings | {"training.noise": "baselines"}).at(16)
     files = PulseFile(given.stand / "sim.lh5"), PulseFile(given.stand / "data.lh5")
     chosen, truth = parse_selection(PEAK, recipe.peaks), given.stand / "truth.npz"
     sim, data = (

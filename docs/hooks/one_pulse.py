@@ -86,13 +86,13 @@ def draw_window(panel: Axes, window: Pulses) -> None:
     panel.axvline(400, color=GREY, lw=0.8)
     for level in (0, 0.8):
         panel.axhline(level, color=GREY, lw=0.8)
-    panel.text(390, 0.3, "99.9 % of the\nmaximum", ha="right", fontsize=8)
-    panel.text(8, 0.83, "0.80: mean of the last 5 samples", fontsize=8)
+    panel.text(390, 0.3, "half of\nits height", ha="right", fontsize=8)
+    panel.text(8, 0.83, "0.80: last 80 ns", fontsize=8)
     panel.set(xlabel="sample", ylabel="prepared pulse", xlim=(0, 799), ylim=(-0.08, 1))
 
 
 def draw_parameters(panel: Axes, window: Pulses) -> None:
-    recipe = load_recipe("fast")
+    recipe = load_recipe("fast").at(window.dt_ns)
     values = pulse_parameters(window, recipe.preparation, recipe.scores)
     pulse, dt_ns = window.waveforms[0], window.dt_ns
     time, top = np.arange(len(pulse)) * dt_ns / 1000, pulse.argmax()
