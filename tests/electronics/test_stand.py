@@ -26,7 +26,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings
-from cpunet.training.response_starts import GOOD_FIT
+from cpunet.training.fitter import GOOD_FIT
 from cpunet.training.train import train
 from synthetic import load_recipe, prepared_truth
 

@@ -48,6 +48,7 @@ def layer(poles: tuple[float, ...], ringing: dict | None = None) -> ElectronicsR
         ringing_mhz=None if ringing is None else ringing["frequency_MHz"],
         ringing_ns=RINGING["damping_ns"],
         drift_terms=0,
+        deviations=False,
     )
     response = ElectronicsResponse(config, DT_NS)
     with torch.no_grad():

@@ -13,8 +13,8 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.training.fitter import GOOD_FIT
 from cpunet.training.networks import outside_noise
-from cpunet.training.response_starts import GOOD_FIT
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.file_translation import Counts

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training import fitter as fitter_module
-from cpunet.training import response_fit, response_starts
+from cpunet.training import response_starts
 from cpunet.training.fitter import (
     Fitted,
     Fitter,
@@ -26,52 +25,6 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, measured_with
-
-SEARCHES = ["fit", "ringing_if_better", "free_decay_if_better"]  # of a hopeless fit
-DRIFT = ["drift_if_better", "drift_if_needed"]
-PHYSICS = "_with_wrong_physics"
-
-
-@pytest.mark.parametrize(
-    ("chi_square", "onset_is_off", "expected"),
-    [
-        (1.01, True, [PHYSICS]),
-        (1.01, False, [*SEARCHES, "_determined"]),
-        (0.99, True, [*SEARCHES, *DRIFT, PHYSICS]),
-    ],
-)
-def test_nothing_else_is_tried_for_another_detector(
-    monkeypatch, chi_square, onset_is_off, expected
-):
-    """If the onset is off, too; `chi_square` is in units of `response_fit.ANOTHER_DETECTOR`."""
-    called: list[str] = []
-    problem = SimpleNamespace(moments=20, response=SimpleNamespace(config=None, drift=None))
-    problem.of = lambda *_: problem
-    cost = 20 * chi_square * response_fit.ANOTHER_DETECTOR
-    found = Fitted(problem, cost, np.eye(1))
-
-    def replace(name: str, result: Any, of: Any = response_fit) -> None:
-        monkeypatch.setattr(of, name, lambda *_, **__: called.append(name) or result)
-
-    recipe, noise = load_recipe("fast"), SimpleNamespace(dt_ns=16.0)
-    fitter = Fitter(recipe.matching.training)
-    replace("fit", found, fitter)
-    for name in (*SEARCHES[1:], *DRIFT):
-        replace(name, found)
-    for name in (PHYSICS, "_determined"):
-        replace(name, name)
-    asked = {
-        "ElectronicsResponse": None,
-        "ResponseProblem": None,
-        "best_start": found,
-        "onset_is_off": onset_is_off,
-    }
-    for name, answer in asked.items():
-        monkeypatch.setattr(response_fit, name, lambda *_, answer=answer, **__: answer)
-    sets = SimpleNamespace(bands=lambda _most=None: [], recipe=recipe, noise=noise)
-    _, fit = response_fit.fit_response(sets, fitter)
-    assert called == expected
-    assert fit == expected[-1]
 
 
 @pytest.mark.parametrize(

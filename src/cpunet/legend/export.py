@@ -23,7 +23,6 @@ import yaml
 from scipy.special import log_ndtr, ndtr
 
 import cpunet
-from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.legend.currents import WINDOW, WINDOWS
 from cpunet.legend.library_files import known_detector
@@ -31,6 +30,7 @@ from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json
 from cpunet.training.chain_description import describe_chain
+from cpunet.training.closed_forms import StepResponse
 from cpunet.training.run import RunLike, as_run
 
 Values = npt.NDArray[np.float64]
@@ -71,7 +71,7 @@ class Equivalent:
     ae_error_percent: float
 
 
-def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
+def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
     """Fit sigma and tau to a chain.
 
     Parameters
@@ -81,6 +81,7 @@ def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
 
     Examples
     --------
+    >>> from cpunet.electronics.exponentials import Exponentials
     >>> two = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
     >>> found = equivalent_kernel(two)
     >>> 10 < found.sigma_ns < 30, 60 < found.tau_ns < 90
@@ -121,7 +122,7 @@ def equivalent_kernel(undecayed: Exponentials) -> Equivalent:
     )
 
 
-def current_delay_ns(undecayed: Exponentials) -> float:
+def current_delay_ns(undecayed: StepResponse) -> float:
     """Time of the maximum of the averaged current for charge that arrives instantaneously.
 
     The three averages look back over 48 ns each. Half of their total length is subtracted, so

@@ -110,6 +110,7 @@ class StepResponse(Readout):
             ringing_mhz=None,
             ringing_ns=1.0,
             drift_terms=0,
+            deviations=False,
         )
         padded, first = padded_length(2 * len(self.lags) + 1000), int(self.lags[0])
         with torch.no_grad():

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import scipy.fft
 import torch
 from torch import Tensor, nn
@@ -129,6 +132,8 @@ def at_times(windows: Tensor, times: Tensor) -> Tensor:
 # kernel is cut, and the transform is long enough to avoid wrap-around.
 MIN_FACTOR = 1.6
 STEP_NS = 12_800.0  # of the response to a step whose half rise is the delay
+DEVIATION_NS = -100.0, 8400.0  # in which a step response deviates from its chain
+AXES = 24  # of the covariance of deviations, which are kept
 IMAGES = 3  # images of the spectrum on either side
 
 
@@ -198,6 +203,12 @@ class Readout(nn.Module):
         return (place + 0.5 - lead) * dt_ns
 
 
+def deviation_lags(dt_ns: float) -> npt.NDArray[np.intp]:
+    """Samples from a step at which its response deviates from the chain."""
+    first, stop = (round(ns / dt_ns) for ns in DEVIATION_NS)
+    return np.arange(first, stop)
+
+
 class ElectronicsResponse(Readout):
     r"""Charge pulses → noise-free records of any height, by physical parameters.
 
@@ -209,7 +220,9 @@ class ElectronicsResponse(Readout):
         d(t) = \left(1 - \sum_i a_i\right) e^{-t/\tau} + \sum_i a_i e^{-t/\tau_i}
 
     the current of a pulse is multiplied by :math:`H` and by the spectrum of :math:`d`.  Times
-    are kept as logarithms, so that they stay positive and steps are relative.
+    are kept as logarithms, so that they stay positive and steps are relative.  What no such
+    chain does is a deviation of the step response at each lag, see
+    `cpunet.training.deviations`; later, it decays with the chain.
 
     Parameters
     ----------
@@ -241,6 +254,8 @@ class ElectronicsResponse(Readout):
 
     slow_ns: Tensor
     fast_decays_us: Tensor
+    deviation: Tensor
+    deviation_axes: Tensor
     drift: DriftClock | None
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
@@ -267,6 +282,18 @@ class ElectronicsResponse(Readout):
         self.ringing = weights(rings)
         self.log_ringing = log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
+        if config.deviations:
+            shape = AXES, len(deviation_lags(dt_ns))
+            self.register_buffer("deviation", torch.zeros(shape[1], dtype=torch.float64))
+            self.register_buffer("deviation_axes", torch.zeros(shape, dtype=torch.float64))
+
+    def set_deviation(
+        self, deviation: npt.NDArray[Any], axes: npt.NDArray[Any] | None = None
+    ) -> None:
+        """Set the deviation at each lag, and the axes of its covariance, shape (lags, axes)."""
+        self.deviation.copy_(torch.from_numpy(deviation))
+        if axes is not None:
+            self.deviation_axes[: axes.shape[1]] = torch.from_numpy(axes.T)
 
     def drifted(self, windows: Tensor) -> Tensor:
         """Simulated pulses with their drift stretched, as they enter the readout."""
@@ -292,7 +319,16 @@ class ElectronicsResponse(Readout):
         kept = math.ceil(padded / MIN_FACTOR) - padding(float(dt_ns))[0]
         time_us = torch.arange(kept, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
         whole: Tensor = fast * torch.fft.rfft(self.decay(time_us), padded)
-        return whole
+        if not self.config.deviations:
+            return whole
+        first, last = (int(deviation_lags(float(dt_ns))[i]) for i in (0, -1))
+        step = torch.zeros(padded, dtype=torch.float64, device=dt_ns.device)
+        step[first:], step[: last + 1] = self.deviation[:-first], self.deviation[-first:]
+        if (at_last := torch.fft.irfft(whole, padded)[last : max(last + 1, kept)]).numel() > 1:
+            step[last:kept] = self.deviation[-1] * at_last / at_last[0]
+        step[kept : padded + first] = 0
+        with_deviation: Tensor = whole + torch.fft.rfft(step, padded)
+        return with_deviation
 
     @property
     def fast_times_us(self) -> Tensor:
@@ -356,8 +392,14 @@ class ElectronicsResponse(Readout):
         return told
 
     def describe(self) -> dict[str, float]:
-        """Fitted parameters by name, with the unit at the end of the name."""
-        return {name: value for name, (_, value) in self.named().items()}
+        """Fitted parameters by name, with the unit at the end of the name.
+
+        ``deviation`` is the largest one of the step response.
+        """
+        told = {name: value for name, (_, value) in self.named().items()}
+        if self.config.deviations:
+            told["deviation"] = float(self.deviation.abs().max())
+        return told
 
 
 def _spline(frequency: Tensor) -> Tensor:

@@ -69,6 +69,8 @@ class ResponseConfig(Config):
     none if ``ringing_mhz`` is null.  With ``free_decays`` the ``fast_decays_us`` are initial
     values of free times, too.  ``drift_terms`` is the number of parameters that stretch the
     simulated drift, see `cpunet.networks.response_layer`; 0 for the drift as simulated.
+    ``deviations`` are those of the step response from that of the chain, which are added where
+    the pulses ask for them.
     """
 
     name: Literal["response"]
@@ -80,6 +82,7 @@ class ResponseConfig(Config):
     ringing_mhz: Positive | None
     ringing_ns: Positive
     drift_terms: DriftTerms
+    deviations: bool
 
     @field_validator("slow_ns", "fast_decays_us")
     @classmethod

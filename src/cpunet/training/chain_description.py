@@ -31,6 +31,8 @@ from cpunet.training.closed_forms import (
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run import FitInfo, Run
 
+# The parts of a chain that deviates are not what its step response consists of.
+HIDDEN = ("slow_", "pole_", "decay_", "fast_decay_", "ringing")
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
 
@@ -85,20 +87,23 @@ def describe_chain(run: Run) -> DescribedChain:
         parameters["ringing"] = response.ringing.norm().item()
 
     def derived(moved: ElectronicsResponse) -> Numbers:
-        slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
         numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
+        if moved.config.deviations:  # which does not part into a rise and decays
+            return {n: value for n, value in numbers.items() if not n.startswith("droop_")}
+        slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
         return slow_numbers(slow) | numbers
 
     errors = fitted_errors(response, fit.errors)
     errors |= propagated(response, fit.covariance, derived)
-    values = {n: v for n, v in parameters.items() if not n.startswith("slow_")}
+    hidden = "slow_" if "deviation" not in parameters else HIDDEN
+    values = {n: v for n, v in parameters.items() if not n.startswith(hidden)}
     values |= derived(response) | noise_numbers(chain)
     if fit.chi_square_per_moment is not None:
         values["chi_square_per_moment"] = fit.chi_square_per_moment
     doubts = beyond(parameters) + stretched(parameters, fit.gains)
     if fit.causes:
         told = "these numbers stand in for what is wrong with the simulation, too"
-        doubts.insert(0, f"poor fit: {fit.verdict}; {told}: {fit.causes[0]}")
+        doubts.insert(0, f"the fit is {fit.verdict}; {told}: {fit.causes[0]}")
     of_values = {n: e for n, e in errors.items() if n in values} | _noise_error(run, chain)
     return DescribedChain(run, chain, values, of_values, parameters, errors, doubts)
 
@@ -187,7 +192,7 @@ def _parameters(values: Mapping[str, float]) -> str:
         stem, _, unit = name.rpartition("_")
         shown = f" {UNITS[unit]}" if unit in UNITS else ""
         called = (stem if shown else name).replace("_", " ")
-        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)", name):
+        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)|deviation", name):
             words.append(f"{called}{shown} {percent(100 * value)}")
         else:
             words.append(f"{called} {value:.4g}{shown}")

@@ -11,8 +11,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from cpunet.electronics.baseline_noise import record_samples
@@ -20,7 +23,7 @@ from cpunet.electronics.chain import Decay, Electronics
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
 from cpunet.electronics.readout import noise_power
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.response_problem import SmoothParameters
 
@@ -31,6 +34,71 @@ _TIMES_NS = np.arange(0, 10_000, _FINE_NS)  # of step responses
 _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 # Range in which a spectrum is flat, in units of half the sampling rate, and smoothing bins.
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
+
+
+class StepResponse(Protocol):
+    """A step response, in units of the full charge, and its derivative per ns."""
+
+    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """At times in ns after the step."""
+
+    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Its derivative."""
+
+
+class WithDeviation:
+    """A closed form plus a deviation of its step response, which decays with the chain later.
+
+    Parameters
+    ----------
+    chain
+        The chain.
+    time_ns, deviation
+        Times, and deviation at each.
+    """
+
+    def __init__(
+        self, chain: Exponentials, time_ns: npt.NDArray[np.floating[Any]], deviation: FloatArray
+    ) -> None:
+        self.chain, self.first, self.last = chain, time_ns[0], time_ns[-1]
+        self.deviation = CubicSpline(time_ns, deviation)
+        self.late = deviation[-1] / chain.step(self.last)
+
+    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Its response to a step."""
+        time, chain = np.asarray(t_ns, float), self.chain.step(t_ns)
+        deviation = self.deviation(np.clip(time, self.first, self.last))
+        deviation = np.where(time < self.first, 0.0, deviation)
+        return np.asarray(chain + np.where(time > self.last, self.late * chain, deviation))
+
+    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Its derivative."""
+        return _derivative(self, t_ns)
+
+
+class PoleZeroed:
+    """A step response without the decay of its late part, which becomes 1."""
+
+    def __init__(self, whole: WithDeviation) -> None:
+        self.whole = whole
+        late_ns = np.linspace(0.5 * whole.last, whole.last, 100)
+        self.slope, self.level = np.polyfit(late_ns, np.log(whole.step(late_ns)), 1)
+
+    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Its response to a step."""
+        time = np.asarray(t_ns, float)
+        return np.asarray(self.whole.step(time) * np.exp(-self.slope * time - self.level))
+
+    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Its derivative."""
+        return _derivative(self, t_ns)
+
+
+def _derivative(response: StepResponse, t_ns: npt.ArrayLike) -> FloatArray:
+    early, late = (
+        response.step(np.asarray(t_ns) + end) for end in (-0.5 * _FINE_NS, 0.5 * _FINE_NS)
+    )
+    return np.asarray((late - early) / _FINE_NS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +117,8 @@ class Chain:
     """
 
     name: str
-    whole: Exponentials
-    undecayed: Exponentials
+    whole: StepResponse
+    undecayed: StepResponse
     noise: tuple[FloatArray, FloatArray] | None = None
 
 
@@ -153,7 +221,12 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
         undecayed = undecayed * Exponentials(1 + cosine, *pair)
     shares = [1 - sum(fast), *fast]
     whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
-    return Chain(name, whole, undecayed)
+    if not response.config.deviations:
+        return Chain(name, whole, undecayed)
+    # a sample is the mean over its period
+    time_ns = np.asarray(deviation_lags(dt_ns := float(response.dt_ns)) + 0.5) * dt_ns
+    deviating = WithDeviation(whole, time_ns, response.deviation.numpy())
+    return Chain(name, deviating, PoleZeroed(deviating))
 
 
 def true_chain_of(electronics: Electronics) -> Chain:
@@ -239,7 +312,13 @@ def propagated(
         Standard deviation by name, of numbers that are defined at both ends of every axis;
         empty if the covariance does not match the parameters.
     """
-    moved = copy.deepcopy(response)
+    moved, ends = copy.deepcopy(response), []
+    if response.config.deviations:  # their axes contain the parameters of the chain
+        for axis in response.deviation_axes:
+            for sign in (1, -1):
+                moved.deviation = response.deviation + sign * axis
+                ends.append(numbers(moved))
+        return _half_ranges(ends)
     parameters = SmoothParameters(moved, poles=False)
     centre = parameters.vector()
     matrix = np.asarray(covariance, float)
@@ -247,11 +326,15 @@ def propagated(
         return {}
     turn = parameters.turn()
     variances, axes = np.linalg.eigh(turn @ matrix @ turn.T)
-    ends = []
     for axis in (np.sqrt(np.maximum(variances, 0)) * axes).T:
         for end in (centre + axis, centre - axis):
             parameters.set(end)
             ends.append(numbers(moved))
+    return _half_ranges(ends)
+
+
+def _half_ranges(ends: Sequence[Numbers]) -> Numbers:
+    """Root of the sum of squares of half the differences between pairs of ends."""
     errors: Numbers = {}
     for name in ends[0]:
         if all(name in end for end in ends):

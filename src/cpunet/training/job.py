@@ -35,7 +35,7 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.diagnosis import beyond, diagnosis, stretched
+from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.learned_fit import fit_learned
@@ -269,10 +269,11 @@ def match(
     stretches = stretched(parameters, fit.gains)
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     told = asdict(fit) | {
+        "checks": fit.checks,
         "parameters": parameters,
         "delay_ns": response.delay_ns(),
         "verdict": "; ".join([fit.verdict, *stretches]),
-        "causes": diagnosis(fit.pulls) if fit.poor else [],
+        "causes": fit.checks.causes,
         "in_no_band": {
             "sim": len(sim) - sum(n for n, _ in counts),
             "data": len(data) - sum(m for _, m in counts) - fit.data_left_out,
@@ -303,10 +304,10 @@ def _tell(fit: Fit, info: FitInfo, doubts: list[str]) -> None:
             f"in no band, since one side has too few of their energies: {beside['sim']} "
             f"simulated and {beside['data']} measured pulses"
         )
-    if fit.poor:
-        log.warning(f"poor fit: {fit.verdict}")
+    if not fit.checks.good:
+        log.warning(f"the fit is {fit.verdict}")
     else:
-        log.info(f"fit: {fit.verdict}")
+        log.info(f"the fit is {fit.verdict}")
     for part, gain in fit.gains.items():
         if part != DRIFT[1] or "drift_stretch" not in info.parameters:
             log.info(f"{part}: {gain}")

@@ -44,6 +44,7 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import CHECKED, Fit, described
 from cpunet.training.response_problem import Band, BandComparison, ResponseProblem
 from cpunet.training.response_starts import RINGS, onset_is_off
+from cpunet.training.verdict import verdict
 
 # Width of the bins of the current amplitude and pulses of each side in the first fit from afar,
 # and the width in the second.
@@ -90,7 +91,9 @@ def fit_learned(
     else:
         everything = changed([*everything, *single], response.drift)
         covariance = fitter.follow(ResponseProblem(response.step, everything, 2)).covariance
-    return response, described(ResponseProblem(response.step, everything), covariance, fitter)
+    checks = verdict(response, sets.sides(response))
+    problem = ResponseProblem(response.step, everything)
+    return response, described(problem, covariance, checks, fitter)
 
 
 def _from_afar(

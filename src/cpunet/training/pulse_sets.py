@@ -13,16 +13,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import record_length
-from cpunet.pulses.container import Pulses
+from cpunet.networks.response_layer import Readout, record_length
+from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
-from cpunet.training.moments import MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
+from cpunet.training.aligned import Frame
+from cpunet.training.comparison import MOST, Sides
+from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
 from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, SimulatedSide
 
@@ -228,6 +231,28 @@ class PulseSets:
             some.append(self._band(band, *chosen))
         return some
 
+    def sides(self, response: Readout) -> list[Sides]:
+        """Pulses of both sides in each band for the comparison at every sample.
+
+        The simulated ones have passed what stands before the readout.
+        """
+        preparation, training = self.recipe.preparation, self.recipe.matching.training
+        frame, found = Frame.of(training), []
+        for band, orders in self.parted:
+            some, of_data = (order[:MOST] for order in orders)
+            weights = band.weights[some]
+            if np.ptp(weights) > 0:
+                some = self.rng.choice(some, len(some), p=weights / weights.sum())
+            sim = self.sim[band.sim[some]]
+            data = self.data.waveforms[np.sort(band.data[of_data])]
+            data = data[np.isfinite(data).all(axis=1)]
+            length = record_length(sim.waveforms.shape[1], sim.dt_ns)
+            drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)
+            noise = Noise.draw(self.noise, *drawn)
+            entering = _entering(response, sim.waveforms)
+            found.append(Sides(entering, data, noise, frame, preparation.tail_level))
+        return found
+
     def single_sites(self) -> list[Band]:
         """Single sites of the continuum, whose peak of the current amplitude is compared.
 
@@ -263,3 +288,12 @@ class PulseSets:
         length = record_length(sim.waveforms.shape[1], sim.dt_ns)
         drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
         return SimulatedSide(sim.waveforms, drawn, moments, weights)
+
+
+def _entering(response: Readout, sim: FloatArray) -> FloatArray:
+    """Simulated pulses as they enter the readout."""
+    if response.drift is None:
+        return sim
+    with torch.no_grad():
+        parts = torch.split(torch.from_numpy(np.ascontiguousarray(sim)), BLOCK)
+        return np.concatenate([response.drifted(part).numpy() for part in parts])

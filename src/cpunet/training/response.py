@@ -46,6 +46,7 @@ ROWS = {
     r"ringing_(sine|cosine)": (r"its \1", "%"),
     r"ringing_mhz": ("ringing frequency", "MHz"),
     r"ringing_damping_ns": ("ringing damping", "ns"),
+    r"deviation": ("largest deviation from a chain", "%"),
     r"drift_stretch": ("drift stretched by", "%"),
     r"drift_stretch_per_us": ("and per µs by", "%"),
     r"rise_(.*)_(.*)_ns": (r"rise \1–\2 %", "ns"),

@@ -1,49 +1,48 @@
-"""Fit a readout chain to unpaired pulses: least squares on moments, with errors.
+"""Fit a readout to unpaired pulses: a chain of few parameters, then any step response.
 
-The parameters of a response are those for which the moments of the translated simulation,
+The parameters of a chain are those for which the moments of the translated simulation,
 including noise, agree best with those of the data: a chi-square fit of about ten parameters by
 the Levenberg–Marquardt method, with exact derivatives at fixed random numbers.
 Some of the pulses are enough to find the valley of chi-square; all of them, optimally weighted,
-then determine the response within it.
+then determine the chain within it.  What no such chain does is learned as deviations of its
+step response (`cpunet.training.deviations`), if the pulses ask for them.
 
-With enough pulses any chain differs significantly from the true one: chi-square grows with
-their number.  What matters is the effect of the difference on the current amplitude, which
-users cut on.  It is therefore also given as the shift of the current amplitude (A of A/E) that
-would best match the translated distribution to the data.
+Every sample decides whether that is good (`cpunet.training.verdict`).  If it is not, and pulses
+begin differently than simulated, the drift of the charges is stretched.
+
+The current amplitude is what users cut on.  How well it is known is also given as the shift of
+the current amplitude (A of A/E) that would best match the translated distribution to the data.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse, Readout
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
+from cpunet.training.deviations import with_deviations
+from cpunet.training.fitter import Fitted, Fitter, held_out_gain
 from cpunet.training.moments import Readings, Values
 from cpunet.training.optimal_weights import ConditionalFunctions, refine
 from cpunet.training.pulse_sets import SINGLE, PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from cpunet.training.response_starts import (
-    HOPELESS_FIT,
-    best_start,
     drift_if_better,
     drift_if_needed,
-    free_decay_if_better,
     from_known,
+    from_start,
     onset_is_off,
-    ringing_if_better,
 )
+from cpunet.training.verdict import Verdict, verdict
 
-# Chi-square per moment above which, with such an onset, nothing else is tried: simulation and
-# data are from different detectors.  A ringing missing from the response results in 50.
-ANOTHER_DETECTOR = 100.0
-# Pulses of each side with which a poor fit is examined.
+# Pulses of each side with which a stretch of the drift is examined.
 CHECKED = 4096
-# Chi-square per moment above which a fast decay is tried beside a stretch of the drift.
-HIDDEN = 1.2
+# Chi-square per sample above which the physics are wrong, if pulses begin otherwise, too.
+HOPELESS = 5.0
 # Rounds of optimal weights; those of the second are evaluated at the result of the first.
 ROUNDS = 2
 
@@ -54,6 +53,8 @@ class Fit:
 
     Parameters
     ----------
+    checks
+        What every sample says.
     chi_square, moments
         Chi-square and number of moments of the comparison, before any allowance for errors of
         the simulation.
@@ -78,6 +79,7 @@ class Fit:
         What held-out pulses say of each part that was tried.
     """
 
+    checks: Verdict
     chi_square: float
     moments: int
     steps: int
@@ -98,28 +100,9 @@ class Fit:
         off = abs(shift) >= 2 * error
         right = f"right to {abs(shift) + error:.2f} %"
         size = f"off by {shift:+.2f} ± {error:.2f} %" if off else right
-        per, why = self.chi_square / self.moments, "as by chance"
-        if self.poor:
-            why = "too much for chance"
-        elif per > GOOD_FIT:
-            why = "of a misfit that only so many pulses tell"
         # a shift that is small compared with its error does not make the shape right
-        more = f"; the current amplitude is {size}" if off or not self.poor else ""
-        return f"chi-square is {per:.1f} per moment, {why}{more}"
-
-    @property
-    def poor(self) -> bool:
-        """Whether the response does not describe the data.
-
-        With enough pulses any response differs significantly from the true one.  What matters
-        then is the misfit relative to the spread of single pulses.
-        """
-        return self.excess > GOOD_FIT - 1
-
-    @property
-    def excess(self) -> float:
-        """Chi-square per moment above 1, scaled to `CHECKED` pulses if there are more."""
-        return (self.chi_square / self.moments - 1) * min(1.0, 0.5 * CHECKED / self.pairs)
+        more = f"; the current amplitude is {size}" if off or self.checks.good else ""
+        return f"{self.checks}{more}"
 
 
 def fit_response(
@@ -146,41 +129,65 @@ def fit_response(
     config = sets.recipe.chain
     some = sets.bands(fitter.training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, sets.noise.dt_ns), some, draws=1)
-    near = None if known is None else from_known(first, known, fitter)
-    found = near or best_start(first, config, fitter)
     everything = sets.bands()
-    response = found.problem.response
-    if response.drift is None and not found.poor:
-        fit = _determined(found, everything, sets, fitter)
-        if not fit.poor:
-            return response, fit
-    elif found.per_moment > ANOTHER_DETECTOR and onset_is_off(found.problem):
-        return response, _with_wrong_physics(found, fitter)
-    more = found.problem.of(response, sets.bands(CHECKED))
-    found = _extended(fitter.fit(more, coarse=False), fitter)
-    response = found.problem.response
-    if found.poor and onset_is_off(found.problem):
-        return response, _with_wrong_physics(found, fitter)
-    return response, _determined(found, everything, sets, fitter)
+    found = None if known is None else from_known(first, known, fitter)
+    tried = []
+    for factor in fitter.training.start_factors:
+        found = found or from_start(first, config, fitter, factor)
+        tried.append((_learned(found, everything, sets, fitter), found))
+        if tried[-1][0].checks.good or not found.poor:
+            break  # there is no other valley to search for
+        found = None
+    best, found = min(tried, key=lambda one: one[0].checks.chi_square)
+    if best.checks.good or not onset_is_off(found.problem):
+        return best.described(everything, fitter)
+    stretched = _stretched(found.problem.of(best.chain, sets.bands(CHECKED)), fitter)
+    if stretched is not None:
+        further = _single_sites(stretched.problem.response, sets, fitter)
+        everything = [*everything, *further]
+        other = _learned(stretched, everything, sets, fitter)
+        if other.checks.chi_square < best.checks.chi_square:
+            best, found = other, stretched
+    if best.checks.chi_square < HOPELESS:
+        return best.described(everything, fitter)
+    return _with_wrong_physics(best, found, everything, sets, fitter)
 
 
-def _extended(found: Fitted, fitter: Fitter) -> Fitted:
-    """Extend the response by what brings a poor or stretched fit closer."""
-    stretched = found.problem.response.drift is not None
-    hopeless = found.per_moment > HOPELESS_FIT
-    if hopeless:  # nothing else may stand in for a ringing
-        found = ringing_if_better(found, fitter)
-    elif stretched:
-        found = drift_if_better(found, fitter)
-    # a stretch hides some of what another decay does
-    if found.poor or (stretched and found.per_moment > HIDDEN):
-        found = free_decay_if_better(found, fitter)
-    if found.poor and not hopeless:
-        found = ringing_if_better(found, fitter)
-    if stretched or (found.poor and onset_is_off(found.problem)):
-        found = drift_if_better(found, fitter)
-        found = drift_if_needed(found, fitter)
-    return found
+class _Learned(NamedTuple):
+    """A chain, the response with its deviations, if any, and what every sample says of it."""
+
+    chain: ElectronicsResponse
+    response: ElectronicsResponse
+    checks: Verdict
+    covariance: Values | None
+
+    def described(
+        self, bands: Sequence[Band], fitter: Fitter
+    ) -> tuple[ElectronicsResponse, Fit]:
+        """The response and its fit."""
+        problem = ResponseProblem(self.response, bands)
+        return self.response, described(problem, self.covariance, self.checks, fitter)
+
+
+def _learned(found: Fitted, bands: Sequence[Band], sets: PulseSets, fitter: Fitter) -> _Learned:
+    """Determine a chain from all pulses, and learn what it does not do."""
+    chain, covariance = copy.deepcopy(found.problem.response), None
+    if chain.drift is not None:
+        # optimal weights trust the shapes of the pulses to a thousandth, and a simulation whose
+        # drift had to be stretched is not as good as that
+        whole = fitter.fit(ResponseProblem(chain, bands), coarse=False)
+        covariance = whole.covariance
+    elif not found.poor:
+        compared, near = ResponseProblem(chain, bands), found.problem.of(chain)
+        for _ in range(ROUNDS):
+            covariance = refine(near, bands, fitter.training.conditional_bins)
+            deviations = compared.deviations(compared.parameters.vector())
+            fitter.count(float(deviations @ deviations))
+    sides = sets.sides(chain)
+    if not found.poor and (checks := verdict(chain, sides)).clear:
+        return _Learned(chain, chain, checks, covariance)
+    response = with_deviations(chain, sides, fitter.count).response
+    return _Learned(chain, response, verdict(response, sides), covariance)
 
 
 def _single_sites(response: ElectronicsResponse, sets: PulseSets, fitter: Fitter) -> list[Band]:
@@ -199,43 +206,43 @@ def _single_sites(response: ElectronicsResponse, sets: PulseSets, fitter: Fitter
     return single if better else []
 
 
-def _determined(found: Fitted, bands: Sequence[Band], sets: PulseSets, fitter: Fitter) -> Fit:
-    """Determine the response within its valley from all pulses.
+def _stretched(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
+    """Stretch the drift, and let the stretch change with time, as far as that gains."""
+    found = fitter.fit(problem, coarse=False)
+    for _ in range(fitter.training.drift_terms):
+        found = drift_if_better(found, fitter)
+    return None if found.problem.response.drift is None else drift_if_needed(found, fitter)
 
-    Optimal weights trust the shapes of the pulses to a thousandth.  A simulation whose drift
-    had to be stretched is not as good as that, so the moments alone are compared there.
+
+def _with_wrong_physics(
+    best: _Learned, found: Fitted, bands: Sequence[Band], sets: PulseSets, fitter: Fitter
+) -> tuple[ElectronicsResponse, Fit]:
+    """A chain fitted with model errors of the simulation, which no response makes agree.
+
+    The shape of the edge would distort it; see `ResponseProblem.allow_for_model_error`.
     """
-    response = found.problem.response
-    if response.drift is not None:
-        further = _single_sites(response, sets, fitter)
-        whole = fitter.fit(ResponseProblem(response, [*bands, *further]), coarse=False)
-        return described(whole.problem, whole.covariance, fitter)
-    compared = ResponseProblem(response, bands)
-    for _ in range(ROUNDS):
-        covariance = refine(found.problem, bands, fitter.training.conditional_bins)
-        deviations = compared.deviations(compared.parameters.vector())
-        fitter.count(float(deviations @ deviations))
-    return described(compared, covariance, fitter)
-
-
-def _with_wrong_physics(found: Fitted, fitter: Fitter) -> Fit:
-    """Fit with model errors of the simulation, but report the chi-square without them."""
-    problem = found.problem
-    deviations = problem.deviations(problem.parameters.vector())
+    problem = found.problem.of(best.chain)
     problem.allow_for_model_error()
-    again = fitter.fit(problem, coarse=False)
-    fit = described(problem, again.covariance, fitter)
-    return replace(fit, chi_square=float(deviations @ deviations))
+    covariance = fitter.fit(problem, coarse=False).covariance
+    checks = verdict(best.chain, sets.sides(best.chain))
+    return _Learned(best.chain, best.chain, checks, covariance).described(bands, fitter)
 
 
-def described(problem: ResponseProblem, covariance: Values, fitter: Fitter) -> Fit:
-    """Describe the fit of a response."""
+def described(
+    problem: ResponseProblem, covariance: Values | None, checks: Verdict, fitter: Fitter
+) -> Fit:
+    """Describe the fit of a response; the covariance is that of the moments if not given."""
     parameters = problem.parameters
     vector = parameters.vector()
+    if covariance is None:
+        slopes = problem.derivatives(vector)
+        covariance = parameters.covariance(slopes.T @ slopes)
     pulls, deviations = problem.pulls(vector), problem.deviations(vector)
     whole = [band for band in problem.bands if band.moments.balance is None]
     shift, shift_error = amplitude_shift(problem.response, whole)
+    fitter.count(float(deviations @ deviations))
     return Fit(
+        checks=checks,
         chi_square=float(deviations @ deviations),
         moments=problem.moments,
         pairs=sum(band.pairs for band in problem.bands),

@@ -58,8 +58,8 @@ class Parameters:
         self.longest = np.where(learned, LONGEST, self.widths)
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
-        stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
-        self.widths[stretched] = STRETCH_WIDTHS[: len(stretched)]
+        self._stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
+        self.widths[self._stretched] = STRETCH_WIDTHS[: len(self._stretched)]
 
     def vector(self) -> Values:
         """Parameters as one vector."""
@@ -75,20 +75,27 @@ class Parameters:
     @torch.no_grad()
     def ways(self, sim: SimulatedSide) -> Ways:
         """How records of some pulses change with each parameter, those of a stretch last."""
-        padded, ends = (
-            padded_length(sim.length),
-            [self._ends(i) for i in range(len(self.labels))],
-        )
-        n = sum(label != STRETCH for label in self.labels)
-        slopes = [(b.transfer(padded) - a.transfer(padded)) / step for a, b, step in ends[:n]]
+        ends = [self._ends(i) for i in self._stretched]
+        slopes = [slope for _, slope in self.slopes_of_transfer(padded_length(sim.length))]
 
         @torch.no_grad()
         def of_pulses(rows: slice) -> Tensor:
             pulses = torch.from_numpy(sim.sim[rows]).double()
-            found = [(b.drifted(pulses) - a.drifted(pulses)) / step for a, b, step in ends[n:]]
+            found = [(b.drifted(pulses) - a.drifted(pulses)) / step for a, b, step in ends]
             return torch.stack(found).float() if found else torch.empty((0, *pulses.shape))
 
         return Ways(self.response, torch.stack(slopes), of_pulses)
+
+    @torch.no_grad()
+    def slopes_of_transfer(self, padded: int) -> list[tuple[float, Tensor]]:
+        """Widths of all parameters but a stretch, and how the spectrum changes with each."""
+        found = []
+        for i, label in enumerate(self.labels):
+            if label != STRETCH:
+                a, b, step = self._ends(i)
+                change = (b.transfer(padded) - a.transfer(padded)) / step
+                found.append((float(self.widths[i]), change))
+        return found
 
     def _ends(self, i: int) -> tuple[Readout, Readout, float]:
         """Copies of the response on both sides of it along one coordinate, and their distance.

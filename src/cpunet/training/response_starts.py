@@ -18,12 +18,10 @@ import numpy as np
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import ResponseConfig
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter, held_out_gain
+from cpunet.training.fitter import Fitted, Fitter, held_out_gain
 from cpunet.training.moments import stretch_name
 from cpunet.training.response_problem import STRETCH, ResponseProblem
 
-# Chi-square per moment of another detector; in a wrong valley it is about three.
-HOPELESS_FIT = 20.0
 # A ringing must lower chi-square to this fraction, and promise the next: derivatives
 # far from the minimum underestimate the decrease.
 RINGS, PROMISES = 0.7, 0.9
@@ -68,29 +66,14 @@ def from_known(
     return None
 
 
-def best_start(first: ResponseProblem, config: ResponseConfig, fitter: Fitter) -> Fitted:
-    """Fit from one start after another, until a fit is good or hopeless, or all are done.
-
-    If the first fit is poor, a stretch of the drift and a fast decay with a free time are tried
-    before other starts, the latter with the main decay constrained to its known value, if any.
-    """
-    best: Fitted | None = None
-    dt_ns = float(first.response.dt_ns)
-    for factor in fitter.training.start_factors:
-        start = ElectronicsResponse(config, dt_ns)
-        start.log_poles_ns.data.add_(math.log(factor))
-        set_decay(start, first.slope)
-        found = fitter.fit(first.of(start))
-        if best is None and found.poor and onset_is_off(found.problem):
-            found = drift_if_better(found, fitter)
-        if best is None and GOOD_FIT <= found.per_moment <= HOPELESS_FIT:
-            found = free_decay_if_better(found, fitter)
-        if best is None or found.cost < best.cost:
-            best = found
-        if not GOOD_FIT <= found.per_moment <= HOPELESS_FIT:
-            break  # there is no other valley to search for
-    assert best is not None  # the recipe has at least one start
-    return best
+def from_start(
+    first: ResponseProblem, config: ResponseConfig, fitter: Fitter, factor: float
+) -> Fitted:
+    """Fit from the recipe's chain, with its poles times a factor and the data's decay."""
+    start = ElectronicsResponse(config, float(first.response.dt_ns))
+    start.log_poles_ns.data.add_(math.log(factor))
+    set_decay(start, first.slope)
+    return fitter.fit(first.of(start))
 
 
 def onset_is_off(problem: ResponseProblem) -> bool:

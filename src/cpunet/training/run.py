@@ -40,6 +40,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
 from cpunet.tables import aligned
 from cpunet.training.loop import Record
+from cpunet.training.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,6 +74,7 @@ class FitInfo(InfoPart):
     delay_ns: float = 0.0
     chi_square: float | None = None
     moments: int | None = None
+    checks: Verdict | None = None
     verdict: str = ""
     causes: list[str] = []
     parameters: dict[str, float] = {}

@@ -14,11 +14,11 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.comparisons import Compared, Missing, compare
 from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
 from cpunet.validation.noise import baseline_spectra
-from cpunet.validation.two_sample import TwoSample, classifier_auc
 
 MIN_PULSES = 10  # minimum number of pulses of a distribution
 

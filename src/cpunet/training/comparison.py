@@ -1,0 +1,446 @@
+r"""Two unpaired sets of pulses compared at every sample, in slices by rank.
+
+What all pulses share, as a ringing of the readout, is seen as precisely as noise permits; what
+differs from pulse to pulse, only as precisely as the number of pulses does.  The covariance of
+a difference of means therefore has two parts,
+
+.. math:: C = S \left(\frac{1}{n_s} + \frac{1}{n_d}\right) + N \left(\frac{1}{n_d} + r\right),
+
+the shapes' :math:`S` from the simulation without noise and the noise's :math:`N`; r is what
+draws of opposite sign leave of the simulated noise.  Compared are
+
+* the means of every sample in slices by rank of the current amplitude, and of the rise from 5
+  to 50 %.  Slices are ranks of each side, so they are equally full however far apart the sides
+  are.  Means are those of bounded functions, :math:`w \tanh((A - m) / w)`, which rare pulses
+  do not move;
+* the quantiles of the rise;
+* principal components in bins of the current amplitude, with their joint covariance.  The peak
+  of the single sites determines the amplitude, and what of it comes from the mixture of pulses
+  is told by the components.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+
+from cpunet.electronics.finishing import padding
+from cpunet.networks.response_layer import Readout, padded_length
+from cpunet.pulses.container import FloatArray
+from cpunet.training.aligned import Aligned, Floats, Frame, Values, read
+from cpunet.training.derivatives import Basis, Derivatives
+from cpunet.training.translated import PLATEAU_NS, Noise
+
+Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
+
+MOST = 4096  # pulses of each side that are compared
+# Times in ns from the half height between which every sample is compared, shortest and longest
+# stretches there and elsewhere, and samples compared per pulse at most.
+DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 0.5
+# Centres of the slices as ranks of either side.  The highest amplitudes are single sites, which
+# differ least in shape.
+AMPLITUDE, RISE = "log_amplitude", "rise"
+RANKS = {
+    AMPLITUDE: np.array([0.03, 0.15, 0.3, 0.45, 0.58, 0.69, 0.78, 0.85, 0.9, 0.94, 0.98]),
+    RISE: np.linspace(0.02, 0.98, 8),
+}
+QUANTILES = np.r_[np.linspace(0.01, 0.95, 13), 0.97, 0.985, 0.995]
+BOOTSTRAPS = 400
+POOLED = 0.5  # of the shapes' covariance, taken from all slices
+COMPONENTS, BINS, NARROWEST, RIDGE = 24, 16, 0.006, 0.05
+OUTLIER = 8.0  # standard deviations of a component at which a pulse counts half
+# A measured pulse with another before it, or on its tail: height of its baseline, time from
+# which the tail counts, and its RMS in units of the median.
+QUIET, TAIL_NS, LATE_RMS = 0.05, 2400.0, 4.0
+
+
+class Sides:
+    """Simulated pulses with their noise, and measured ones, of a band of energies.
+
+    Parameters
+    ----------
+    sim, data
+        Prepared pulses, shape (pulses, samples).
+    noise
+        Noise of the simulated pulses.
+    frame
+        What is read.
+    tail_level
+        Height of the plateau of a prepared pulse, which the noise refers to.
+
+    Attributes
+    ----------
+    current, charge
+        Of the simulated pulses within records.
+    data
+        Measured pulses that are single.
+    left_out
+        Number of the others.
+    """
+
+    def __init__(
+        self, sim: FloatArray, data: FloatArray, noise: Noise, frame: Frame, tail_level: float
+    ) -> None:
+        self.frame, self.noise, self.tail_level = frame, noise, tail_level
+        self.before, self.behind = padding(frame.dt_ns)
+        n, window = sim.shape
+        self.length = window + self.before + self.behind
+        self.padded = padded_length(self.length)
+        self.current = np.zeros((n, self.length), np.float32)
+        inside = slice(self.before, self.before + window)
+        self.current[:, inside] = np.diff(sim, axis=1, prepend=np.float32(0))
+        self.charge = self.current.cumsum(axis=1, dtype=np.float32)
+        self.spectra = scipy.fft.rfft(self.current, self.padded)
+        self.data = read(data, frame)
+        late = self.data.pulses[:, self._late]
+        self.middle = np.median(late, axis=0)
+        self.spread = np.median(np.abs(late - self.middle), axis=0)
+        self.widest = LATE_RMS * float(np.median(self._late_rms(self.data)))
+        single = self.single(self.data)
+        self.data, self.left_out = self.data[single], int((~single).sum())
+        self.first = _stretches(frame, min(n, len(self.data)))
+        self.widths = np.diff(np.append(self.first, frame.length))
+
+    def __len__(self) -> int:
+        return len(self.current)
+
+    def of(self, most: int) -> Sides:
+        """The first pulses of both sides."""
+        if most >= max(len(self), len(self.data)):
+            return self
+        some = copy.copy(self)
+        rows = slice(most)
+        some.current, some.charge, some.spectra = (
+            part[rows] for part in (self.current, self.charge, self.spectra)
+        )
+        some.noise, some.data = self.noise.of(rows), self.data[rows]
+        some.first = _stretches(self.frame, min(len(some), len(some.data)))
+        some.widths = np.diff(np.append(some.first, self.frame.length))
+        some.__dict__.pop("time_ns", None)
+        return some
+
+    @property
+    def _late(self) -> slice:
+        return slice(self.frame.before + round(TAIL_NS / self.frame.dt_ns), None)
+
+    def _late_rms(self, aligned: Aligned) -> Values:
+        apart = (aligned.pulses[:, self._late] - self.middle) / self.spread
+        return np.asarray(np.sqrt((apart**2).mean(axis=1)))
+
+    def single(self, aligned: Aligned) -> npt.NDArray[np.bool_]:
+        """Which pulses have no other before them or on their tail."""
+        base = aligned.pulses[:, : self.frame.before // 4].mean(axis=1)
+        quiet: npt.NDArray[np.bool_] = np.abs(base) < QUIET
+        return quiet & (self._late_rms(aligned) < self.widest)
+
+    @cached_property
+    def time_ns(self) -> Values:
+        """Middle of each stretch from the half height."""
+        middle = self.first + 0.5 * (self.widths - 1) - self.frame.before
+        return np.asarray(middle * self.frame.dt_ns)
+
+    def view(self, aligned: Floats) -> Floats:
+        """Means of aligned pulses over the stretches, shape (pulses, stretches)."""
+        sums = np.add.reduceat(aligned, self.first, axis=1)
+        return np.asarray(sums / self.widths.astype(sums.dtype))
+
+    def translated(self, transfer: Spectrum) -> tuple[FloatArray, Floats]:
+        """Noise-free records of prepared height, and the height of each before."""
+        spectra = self.spectra * transfer.astype(np.complex64)
+        records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)[:, : self.length]
+        plateau = slice(-self.behind, round(PLATEAU_NS / self.frame.dt_ns) - self.behind)
+        heights = records[:, plateau].mean(axis=1) / np.float32(self.tail_level)
+        return np.asarray(records / heights[:, np.newaxis], np.float32), heights
+
+    def noisy(self, clean: FloatArray) -> list[Aligned]:
+        """Records with each draw of the noise, read."""
+        draws = range(len(self.noise.factor))
+        return [read(self.noise.add(clean, draw, 0), self.frame) for draw in draws]
+
+
+def _stretches(frame: Frame, pulses: int) -> npt.NDArray[np.intp]:
+    """First sample of each stretch; the fewer pulses, the longer stretches."""
+    fine, coarse = (max(1, round(ns / frame.dt_ns)) for ns in (FINEST_NS, COARSE_NS))
+    while True:
+        first, at = [], 0
+        while at < frame.length:
+            first.append(at)
+            dense = DENSE_NS[0] <= (at - frame.before) * frame.dt_ns < DENSE_NS[1]
+            at += fine if dense else max(fine, coarse)
+        if len(first) <= FEWEST * pulses or fine > coarse:
+            return np.array(first)
+        fine *= 2
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Means of some functions of the translated pulses less those of the data.
+
+    Parameters
+    ----------
+    name
+        What is compared.
+    values, covariance
+        Differences, and their covariance.
+    slopes
+        Derivatives in the coordinates of a basis, shape (functions, coordinates).
+    """
+
+    name: str
+    values: Values
+    covariance: Values
+    slopes: Values | None = None
+
+    @property
+    def chi_square(self) -> float:
+        """Per function."""
+        return float(self.values @ np.linalg.solve(self.covariance, self.values)) / len(
+            self.values
+        )
+
+    @property
+    def sliced(self) -> bool:
+        """Whether it is one of the slices."""
+        return self.name[-1].isdigit()
+
+
+class Comparison:
+    """Differences of both sides for any response.
+
+    Parameters
+    ----------
+    sides
+        Pulses.
+    width
+        Width of the bounded functions in robust standard deviations.
+    """
+
+    def __init__(self, sides: Sides, width: float) -> None:
+        self.sides, self.width = sides, width
+        self.data = sides.view(sides.data.pulses)
+        rise, rng, n = sides.data.rise, np.random.default_rng(0), len(sides.data)
+        drawn = np.quantile(rise[rng.integers(n, size=(BOOTSTRAPS, n))], QUANTILES, axis=1)
+        spread = np.cov(drawn) * (1 + n / len(sides))
+        self.quantiles, self.spread = np.quantile(rise, QUANTILES), spread + 1e-12 * np.eye(16)
+        self.mean = self.data.mean(axis=0)
+        variances, axes = np.linalg.eigh(np.cov((self.data - self.mean).T.astype(float)))
+        sizes = np.sqrt(np.maximum(variances[::-1][:COMPONENTS], 1e-14))
+        self.components = axes[:, ::-1][:, :COMPONENTS] / sizes
+        amplitudes = np.quantile(sides.data.log_amplitude, np.linspace(0.03, 0.995, BINS))
+        centres = [amplitudes[-1]]
+        for amplitude in amplitudes[-2::-1]:
+            if centres[-1] - amplitude >= NARROWEST:
+                centres.append(amplitude)
+        self.centres = np.array(centres[::-1])
+
+    def differences(self, transfer: Spectrum, basis: Basis | None = None) -> list[Difference]:
+        """Compare the pulses translated by a response, with derivatives in a basis if given."""
+        sides = self.sides
+        clean, heights = sides.translated(transfer)
+        noisy = sides.noisy(clean)
+        moves = None
+        if basis is not None:
+            moves = Derivatives(sides, sides.first, noisy[0], heights, basis)
+        views = [sides.view(one.pulses) for one in noisy]
+        clean_view = sides.view(read(clean, sides.frame).pulses)
+        return [
+            self._rises(noisy, moves),
+            self._joint(noisy, views, moves),
+            *self._slices(AMPLITUDE, noisy, views, clean_view, moves),
+            *self._slices(RISE, noisy, views, clean_view, moves),
+        ]
+
+    def mean_pulse(self, transfer: Spectrum) -> Values:
+        """Deviation of the mean of all pulses in its standard errors, by stretch.
+
+        It is 0 within a sample of the half height, where all pulses are aligned.
+        """
+        clean, _ = self.sides.translated(transfer)
+        noisy = self.sides.noisy(clean)
+        kept = self.sides.single(noisy[0])
+        views = [self.sides.view(one.pulses)[kept] for one in noisy]
+        clean_view = self.sides.view(read(clean, self.sides.frame).pulses)[kept]
+        n, ones = len(self.data), np.ones((len(views), int(kept.sum())))
+        data, simulated, pulses, _ = self._bounded(
+            np.ones(n), views, clean_view, np.arange(len(clean_view))
+        )
+        shapes, noise, n_sim, left = _covariances(simulated, pulses, ones)
+        variance = shapes.diagonal() * (1 / n_sim + 1 / n) + noise.diagonal() * (1 / n + left)
+        z = (pulses.mean(axis=(0, 1)) - data.mean(axis=0)) / np.sqrt(variance)
+        aligned = np.abs(self.sides.time_ns) <= self.sides.frame.dt_ns
+        return np.where(aligned, 0.0, z)
+
+    def _rises(self, noisy: list[Aligned], moves: Derivatives | None) -> Difference:
+        """Quantiles of the rise."""
+        found = np.quantile(np.concatenate([one.rise for one in noisy]), QUANTILES)
+        slopes = None
+        if moves is not None:
+            near, _ = hats(noisy[0].rise, found)
+            slopes = near.T @ moves.rise / np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
+        return Difference("rise quantiles", found - self.quantiles, self.spread, slopes)
+
+    def _joint(
+        self, noisy: list[Aligned], views: list[Floats], moves: Derivatives | None
+    ) -> Difference:
+        """Components in bins of the current amplitude."""
+        sides = self.sides
+        _, _, _, data = self._functions(self.data, sides.data.log_amplitude)
+        found = [
+            self._functions(view, one.log_amplitude)
+            for view, one in zip(views, noisy, strict=True)
+        ]
+        bins, turned, components, sim = found[0]
+        covariance = 0.5 * (np.cov(data.T) + np.cov(sim.T)) * (1 / len(data) + 1 / len(sim))
+        covariance += np.diag(RIDGE * covariance.diagonal() / (1 - RIDGE) + 1e-18)
+        covariance *= 1 - RIDGE
+        values = np.mean([own.mean(axis=0) for _, _, _, own in found], axis=0)
+        values -= data.mean(axis=0)
+        if moves is None:
+            return Difference("components", values, covariance)
+        n, amplitude = len(sim), moves.log_amplitude
+        slopes = [turned.T @ amplitude / n]
+        for k in range(bins.shape[1]):
+            rows = np.flatnonzero(bins[:, k])
+            moved = self.components.T @ moves.mean(rows, bins[rows, k, np.newaxis] / n)
+            with_bin = components[rows] * (turned[rows, k] / n)[:, np.newaxis]
+            slopes.append(moved + with_bin.T @ amplitude[rows])
+        return Difference("components", values, covariance, np.concatenate(slopes))
+
+    def _functions(self, view: Floats, amplitude: Values) -> tuple[Values, ...]:
+        """Bins, their derivatives, components, and all functions, by pulse."""
+        components = np.asarray((view - self.mean) @ self.components)
+        far = np.abs(components).max(axis=1) / OUTLIER
+        counts = (1 / (1 + far**6))[:, np.newaxis]
+        bins, turned = (counts * of for of in hats(amplitude, self.centres))
+        products = bins[:, :, np.newaxis] * components[:, np.newaxis]
+        together = np.concatenate([bins, products.reshape(len(bins), -1)], axis=1)
+        return bins, turned, components, together
+
+    def _slices(
+        self,
+        by: str,
+        noisy: list[Aligned],
+        views: list[Floats],
+        clean: Floats,
+        moves: Derivatives | None,
+    ) -> list[Difference]:
+        """Means of bounded functions of every sample, in slices of a quantity."""
+        values = [getattr(one, by) for one in noisy]
+        of_data, _ = hats(own := getattr(self.sides.data, by), np.quantile(own, RANKS[by]))
+        centres = np.quantile(np.concatenate(values), RANKS[by])
+        weights, turned = zip(*(hats(value, centres) for value in values), strict=True)
+        moved = None
+        if moves is not None:  # relative to pulses of the same rank, with which slices move
+            near, _ = hats(values[0], np.quantile(np.concatenate(values), QUANTILES))
+            counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
+            moved = getattr(moves, by) - near @ (near.T @ getattr(moves, by) / counts)
+        found: list[Any] = []
+        for k in range(len(centres)):
+            own_data, own = of_data[:, k], np.array([of[:, k] for of in weights])
+            rows = np.flatnonzero(own.any(axis=0))
+            bounded = self._bounded(own_data, views, clean, rows)
+            data, clean_own, noisy_own, slopes = bounded
+            w = own[:, rows]
+            parts = _covariances(clean_own, noisy_own, w)
+            mean = np.einsum("dp,dpf->f", w, noisy_own) / w.sum()
+            used = own_data[own_data > 0]
+            difference, derivatives = mean - used @ data / used.sum(), None
+            if moves is not None and moved is not None:
+                each = w[0] / w[0].sum()
+                derivatives = moves.mean(rows, each[:, np.newaxis] * slopes)
+                relative = noisy_own[0] - each @ noisy_own[0]
+                sliding = relative * (turned[0][rows, k] / w[0].sum())[:, np.newaxis]
+                derivatives += sliding.T.astype(np.float32) @ moved[rows]
+            found.append((*parts, _effective(used), difference, derivatives))
+        shapes, noise = (sum(one[i] for one in found) / len(found) for i in (0, 1))
+        # the inverse of a covariance from n samples is too large (Hartlap, A&A 464 (2007) 399)
+        samples = max(1.0, 0.5 * len(views)) * len(clean)
+        noise *= samples / max(samples - len(noise), 0.2 * samples)
+        differences = []
+        for k, (shape, _, n_sim, left, n_data, difference, derivatives) in enumerate(found):
+            covariance = (1 - POOLED) * shape + POOLED * shapes
+            covariance = covariance * (1 / n_sim + 1 / n_data) + noise * (1 / n_data + left)
+            differences.append(Difference(f"{by} {k}", difference, covariance, derivatives))
+        return differences
+
+    def _bounded(
+        self, own_data: Values, views: list[Floats], clean: Floats, rows: npt.NDArray[np.intp]
+    ) -> tuple[Values, Values, Values, Values]:
+        """Bounded functions of data, simulation without and with noise, and derivatives."""
+        data = self.data[own_data > 0].astype(float)
+        core = data[own_data[own_data > 0] > 0.3 * own_data.max()]
+        middle = np.median(core, axis=0)
+        scale = self.width * np.maximum(
+            1.4826 * np.median(np.abs(core - middle), axis=0), self._noise_rms(views, clean)
+        )
+
+        def bounded(values: Floats) -> Values:
+            return np.asarray(scale * np.tanh((values - middle) / scale))
+
+        noisy = np.array([bounded(view[rows].astype(float)) for view in views])
+        slopes = 1 - (noisy[0] / scale) ** 2
+        return bounded(data), bounded(clean[rows].astype(float)), noisy, slopes
+
+    def _noise_rms(self, views: list[Floats], clean: Floats) -> Values:
+        return np.asarray(np.sqrt(np.mean((views[0] - clean) ** 2, axis=0, dtype=float)))
+
+
+def _covariances(
+    clean: Values, noisy: Values, weights: Values
+) -> tuple[Values, Values, float, float]:
+    """Covariances of shapes and noise, effective number, and what is left of the noise.
+
+    Parameters
+    ----------
+    clean, noisy
+        Functions without noise, shape (pulses, functions), and with each draw.
+    weights
+        Of each draw, shape (draws, pulses).
+    """
+    mean_weights = weights.mean(axis=0)
+    each = mean_weights / mean_weights.sum()
+    centred = (clean - each @ clean) * np.sqrt(each)[:, np.newaxis]
+    moved, total = noisy - clean, weights.sum()
+    root = np.sqrt(weights / total)[:, :, np.newaxis] * moved
+    root = root.reshape(-1, root.shape[-1])
+    noise = root.T @ root + 1e-14 * np.eye(root.shape[1])
+    # draws of opposite sign cancel as far as they are in the same slice
+    sums = np.einsum("dp,dpf->pf", weights, moved) / total
+    left = float((sums**2).sum() / noise.trace())
+    return centred.T @ centred, noise, _effective(mean_weights), left
+
+
+def _effective(weights: Values) -> float:
+    """Number of pulses of equal weight with the same error of the mean."""
+    return float(weights.sum() ** 2 / (weights @ weights))
+
+
+def hats(values: Values, centres: Values) -> tuple[Values, Values]:
+    """Triangular bins that add up to 1, and their derivatives, shape (values, centres).
+
+    Examples
+    --------
+    >>> bins, derivatives = hats(np.array([0.25, 9.0]), np.array([0.0, 1.0, 2.0]))
+    >>> bins.tolist(), derivatives[0].tolist()
+    ([[0.75, 0.25, 0.0], [0.0, 0.0, 1.0]], [-1.0, 1.0, 0.0])
+    """
+    low = (np.searchsorted(centres, values) - 1).clip(0, len(centres) - 2)
+    apart, rows = centres[low + 1] - centres[low], np.arange(len(values))
+    place = (values - centres[low]) / apart
+    slope = ((place > 0) & (place < 1)) / apart
+    place = place.clip(0, 1)
+    bins, derivatives = np.zeros((2, len(values), len(centres)))
+    bins[rows, low], bins[rows, low + 1] = 1 - place, place
+    derivatives[rows, low], derivatives[rows, low + 1] = -slope, slope
+    return bins, derivatives
+
+
+def response_transfer(response: Readout, padded: int) -> Spectrum:
+    """Spectrum of the response to a step, without its graph of derivatives."""
+    return np.asarray(response.transfer(padded).detach().numpy())

@@ -1,0 +1,163 @@
+"""How aligned pulses and what is read of them change with a step response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.training.aligned import (
+    EARLY,
+    Aligned,
+    Floats,
+    Samples,
+    Values,
+    between,
+    cubic,
+    stretch,
+)
+
+if TYPE_CHECKING:
+    from cpunet.training.comparison import Sides
+
+SINGLE = np.float32  # derivatives need seven digits
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Coordinates in which a step response changes.
+
+    Parameters
+    ----------
+    first
+        First lag after the step in samples; negative.
+    changes
+        Change of the step response from there on per coordinate, shape (lags, coordinates).
+    """
+
+    first: int
+    changes: Values
+
+    @property
+    def last(self) -> int:
+        """Last lag."""
+        return self.first + len(self.changes) - 1
+
+
+class Derivatives:
+    r"""Derivatives in the coordinates of a basis, for pulses with a draw of noise.
+
+    A record changes by the current at lag l times the change of the response there.  What is
+    read of a pulse changes with its baseline, its height and the time of its half height, too:
+
+    .. math:: dA(t) = \frac{dR(t) - dB}{h} - A \frac{dh}{h} + \dot A(t)\, d\tau.
+
+    Parameters
+    ----------
+    sides
+        Pulses.
+    first
+        First sample of each stretch that is compared.
+    aligned, heights
+        The translated pulses, and heights of their records before.
+    basis
+        Coordinates.
+
+    Attributes
+    ----------
+    log_amplitude, rise
+        Derivatives of what is read, shape (pulses, coordinates).
+    """
+
+    def __init__(
+        self,
+        sides: Sides,
+        first: Samples,
+        aligned: Aligned,
+        heights: Floats,
+        basis: Basis,
+    ) -> None:
+        self.sides, self.first, self.basis = sides, first, basis
+        self.reversed = basis.changes[::-1].astype(SINGLE)
+        self.changes = basis.changes.astype(SINGLE)
+        self.values, self.slopes = (sides.view(of) for of in (aligned.pulses, aligned.slopes))
+        frame, rows = sides.frame, np.arange(len(aligned))
+        height = (aligned.height * heights).astype(SINGLE)[:, np.newaxis]
+        weights, _ = cubic(aligned.part)
+
+        def mean(ends: tuple[int, int]) -> Floats:
+            low, high = (self._at(sides.charge, aligned.sample + end - 1) for end in ends)
+            return np.asarray((high - low) / SINGLE(ends[1] - ends[0]) / height)
+
+        def charge(sample: Samples) -> Floats:
+            first = sample - 2 - basis.last
+            samples = stretch(sides.current, first, len(self.changes) + 3)
+            return np.asarray(between(samples, weights) @ self.reversed / height)
+
+        def column(values: Floats) -> Floats:
+            return np.asarray(values, SINGLE)[:, np.newaxis]
+
+        self.base = mean(frame.base)
+        self.span = mean(frame.level) - self.base
+        at_half = charge(aligned.sample) - self.base - SINGLE(0.5) * self.span
+        self.time = -at_half / column(aligned.slopes[rows, frame.before])
+        early, part = aligned.early, column(aligned.early_part)
+        ahead = aligned.pulses[rows, early + 1] - aligned.pulses[rows, early]
+        apart = column(np.maximum(ahead, 1e-5))
+        begin = aligned.sample + early - frame.before
+        risen = charge(begin) * (1 - part) + charge(begin + 1) * part
+        steep = column(aligned.slopes[rows, early]) * (1 - part)
+        steep = steep + column(aligned.slopes[rows, early + 1]) * part
+        risen = risen - self.base - SINGLE(EARLY) * self.span + self.time * steep
+        self.rise = np.where((early > 1)[:, np.newaxis], risen / apart, 0)
+        self.log_amplitude = self._amplitude(aligned) / height
+        self.log_amplitude /= column(np.exp(aligned.log_amplitude))
+        self.log_amplitude -= self.span
+        self.begin = -frame.before - basis.last
+        length = frame.after - basis.first - self.begin + 3
+        currents = stretch(sides.current, aligned.sample + self.begin - 2, length)
+        self.currents = between(currents, weights) / height
+
+    def _at(self, source: Floats, sample: Samples) -> Floats:
+        """Change at a sample of each record whose current, or charge, is given."""
+        return stretch(source, sample - self.basis.last, len(self.changes)) @ self.reversed
+
+    def _amplitude(self, aligned: Aligned) -> Floats:
+        """Change of the highest smoothed current of a record."""
+        taps, reach, lags = self.sides.frame.taps, self.sides.frame.reach, len(self.changes)
+        found = np.zeros((len(aligned), self.changes.shape[1]), SINGLE)
+        for step, weights in enumerate(taps):
+            rows = np.flatnonzero(aligned.step == step)
+            first = aligned.steepest[rows] - self.basis.last - reach
+            records = stretch(self.sides.current[rows], first, lags + 2 * reach + 1)
+            current = np.diff(records, axis=1)
+            smooth = sum(w * current[:, j : j + lags] for j, w in enumerate(weights))
+            found[rows] = smooth @ self.reversed
+        return found
+
+    def mean(self, rows: npt.NDArray[np.intp], weights: Floats) -> Values:
+        """Change of weighted sums of the stretches, shape (stretches, coordinates).
+
+        Parameters
+        ----------
+        rows
+            Pulses.
+        weights
+            Weights of these, shape (pulses, 1) or (pulses, stretches).
+        """
+        weights = np.asarray(weights, SINGLE)
+        widths, basis = self.sides.widths[:, np.newaxis], self.basis
+        currents = weights.T @ self.currents[rows]  # (1 or stretches, times)
+        sums = np.zeros((len(currents), currents.shape[1] + 1))
+        np.cumsum(currents, axis=1, out=sums[:, 1:])
+        lags = np.arange(basis.first, basis.last + 1)
+        low = self.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
+        both = np.broadcast_to(sums, (len(low), sums.shape[1]))
+        high = np.take_along_axis(both, low + widths, axis=1)
+        found = ((high - np.take_along_axis(both, low, axis=1)) / widths) @ basis.changes
+        found -= weights.T @ self.base[rows]
+        found += (weights * self.slopes[rows]).T @ self.time[rows]
+        found -= (weights * self.values[rows]).T @ self.span[rows]
+        return np.asarray(found)

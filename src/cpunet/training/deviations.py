@@ -1,0 +1,335 @@
+r"""Deviations of a readout from a chain of few parameters: any step response.
+
+Real circuits ring, reflect and decay in ways that no short list of parameters has.  A step
+response is therefore that of a chain plus deviations at knots: every sample or 8 ns about the
+edge and up to 3 µs, 96 ns later.  Their prior is a Gaussian process of three parts: smooth in
+:math:`\operatorname{arsinh}(t / 96\,\mathrm{ns})`; structure and ringing, which decays; and
+each knot for itself about the edge.  The chain's own parameters, a delay and the sharpness of
+the edge are free, too: simulated samples are means over a period, measured ones are points.
+
+How large and how long the deviations are is chosen by evidence (MacKay, Neural Comput. 4 (1992)
+415), which for a linear problem with information A and right side b is
+
+.. math:: \log E = \tfrac12 g^T M^{-1} g - \tfrac12 \log|M|, \qquad
+    M = 1 + B^T A B, \quad K = B B^T, \quad g = B^T b,
+
+relative to no deviations: where it is negative, the chain is right, and stays as it is.  The
+differences of `cpunet.training.comparison` are linear in the deviations to a good degree, so
+that a few steps of Gauss and Newton suffice from anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+import scipy.linalg
+from scipy.interpolate import CubicSpline
+from scipy.special import expit
+
+from cpunet.networks.response_layer import AXES, ElectronicsResponse, deviation_lags
+from cpunet.training.aligned import Values
+from cpunet.training.comparison import MOST, Comparison, Sides, Spectrum, response_transfer
+from cpunet.training.derivatives import Basis
+from cpunet.training.response_problem import SmoothParameters
+
+# Knots in ns: the last one of the dense ones and of all, and how far apart.
+DENSE_NS, LAST_NS, APART_NS, SPARSE_NS, GROWTH = 3000.0, 6800.0, 8.0, 96.0, 1.12
+ONSET_NS, LINEAR_NS, EDGE_NS = 8.0, 96.0, 192.0
+FREE = 0.3  # of the priors of the chain's parameters, within which they are free
+# Stages of the fit: width of the bounded functions, most pulses, and share by which a step
+# must lower chi-square for another.
+STAGES = ((6.0, 1024, 0.03), (1.5, MOST, 0.003))
+# Most steps of a stage; lengths of a step in standard deviations below which the stage ends,
+# and derivatives are kept.
+STEPS, SETTLED, CLOSE = 10, 0.7, 3.0
+GAUGE = 1e10  # pulses are scaled to their level: information that holds it
+HALVED = 3  # times that a step which makes it worse is halved
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian process of the deviations, in units of the full charge; times in ns.
+
+    Parameters
+    ----------
+    width, edge, length
+        Of the smooth part, factor of its width about the edge, and correlation length.
+    fine, fine_length, fine_decay
+        The same of structure and ringing, and how long it lasts.
+    rough, rough_decay
+        Of each knot for itself, and how long.
+    """
+
+    width: float = 0.01
+    edge: float = 2.0
+    length: float = 0.5
+    fine: float = 0.003
+    fine_length: float = 20.0
+    fine_decay: float = 250.0
+    rough: float = 0.001
+    rough_decay: float = 60.0
+
+    def covariance(self, time_ns: Values) -> Values:
+        """Covariance of the deviations at these times."""
+        begun = expit(time_ns / ONSET_NS)
+        width = self.width * (1 + (self.edge - 1) * np.exp(-((time_ns / EDGE_NS) ** 2))) * begun
+        found = _process(width, np.arcsinh(time_ns / LINEAR_NS), self.length)
+        if self.fine:
+            width = self.fine * np.exp(-np.abs(time_ns) / self.fine_decay) * begun
+            found += _process(width, time_ns, self.fine_length)
+        rough = self.rough * np.exp(-np.abs(time_ns) / self.rough_decay)
+        return np.asarray(found + np.diag(rough**2 + 1e-12))
+
+
+def _process(width: Values, place: Values, length: float) -> Values:
+    near = np.exp(-0.5 * ((place[:, np.newaxis] - place) / length) ** 2)
+    return np.asarray(width[:, np.newaxis] * width * near)
+
+
+CHOICES: dict[str, tuple[float, ...]] = {
+    "width": (0.0001, 0.0003, 0.001, 0.003, 0.01, 0.03),
+    "fine": (0.0, 0.001, 0.003, 0.01, 0.03, 0.1),
+    "fine_decay": (60.0, 120.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0),
+    "fine_length": (12.0, 20.0, 30.0, 45.0),
+    "rough": (1e-5, 1e-4, 3e-4, 1e-3, 3e-3),
+    "rough_decay": (20.0, 60.0, 200.0),
+    "length": (0.2, 0.35, 0.5, 0.8),
+    "edge": (1.0, 2.0, 5.0),
+}
+STARTS = (
+    Prior(),
+    Prior(rough=1e-5),
+    Prior(fine=0.0),
+    Prior(width=0.001, fine=0.0, rough=1e-5),
+    Prior(width=0.003, fine=0.01, fine_length=12.0, fine_decay=120.0, rough=1e-5),
+)
+FURTHER, BETTER = 2, 0.1  # starts that are followed; gain in evidence that counts
+
+
+class Posterior(NamedTuple):
+    """Logarithm of the evidence, and mean of the coordinates."""
+
+    evidence: float
+    mean: Values
+
+
+def posterior(information: Values, right: Values, covariance: Values) -> Posterior:
+    """Evidence of a prior covariance, and what follows for the coordinates.
+
+    Examples
+    --------
+    A measurement of 3 ± 1 with a prior of width 1 gives half of it:
+
+    >>> one = np.ones((1, 1))
+    >>> posterior(one, np.array([3.0]), one).mean.round(6).tolist()
+    [1.5]
+    """
+    root = np.linalg.cholesky(covariance)
+    inner = np.eye(len(root)) + root.T @ information @ root
+    factor, g = scipy.linalg.cho_factor(inner), root.T @ right
+    z = scipy.linalg.cho_solve(factor, g)
+    return Posterior(float(0.5 * g @ z - np.log(factor[0].diagonal()).sum()), root @ z)
+
+
+def best_prior(of: Callable[[Prior], float], starts: Sequence[Prior]) -> Prior:
+    """The prior of the highest evidence, one of its values changed after another."""
+    followed = sorted(((of(prior), i) for i, prior in enumerate(starts)), reverse=True)
+    found = []
+    for best, i in followed[:FURTHER]:
+        prior, before = starts[i], -np.inf
+        while best > before + 1:
+            before = best
+            for name, values in CHOICES.items():
+                if name.startswith("fine_") and not prior.fine:
+                    continue
+                for value in values:
+                    other = replace(prior, **{name: value})
+                    if other != prior and (tried := of(other)) > best + BETTER:
+                        best, prior = tried, other
+        found.append((best, prior))
+    return max(found, key=lambda one: one[0])[1]
+
+
+class Knots:
+    """Knots of the deviations, the lags of the response between, and the chain's directions.
+
+    Parameters
+    ----------
+    response
+        The chain.
+    padded
+        Length of the transforms.
+
+    Attributes
+    ----------
+    time_ns
+        Times of the knots.
+    between
+        Deviations at the lags by those at the knots, shape (lags, knots).
+    tangents
+        Changes of the chain at the knots within which it is free, shape (knots, directions).
+    """
+
+    def __init__(self, response: ElectronicsResponse, padded: int) -> None:
+        dt_ns, lags = float(response.dt_ns), deviation_lags(float(response.dt_ns))
+        self.lags = lags
+        apart, last = max(1, round(APART_NS / dt_ns)), round(LAST_NS / dt_ns)
+        knots, step = [*range(lags[0], round(DENSE_NS / dt_ns) + 1, apart)], float(apart)
+        while knots[-1] < last:
+            step = min(GROWTH * step, SPARSE_NS / dt_ns)
+            knots.append(min(knots[-1] + max(1, round(step)), last))
+        places = np.array(knots)
+        self.time_ns = places * dt_ns
+
+        def scale(lag: npt.NDArray[Any]) -> Values:
+            time = lag * dt_ns
+            late = DENSE_NS * (1 + np.log(np.maximum(time, 1.0) / DENSE_NS))
+            return np.asarray(np.where(time < DENSE_NS, time, late))
+
+        inside = lags <= last
+        self.between = np.zeros((len(lags), len(knots)))
+        spline = CubicSpline(scale(places), np.eye(len(knots)), bc_type="natural")
+        self.between[inside] = spline(scale(lags[inside]))
+        base = self._at_lags(response_transfer(response, padded), padded)
+        # beyond the last knot a deviation decays with the chain
+        at_last = base[last - lags[0]]
+        self.between[~inside, -1] = base[~inside] / at_last
+        self.tangents = self._tangents(response, base, padded)[places - lags[0]]
+
+    def _at_lags(self, transfer: Spectrum, padded: int) -> Values:
+        step = scipy.fft.irfft(transfer, padded)
+        first = int(self.lags[0])
+        return np.concatenate([step[first:], step[: len(self.lags) + first]])
+
+    def _tangents(self, response: ElectronicsResponse, base: Values, padded: int) -> Values:
+        parameters = SmoothParameters(response)
+        columns = [
+            FREE * width * self._at_lags(np.asarray(change.numpy()), padded)
+            for width, change in parameters.slopes_of_transfer(padded)
+        ]
+        # half a sample of delay, and a variance of a sample squared, of either sign
+        slope = np.gradient(base)
+        return np.column_stack([*columns, 0.5 * slope, 0.5 * np.gradient(slope)])
+
+    def covariance(self, prior: Prior) -> Values:
+        """Prior covariance of the deviations at the knots, with the chain's directions."""
+        return np.asarray(prior.covariance(self.time_ns) + self.tangents @ self.tangents.T)
+
+
+class Deviated(NamedTuple):
+    """A response with its deviations, what they gain, and the last comparisons.
+
+    Parameters
+    ----------
+    response
+        The chain with deviations; the chain itself if they gain nothing.
+    evidence
+        Logarithm of the evidence of deviations, where they were first tried.
+    prior
+        Their prior.
+    """
+
+    response: ElectronicsResponse
+    evidence: float
+    prior: Prior | None = None
+
+
+def with_deviations(
+    response: ElectronicsResponse, bands: Sequence[Sides], count: Callable[[float], None]
+) -> Deviated:
+    """Deviations of a chain that has been fitted.
+
+    Parameters
+    ----------
+    response
+        The chain, which is not changed.
+    bands
+        Pulses of both sides, whose simulation has passed any stretch of the drift.
+    count
+        Called with chi-square after each step.
+    """
+    padded, frame = bands[0].padded, bands[0].frame
+    knots = Knots(response, padded)
+    own = ElectronicsResponse(
+        response.config.model_copy(update={"deviations": True}), float(response.dt_ns)
+    )
+    own.load_state_dict(response.state_dict(), strict=False)
+    own.decay_known = response.decay_known
+    basis = Basis(int(knots.lags[0]), knots.between)
+    inside = (knots.lags >= frame.level[0]) & (knots.lags < frame.level[1])
+    gauge = knots.between[inside].mean(axis=0)
+    place, prior, first = np.zeros(len(knots.time_ns)), STARTS[0], None
+    for width, most, gain in STAGES:
+        problem = _Linear([Comparison(side.of(most), width) for side in bands], basis)
+        before, far, halved = (np.inf, place), True, 0
+        for _ in range(STEPS):
+            own.set_deviation(knots.between @ place)
+            cost = problem.evaluate(response_transfer(own, padded), place, anew=far)
+            count(cost)
+            if cost > 1.02 * before[0] + 5 and halved < HALVED:
+                place, halved = 0.5 * (place + before[1]), halved + 1
+                continue
+            gained, before, halved = before[0] - cost, (cost, place), 0
+            information = problem.information + GAUGE * np.outer(gauge, gauge)
+
+            def of(prior: Prior, problem: _Linear = problem, a: Values = information) -> float:
+                return posterior(a, problem.right, knots.covariance(prior)).evidence
+
+            if far:
+                prior = best_prior(of, STARTS if first is None else [prior])
+            covariance = knots.covariance(prior)
+            evidence, new = posterior(information, problem.right, covariance)
+            if first is None and evidence < 0:
+                return Deviated(response, evidence)
+            first = evidence if first is None else first
+            move, place = new - place, new
+            size = float(np.sqrt(move @ problem.information @ move))
+            far = size > CLOSE
+            if size < SETTLED or gained < gain * cost:
+                break
+    own.set_deviation(knots.between @ place, knots.between @ _axes(information, covariance))
+    assert first is not None  # there is a step
+    return Deviated(own, first, prior)
+
+
+def _axes(information: Values, covariance: Values) -> Values:
+    """The longest axes of the posterior covariance, shape (knots, axes)."""
+    root = np.linalg.cholesky(covariance)
+    inner = np.eye(len(root)) + root.T @ information @ root
+    variances, axes = np.linalg.eigh(root @ np.linalg.solve(inner, root.T))
+    sizes = np.sqrt(np.maximum(variances[::-1][:AXES], 0))
+    return np.asarray(axes[:, ::-1][:, :AXES] * sizes)
+
+
+class _Linear:
+    """Chi-square of comparisons to second order in the coordinates."""
+
+    def __init__(self, comparisons: Sequence[Comparison], basis: Basis) -> None:
+        self.comparisons, self.basis = comparisons, basis
+        self.white: list[tuple[Values, Values]] = []  # roots of covariances, slopes
+
+    def evaluate(self, transfer: Spectrum, place: Values, *, anew: bool) -> float:
+        """Chi-square; information and right side with derivatives at this place if `anew`."""
+        basis = self.basis if anew else None
+        found = [d for c in self.comparisons for d in c.differences(transfer, basis)]
+        n, cost = len(place), 0.0
+        self.right = np.zeros(n)
+        if anew:
+            self.white, self.information = [], np.zeros((n, n))
+        for i, difference in enumerate(found):
+            share = 0.5 if difference.sliced else 1.0  # both kinds of slices see the same
+            if anew:
+                root = np.asarray(np.linalg.cholesky(difference.covariance))
+                slopes = scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
+                self.white.append((root, slopes))
+                self.information += share * slopes.T @ slopes
+            root, slopes = self.white[i]
+            white = scipy.linalg.solve_triangular(root, difference.values, lower=True)
+            cost += share * float(white @ white)
+            self.right += share * slopes.T @ (slopes @ place - white)
+        return cost

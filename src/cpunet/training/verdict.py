@@ -1,0 +1,182 @@
+"""Whether translated pulses are those of the data, with the power to see what a look sees.
+
+Fitted functions say little of their own fit.  What counts here is every sample: the mean pulse
+in units of its standard errors, chi-square of the slices by rank, and a classifier that is
+tested on pulses outside its training.  Good is what passes all; else it says what is off, when
+in the pulse, and what may be the cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cpunet.networks.response_layer import Readout
+from cpunet.pulses.loading import InfoPart
+from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
+from cpunet.training.comparison import Comparison, Sides, response_transfer
+
+# Limits: chi-square per function of the median slice, and of the components; standard errors of
+# the mean pulse; AUC, which must also be so many deviations from its null.
+MAX_CHI_SQUARE, MAX_AMPLITUDE, MAX_Z, MAX_AUC, SURE = 1.3, 1.6, 5.0, 0.6, 3.0
+CLEAR = 1 / 3  # of the way from what is expected to the limit of chi-square
+WIDTH = 3.0  # of the bounded functions in robust standard deviations
+# Parts of a pulse by their end in ns from the half height, and likely causes.
+PARTS = {
+    "onset": (
+        -240.0,
+        "no readout shapes it: the physics simulated are not those of the detector, or it is "
+        "another one; try: cpunet check; cpunet calibrate finds temperature and impurities",
+    ),
+    "edge": (
+        240.0,
+        "a readout that is not linear, as one of limited slew rate, or other physics; try: "
+        "cpunet calibrate; cpunet response tells what was fitted",
+    ),
+    "top": (
+        1344.0,
+        "charges that are trapped, or a readout that is not linear; try: cpunet calibrate",
+    ),
+    "tail": (
+        np.inf,
+        "in-trace pile-up, or pile-up tails too few to be sure of; try: cpunet info --quality "
+        "tells of pile-up tails",
+    ),
+}
+AMPLITUDE = (
+    "the distribution of the current amplitude differs: other energies or another mixture of "
+    "events than simulated; try: cpunet check compares both sides"
+)
+
+
+class Verdict(InfoPart):
+    """What the comparison of translated and measured pulses says.
+
+    Parameters
+    ----------
+    chi_square, amplitude
+        Per function: of the median slice, and of components in bins of the amplitude.
+    z, z_ns
+        Largest deviation of the mean pulse in its standard errors, and its time from the half
+        height in ns.
+    beyond_ns
+        First and last time beyond `MAX_Z`; empty if there is none.
+    auc, auc_null, auc_error
+        Of the classifier, the same of shuffled labels, and the standard deviation of that.
+    off
+        Largest deviation of the mean pulse by part, of those beyond the limit.
+    pulses
+        Simulated and measured pulses compared.
+    """
+
+    chi_square: float
+    amplitude: float
+    z: float
+    z_ns: float
+    beyond_ns: list[float]
+    auc: float = 0.5
+    auc_null: float = 0.5
+    auc_error: float = 0.0
+    off: dict[str, float]
+    pulses: list[int]
+
+    @property
+    def distinguished(self) -> bool:
+        """Whether the classifier tells the two sides apart."""
+        return self.auc > max(MAX_AUC, self.auc_null + SURE * self.auc_error)
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing is off."""
+        limits = self.chi_square <= MAX_CHI_SQUARE and self.amplitude <= MAX_AMPLITUDE
+        return limits and abs(self.z) <= MAX_Z and not self.distinguished
+
+    @property
+    def clear(self) -> bool:
+        """Whether nothing asks for more than is there."""
+        apart = max(self.chi_square, self.amplitude) - 1 < CLEAR * (MAX_CHI_SQUARE - 1)
+        return self.good and apart and abs(self.z) < (1 - CLEAR) * MAX_Z
+
+    @property
+    def causes(self) -> list[str]:
+        """What is off, why that may be, and what to try, worst first; a wrong onset leads."""
+        told = []
+        for part in sorted(self.off, key=lambda part: (part != "onset", -self.off[part])):
+            size = f"{self.off[part]:.0f} standard errors"
+            told.append(f"the {part} is off by {size}: {PARTS[part][1]}")
+        if self.amplitude > MAX_AMPLITUDE:
+            told.append(AMPLITUDE)
+        if not told and not self.good:
+            told.append("pulses differ from each other otherwise than simulated")
+        return told
+
+    def __str__(self) -> str:
+        size = f"{abs(self.z):.1f} standard errors"
+        mean = f"the mean pulse is within {size}"
+        if self.beyond_ns:
+            first, last = self.beyond_ns
+            when = (
+                f"at {first:.0f} ns" if first == last else f"from {first:.0f} to {last:.0f} ns"
+            )
+            mean = f"the mean pulse is off by {size}, {when} after the half height"
+        return (
+            f"{'good' if self.good else 'bad'}: {mean}, chi-square of its slices is "
+            f"{self.chi_square:.2f} per sample, of the amplitude {self.amplitude:.2f}, a "
+            f"classifier has an AUC of {self.auc:.2f}"
+        )
+
+
+def verdict(response: Readout, bands: Sequence[Sides]) -> Verdict:
+    """Compare translated and measured pulses of all bands; the worst of each counts."""
+    found = [_of_band(response, sides) for sides in bands]
+    worst = max(found, key=lambda one: abs(one.z))
+    apart = max(found, key=lambda one: one.auc - one.auc_null)
+    off: dict[str, float] = {}
+    for one in found:
+        off |= {part: max(size, off.get(part, 0.0)) for part, size in one.off.items()}
+    return worst.model_copy(
+        update={
+            "chi_square": max(one.chi_square for one in found),
+            "amplitude": max(one.amplitude for one in found),
+            "auc": apart.auc,
+            "auc_null": apart.auc_null,
+            "auc_error": apart.auc_error,
+            "off": off,
+            "pulses": np.sum([one.pulses for one in found], axis=0).tolist(),
+        }
+    )
+
+
+def _of_band(response: Readout, sides: Sides) -> Verdict:
+    comparison = Comparison(sides, WIDTH)
+    transfer = response_transfer(response, sides.padded)
+    z, differences = comparison.mean_pulse(transfer), comparison.differences(transfer)
+    time, worst = sides.time_ns, int(np.abs(z).argmax())
+    beyond = time[np.abs(z) > MAX_Z]
+    off, since = {}, -np.inf
+    for part, (until, _) in PARTS.items():
+        largest = float(np.abs(z[(time >= since) & (time < until)]).max(initial=0.0))
+        since = until
+        if largest > MAX_Z:
+            off[part] = round(largest, 1)
+    clean, _ = sides.translated(transfer)
+    translated = sides.noisy(clean)[0]
+    translated = translated[sides.single(translated)]
+    auc = {}
+    if min(len(translated), len(sides.data)) >= MIN_PULSES:
+        both = sides.data, translated
+        more = [{"log": of.log_amplitude, "rise": of.rise} for of in both]
+        pulses = (of.pulses for of in both)
+        told = classifier_auc(*pulses, seed=0, features=(more[0], more[1]))
+        auc = {"auc": told.auc, "auc_null": told.null_mean, "auc_error": told.null_std}
+    return Verdict(
+        chi_square=float(np.median([d.chi_square for d in differences if d.sliced])),
+        amplitude=next(d.chi_square for d in differences if d.name == "components"),
+        z=float(z[worst]),
+        z_ns=float(time[worst]),
+        beyond_ns=[float(beyond[0]), float(beyond[-1])] if len(beyond) else [],
+        off=off,
+        pulses=[len(sides), len(sides.data)],
+        **auc,
+    )

@@ -1,0 +1,190 @@
+"""Any step response: exact derivatives, a readout that no chain describes, and the verdict."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags, padding
+from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
+from cpunet.training.comparison import Comparison, Sides, hats, response_transfer
+from cpunet.training.derivatives import Basis
+from cpunet.training.deviations import with_deviations
+from cpunet.training.fitter import Fitter
+from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.response_fit import fit_response
+from cpunet.training.verdict import PARTS, Verdict, verdict
+from synthetic import load_recipe
+from unpaired import CHAIN, DT_NS, Unpaired, charge, faster, measured_with, simulated
+
+RECIPE = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"])
+RINGING = {"fraction": 0.05, "frequency_MHz": 3.0, "damping_ns": 300.0}
+RINGS = type(CHAIN).model_validate(CHAIN.model_dump() | {"ringing": RINGING})
+
+
+def true_response(poles_ns: tuple[float, float] = (55.0, 35.0)) -> ElectronicsResponse:
+    """The chain that the data went through."""
+    config = RECIPE.generator.model_copy(
+        update={"poles_ns": poles_ns, "decay_us": CHAIN.decays[0].tau_us}
+    )
+    response = ElectronicsResponse(config, DT_NS)
+    response.slow_weights.data.fill_(0.065)
+    return response
+
+
+def sides_of(sets: Unpaired, response: ElectronicsResponse) -> Sides:
+    (sides,) = PulseSets(*sets, RECIPE, np.random.default_rng(0)).sides(response)
+    return sides
+
+
+@pytest.fixture(scope="module")
+def plain() -> Unpaired:
+    return measured_with(CHAIN, 1500)
+
+
+@pytest.fixture(scope="module")
+def rings() -> Unpaired:
+    return measured_with(RINGS, 1500)
+
+
+def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> ElectronicsResponse:
+    own = ElectronicsResponse(response.config.model_copy(update={"deviations": True}), DT_NS)
+    own.load_state_dict(response.state_dict(), strict=False)
+    own.set_deviation(deviation)
+    return own
+
+
+def test_chi_square_at_the_truth_is_one(plain):
+    response = true_response()
+    sides = sides_of(plain, response)
+    found = Comparison(sides, 1.5).differences(response_transfer(response, sides.padded))
+    assert np.mean([d.chi_square for d in found if d.sliced]) == pytest.approx(1.0, abs=0.15)
+    assert all(d.chi_square < 1.6 for d in found)
+
+
+@pytest.mark.parametrize("at_ns", [320.0, 2000.0])
+def test_derivatives_are_those_of_differences(plain, at_ns):
+    """With little noise, of which slices with other pulses have other means."""
+    response = true_response()
+    sides, lags = sides_of(plain, response), deviation_lags(DT_NS)
+    sides.noise = replace(sides.noise, factor=1e-4 * sides.noise.factor)
+    change = np.exp(-0.5 * ((lags * DT_NS - at_ns) / 60.0) ** 2)
+    comparison, step = Comparison(sides, 6.0), 1e-4
+    basis = Basis(int(lags[0]), change[:, np.newaxis])
+    found = comparison.differences(response_transfer(response, sides.padded), basis)
+    ends = [
+        comparison.differences(
+            response_transfer(deviating(response, sign * step * change), sides.padded)
+        )
+        for sign in (1, -1)
+    ]
+    for here, up, down in zip(found[1:], ends[0][1:], ends[1][1:], strict=True):
+        wanted = (up.values - down.values) / (2 * step)
+        off = np.linalg.norm(here.slopes[:, 0] - wanted) / np.linalg.norm(wanted)
+        assert off < 0.1, here.name
+
+
+def test_a_chain_that_is_right_stays_as_it_is(plain):
+    response = true_response()
+    found = with_deviations(response, [sides_of(plain, response)], lambda _: None)
+    assert found.evidence < 0
+    assert found.response is response
+
+
+def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
+    """The mean pulse tells what moments of a chain do not."""
+    response = true_response()
+    sides = sides_of(rings, response)
+    bad = verdict(response, [sides])
+    assert not bad.good
+    assert abs(bad.z) > 10
+    assert {"edge", "top"} & set(bad.off)
+    found = with_deviations(response, [sides], lambda _: None)
+    assert found.evidence > 100
+    assert verdict(found.response, [sides]).good
+    # from the half height, since pulses do not tell a delay
+    time_ns, steps = np.arange(-50, 1500.0, 4), []
+    for chain in (
+        learned_chain(found.response, ""),
+        true_chain_of(RINGS),
+        true_chain_of(CHAIN),
+    ):
+        half_ns = reaches_ns(chain, 0.5)
+        steps.append(chain.whole.step(time_ns + half_ns) / chain.whole.step(3000.0))
+    assert np.abs(steps[0] - steps[1]).max() < 0.002
+    assert np.abs(steps[2] - steps[1]).max() > 0.008
+
+
+@pytest.mark.thorough
+def test_a_fit_learns_what_its_chain_cannot(rings):
+    sets = PulseSets(*rings, RECIPE, np.random.default_rng(0))
+    response, fit = fit_response(sets, Fitter(RECIPE.matching.training))
+    assert response.config.deviations
+    assert fit.checks.good
+    assert fit.verdict.startswith("good: the mean pulse is within")
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.15])
+def test_other_physics_are_bad(plain, factor):
+    """No linear readout makes up for a drift that is longer or shorter."""
+    other = plain._replace(sim=simulated(faster(charge(1500, seed=1), factor)))
+    response = true_response()
+    sides = sides_of(other, response)
+    found = with_deviations(response, [sides], lambda _: None)
+    told = verdict(found.response, [sides])
+    assert not told.good
+    assert told.causes
+
+
+def test_what_a_verdict_says():
+    right = {"chi_square": 1.02, "amplitude": 0.9, "z": -2.5, "z_ns": 40.0, "beyond_ns": []}
+    right |= {"off": {}, "pulses": [1000, 900]}
+    good = Verdict.model_validate(right)
+    assert good.good
+    assert good.causes == []
+    assert str(good).startswith("good: the mean pulse is within 2.5 standard errors")
+    wrong = {"z": 30.0, "beyond_ns": [300.0, 820.0], "off": {"top": 30.0, "onset": 9.0}}
+    bad = Verdict.model_validate(right | wrong)
+    assert not bad.good
+    assert "is off by 30.0 standard errors, from 300 to 820 ns after the half height" in str(
+        bad
+    )
+    assert bad.causes[0] == f"the onset is off by 9 standard errors: {PARTS['onset'][1]}"
+    seen = Verdict.model_validate(right | {"auc": 0.7, "auc_error": 0.02})
+    assert not seen.good
+    assert not Verdict.model_validate(right | {"chi_square": 1.4}).good
+
+
+def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
+    response, lags = true_response(), deviation_lags(DT_NS)
+    deviation = 0.01 * np.exp(-0.5 * ((lags * DT_NS - 800) / 100) ** 2) + 0.004
+    own = deviating(response, deviation)
+    padded, last = 8192, int(lags[-1])
+    plain, moved = (
+        np.fft.irfft(response_transfer(one, padded), padded) for one in (response, own)
+    )
+    apart = moved - plain
+    np.testing.assert_allclose(apart[: last + 1], deviation[-lags[0] :], atol=1e-12)
+    np.testing.assert_allclose(apart[lags[0] :], deviation[: -lags[0]], atol=1e-12)
+    later = slice(last, 4000)
+    np.testing.assert_allclose(
+        apart[later] / apart[last], plain[later] / plain[last], atol=1e-9
+    )
+    # records are those of its closed form, sampled as means over the period
+    step = (torch.arange(1600) >= 400).float()[None]
+    record = own(step)[0].detach().numpy()[padding(DT_NS)[0] + 400 :]
+    time_ns = (np.arange(1000) + 0.5) * DT_NS
+    closed = learned_chain(copy.deepcopy(own), "").whole.step(time_ns)
+    np.testing.assert_allclose(record[30:1000], closed[30:], atol=3e-4)
+    assert own.describe()["deviation"] == pytest.approx(0.014)
+
+
+def test_bins_add_up():
+    values = np.random.default_rng(0).normal(size=100)
+    bins, slopes = hats(values, np.array([-1.0, 0.0, 0.5]))
+    np.testing.assert_allclose(bins.sum(axis=1), 1)
+    np.testing.assert_allclose(slopes.sum(axis=1), 0, atol=1e-12)
