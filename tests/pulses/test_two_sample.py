@@ -7,8 +7,8 @@ import pytest
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.two_sample import auc_and_variance, classifier_auc
 from cpunet.pulses import two_sample
+from cpunet.pulses.two_sample import auc_and_variance, classifier_auc
 
 TIME = np.arange(80.0)
 SHAPE = np.exp(-0.5 * ((TIME - 40) / 5) ** 2)

@@ -51,7 +51,7 @@ from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.writing import written_hdf5
-from cpunet.training.run import RunLike, as_run, resolve_device
+from cpunet.training.run import RunLike, resolve_device, used_run
 from cpunet.translation.translator import BATCH, REN
 
 
@@ -204,7 +204,7 @@ def translate_library(
     --------
     cpunet library translate run psl.lh5 --out psl_ren.lh5
     """
-    run, source, out = as_run(run), Path(library), Path(out)
+    run, source, out = used_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
     translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
     numbers: dict[str, LibraryNumbers] = {}

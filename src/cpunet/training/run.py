@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import platform
 import re
 from collections.abc import Iterable, Mapping
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
     from cpunet.translation.translation import Translation
     from cpunet.translation.translator import IREN, REN
     from cpunet.validation.report import Report
+
+log = logging.getLogger(__name__)
 
 FORMAT = 2
 """Format of run folders; those of other versions cannot be loaded."""
@@ -364,6 +367,15 @@ else:  # which commands read: there, a run is its folder
 def as_run(run: RunLike) -> Run:
     """The run itself, or that of a folder."""
     return run if isinstance(run, Run) else Run.load(run)
+
+
+def used_run(run: RunLike) -> Run:
+    """The same, with a warning if its own verdict is bad."""
+    used = as_run(run)
+    checks = None if used.fit is None else used.fit.checks
+    if checks is not None and not checks.good:
+        log.warning(f"{used.name}: its own verdict is {checks}; {checks.causes[0]}")
+    return used
 
 
 def differing(own: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> list[str]:

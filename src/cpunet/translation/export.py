@@ -28,7 +28,7 @@ from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.networks.response_layer import DriftClock
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
-from cpunet.training.run import RunLike, as_run
+from cpunet.training.run import RunLike, used_run
 from cpunet.translation.translator import IREN, REN, Translator
 
 # Version of the operators, and the lowest version of the file format that holds them: what a
@@ -92,7 +92,7 @@ def export_onnx(
     cpunet export onnx run --out ren.onnx
     """
     out = Path(out)
-    noise_file, run = out.with_suffix(".noise.npz"), as_run(run)
+    noise_file, run = out.with_suffix(".noise.npz"), used_run(run)
     for path in (out, noise_file):
         refuse_existing(path, run.folder, force=force)
     kind: type[Translator] = IREN if inverse else REN

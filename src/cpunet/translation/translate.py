@@ -22,7 +22,7 @@ from cpunet.progress import stage
 from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own_folder
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
-from cpunet.training.run import INFO, Run, RunLike, as_run
+from cpunet.training.run import INFO, Run, RunLike, as_run, used_run
 from cpunet.translation.file_translation import Counts, FileTranslation
 from cpunet.translation.options import NONE, Adc, TranslateOptions
 from cpunet.translation.translation import Translation
@@ -131,7 +131,7 @@ def translate(
     if out is None:
         if several or channels:
             raise CpunetError("several files or tables do not stay in memory; give `out`")
-        run = as_run(run)
+        run = used_run(run)
         job = FileTranslation(run, options)
         job.warn()
         kept, counts = job.in_memory(files[0])
@@ -141,7 +141,7 @@ def translate(
         if len(files) > 1:
             raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
         return to_files.of_channels(run, files[0], Path(out))
-    run = as_run(run)
+    run = used_run(run)
     if several:
         return to_files.several(run, files, Path(out), jobs)
     return to_files.one(run, files[0], Path(out))
@@ -199,7 +199,7 @@ class _ToFiles:
 
     def of_channel(self, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
         run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-        return self.one(as_run(run), pair[0], place.with_name(f"{name}.lh5"), name)
+        return self.one(used_run(run), pair[0], place.with_name(f"{name}.lh5"), name)
 
     def several(
         self, run: Run, sources: Sequence[PulseFile], out: Path, jobs: int

@@ -14,7 +14,7 @@ from cpunet.outputs import folder_written_aside
 from cpunet.pulses.channels import Outcome, Pair, each_channel, own_folder, paired
 from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.settings import require_seed
-from cpunet.training.run import INFO, Run, RunLike, as_run
+from cpunet.training.run import INFO, Run, RunLike, used_run
 from cpunet.validation.compare import compared
 from cpunet.validation.report import REPORT, Report
 from cpunet.validation.verdicts import Metrics
@@ -93,7 +93,7 @@ def validate(
     folder = None if out is None else Path(out)
     if data.table == ALL:
         return _of_channels(run, (sim, data), folder, how, force)
-    return _validated(as_run(run), (sim, data), folder, how, force)
+    return _validated(used_run(run), (sim, data), folder, how, force)
 
 
 def _validated(
@@ -146,7 +146,7 @@ def _of_channel(
 ) -> Path:
     """The folder of the report of a channel, made in a process of its own."""
     run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-    _validated(as_run(run), pair, folder, how, force)
+    _validated(used_run(run), pair, folder, how, force)
     return folder
 
 
