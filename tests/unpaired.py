@@ -16,7 +16,7 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.readout import coloured_noise
 from cpunet.networks.generators import stretch
-from cpunet.networks.response_layer import Readout
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
@@ -95,7 +95,7 @@ def faster(fine: Pulses, factor: float) -> Pulses:
     return fine.with_waveforms(np.array(values, np.float32))
 
 
-def edge_errors(response: Readout) -> np.ndarray:
+def edge_errors(response: ElectronicsResponse) -> np.ndarray:
     """RMSE on the edge of other pulses than were fitted, against those of the true chain."""
     fine = charge(200, seed=9)
     with torch.no_grad():

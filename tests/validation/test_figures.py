@@ -75,16 +75,6 @@ def test_a_loss_of_every_third_iteration_is_drawn():
     assert np.isfinite(average.get_ydata()).sum() == 20
 
 
-def test_what_the_unet_does_is_drawn_against_the_drift_time():
-    before = np.linspace(300, 1500, 400)
-    figure = run_figures.drift_figure(before[::-1], 1e-5 * before[::-1], np.full(400, -25.0))
-    require_drawn(figure)
-    longer, blur = (axes.lines[1] for axes in figure.axes)
-    assert longer.get_ydata() == pytest.approx(1e-3 * np.array(longer.get_xdata()))
-    assert np.all(np.diff(longer.get_xdata()) > 0)
-    assert set(blur.get_ydata()) == {-5.0}
-
-
 def test_histogram_legend_tells_scores_and_counts():
     rng = np.random.default_rng(0)
     values = {

@@ -12,7 +12,6 @@ import pytest
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.published import UNKNOWN
@@ -184,12 +183,6 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
         generator=peak.translations.ren.seeded(0),
     )
     np.testing.assert_array_equal(pulses["ren"], again[raw])
-
-
-def test_a_unet_before_the_readout_is_drawn(whole, monkeypatch) -> None:
-    network = whole.sets[0].translations.ren.backend.network
-    monkeypatch.setitem(network._modules, "unet", DriftUNet(2, 16.0))
-    assert "clock and blur of the U-Net" in drawings(whole)
 
 
 def test_a_run_of_ren_alone_is_drawn_without_cycles(whole) -> None:

@@ -149,7 +149,7 @@ def calibrate(
     if target is not None and not isinstance(recipe, Recipe):
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
-    _ = settings.chain  # without one there is nothing to calibrate with a detector
+    _ = settings.matching  # without a chain there is nothing to calibrate with a detector
     given = settings, Freedom.of(free, prior), peak, events, require_seed(seed)
     act = partial(_calibrated, given, plan, force)
     if sides[1].table != ALL:

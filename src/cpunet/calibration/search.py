@@ -84,7 +84,7 @@ class Search:
         self._all = list(range(len(nuisances)))
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
         dt_ns = self.simulator.physics.settings.dt_ns
-        self._start = ElectronicsResponse(self.recipe.chain, dt_ns)
+        self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
         set_decay(self._start, float(np.mean([b.moments.slope for b in self._bands])))
 
     def plan(self) -> Information:

@@ -75,7 +75,7 @@ class TemplateTranslator:
     """
 
     def __init__(self, ren: REN, dt_ns: float) -> None:
-        if ren.backend.chain is None or ren.recipe.generator.name == "learned":
+        if ren.backend.chain is None:
             raise CpunetError(
                 "the run's network translates whole pulses, not the templates that they are "
                 "summed from; give a run of the recipe fast"

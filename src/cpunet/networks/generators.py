@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise, record_samples
 from cpunet.electronics.drawn_pile_up import DrawnTails
-from cpunet.networks.learned_response import LearnedResponse
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.schema import LearnedConfig, MatchingConfig, ResponseConfig
+from cpunet.recipes.schema import MatchingConfig, ResponseConfig
 
 
 class KeptNoise(nn.Module):
@@ -205,13 +202,9 @@ class ResponseGenerator(KeptNoise):
     tails: DrawnTails | None = None
     """Pile-up tails, which are added to records with the noise."""
 
-    def __init__(self, config: ResponseConfig | LearnedConfig, dt_ns: float) -> None:
+    def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
-        self.response: Any = (
-            LearnedResponse(config, dt_ns)
-            if isinstance(config, LearnedConfig)
-            else ElectronicsResponse(config, dt_ns)
-        )
+        self.response = ElectronicsResponse(config, dt_ns)
 
     @property
     def noise_dt_ns(self) -> float:
@@ -220,4 +213,5 @@ class ResponseGenerator(KeptNoise):
 
     def forward(self, windows: Tensor) -> Tensor:
         """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""
-        return self.response(windows)  # type: ignore[no-any-return]
+        records: Tensor = self.response(windows)
+        return records

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 import torch
+from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from cpunet.electronics.finishing import padding as padding
@@ -137,79 +138,13 @@ AXES = 24  # of the covariance of deviations, which are kept
 IMAGES = 3  # images of the spectrum on either side
 
 
-class Readout(nn.Module):
-    """Charge pulses → noise-free records of any height.
-
-    Parameters
-    ----------
-    dt_ns
-        Sampling period of the pulses in ns.
-    """
-
-    dt_ns: Tensor
-    drift: nn.Module | None
-    """What changes the simulated pulses before they enter the readout."""
-    decay_known: float | None = None
-    """Relative error of the main decay, if it is known from baselines."""
-
-    def __init__(self, dt_ns: float) -> None:
-        super().__init__()
-        self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
-
-    def forward(self, windows: Tensor) -> Tensor:
-        """Apply the response to prepared simulated pulses.
-
-        Parameters
-        ----------
-        windows
-            Shape (batch, samples), 0 … 1.
-
-        Returns
-        -------
-        Tensor
-            Shape (batch, record_length).
-        """
-        length = record_length(windows.shape[1], dt_ns := float(self.dt_ns))
-        padded = padded_length(length)
-        windows = self.drifted(windows)
-        transfer = self.transfer(padded).to(torch.complex64)
-        spectrum = current_spectrum(windows, padded, dt_ns) * transfer
-        signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
-        return signal
-
-    def drifted(self, windows: Tensor) -> Tensor:
-        """Simulated pulses as they enter the readout."""
-        raise NotImplementedError
-
-    def transfer(self, padded: int) -> Tensor:
-        """Response to a step of charge at sample 0, as a spectrum of `padded` samples."""
-        raise NotImplementedError
-
-    def describe(self) -> dict[str, float]:
-        """Fitted properties by name, with the unit at the end of the name."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def delay_ns(self) -> float:
-        """Time in ns at which the response to a step is half as high as its maximum."""
-        dt_ns = float(self.dt_ns)
-        padded = padded_length(record_length(round(STEP_NS / dt_ns), dt_ns))
-        lead = padding(dt_ns)[0]
-        step = torch.fft.irfft(self.transfer(padded), padded).roll(lead)[: padded - lead]
-        after = int((step >= 0.5 * step.max()).int().argmax())
-        low, high = step[after - 1], step[after]
-        place = after - 1 + float((0.5 * step.max() - low) / (high - low))
-        # a sample is the mean over its period
-        return (place + 0.5 - lead) * dt_ns
-
-
 def deviation_lags(dt_ns: float) -> npt.NDArray[np.intp]:
     """Samples from a step at which its response deviates from the chain."""
     first, stop = (round(ns / dt_ns) for ns in DEVIATION_NS)
     return np.arange(first, stop)
 
 
-class ElectronicsResponse(Readout):
+class ElectronicsResponse(nn.Module):
     r"""Charge pulses → noise-free records of any height, by physical parameters.
 
     With bandwidth poles :math:`\tau_k`, weights :math:`w_j` of slow parts of fixed times
@@ -252,14 +187,18 @@ class ElectronicsResponse(Readout):
     (0.98413, 0.98413)
     """
 
+    dt_ns: Tensor
     slow_ns: Tensor
     fast_decays_us: Tensor
     deviation: Tensor
     deviation_axes: Tensor
     drift: DriftClock | None
+    decay_known: float | None = None
+    """Relative error of the main decay, if it is known from baselines."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
-        super().__init__(dt_ns)
+        super().__init__()
+        self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
         self.config = config
 
         def log(values: Sequence[float]) -> nn.Parameter:
@@ -284,6 +223,7 @@ class ElectronicsResponse(Readout):
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
         if config.deviations:
             shape = AXES, len(deviation_lags(dt_ns))
+            self.deviation_dt_ns = float(dt_ns)  # the response itself may be sampled otherwise
             self.register_buffer("deviation", torch.zeros(shape[1], dtype=torch.float64))
             self.register_buffer("deviation_axes", torch.zeros(shape, dtype=torch.float64))
 
@@ -294,6 +234,27 @@ class ElectronicsResponse(Readout):
         self.deviation.copy_(torch.from_numpy(deviation))
         if axes is not None:
             self.deviation_axes[: axes.shape[1]] = torch.from_numpy(axes.T)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Apply the response to prepared simulated pulses.
+
+        Parameters
+        ----------
+        windows
+            Shape (batch, samples), 0 … 1.
+
+        Returns
+        -------
+        Tensor
+            Shape (batch, record_length).
+        """
+        length = record_length(windows.shape[1], dt_ns := float(self.dt_ns))
+        padded = padded_length(length)
+        windows = self.drifted(windows)
+        transfer = self.transfer(padded).to(torch.complex64)
+        spectrum = current_spectrum(windows, padded, dt_ns) * transfer
+        signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
+        return signal
 
     def drifted(self, windows: Tensor) -> Tensor:
         """Simulated pulses with their drift stretched, as they enter the readout."""
@@ -321,14 +282,32 @@ class ElectronicsResponse(Readout):
         whole: Tensor = fast * torch.fft.rfft(self.decay(time_us), padded)
         if not self.config.deviations:
             return whole
-        first, last = (int(deviation_lags(float(dt_ns))[i]) for i in (0, -1))
+        lags, deviation = deviation_lags(float(dt_ns)), self.deviation.cpu().numpy()
+        if float(dt_ns) != self.deviation_dt_ns:
+            time_ns = (deviation_lags(self.deviation_dt_ns) + 0.5) * self.deviation_dt_ns
+            deviation = CubicSpline(time_ns, deviation)((lags + 0.5) * float(dt_ns))
+        first, last = int(lags[0]), int(lags[-1])
         step = torch.zeros(padded, dtype=torch.float64, device=dt_ns.device)
-        step[first:], step[: last + 1] = self.deviation[:-first], self.deviation[-first:]
+        values = torch.from_numpy(deviation).to(step)
+        step[first:], step[: last + 1] = values[:-first], values[-first:]
         if (at_last := torch.fft.irfft(whole, padded)[last : max(last + 1, kept)]).numel() > 1:
-            step[last:kept] = self.deviation[-1] * at_last / at_last[0]
+            step[last:kept] = values[-1] * at_last / at_last[0]
         step[kept : padded + first] = 0
         with_deviation: Tensor = whole + torch.fft.rfft(step, padded)
         return with_deviation
+
+    @torch.no_grad()
+    def delay_ns(self) -> float:
+        """Time in ns at which the response to a step is half as high as its maximum."""
+        dt_ns = float(self.dt_ns)
+        padded = padded_length(record_length(round(STEP_NS / dt_ns), dt_ns))
+        lead = padding(dt_ns)[0]
+        step = torch.fft.irfft(self.transfer(padded), padded).roll(lead)[: padded - lead]
+        after = int((step >= 0.5 * step.max()).int().argmax())
+        low, high = step[after - 1], step[after]
+        place = after - 1 + float((0.5 * step.max() - low) / (high - low))
+        # a sample is the mean over its period
+        return (place + 0.5 - lead) * dt_ns
 
     @property
     def fast_times_us(self) -> Tensor:

@@ -92,21 +92,6 @@ class ResponseConfig(Config):
         return times
 
 
-class LearnedConfig(Config):
-    """A learned step response behind a U-Net, see `cpunet.networks.learned_response`.
-
-    ``coordinates`` is the number of parameters of the step response; with ``ringing`` there
-    are more, for a ringing.  ``width`` is that of the U-Net's first layer, which is there with
-    ``drift``.  Both are tried if the fit without them is poor.
-    """
-
-    name: Literal["learned"]
-    coordinates: Annotated[int, Field(ge=1, le=60)]
-    width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
-    ringing: bool
-    drift: bool
-
-
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 
@@ -281,13 +266,13 @@ class MatchingConfig(Timed):
     deviations.  ``ridge`` is the fraction of the identity in the correlation matrix of all of
     these.  The valley is searched for with ``search_pulses`` of each side, in fits of at most
     ``steps`` iterations.  A fit that ends in the wrong valley is started again with the
-    response's poles times the next of ``start_factors``; the best of all is kept.  If it is
-    still poor, a ringing at one of ``ringing_mhz`` is tried.  If pulses begin differently than
-    simulated, up to ``drift_terms`` parameters that stretch the drift are tried first.
-    Each of these is kept if held-out pulses gain.  Finally, all pulses are compared with
-    ``noise_sets`` draws of the noise each, optimally weighted with the components in
-    ``conditional_bins`` of the current amplitude; or, if the drift was stretched, by their
-    moments and by the single sites of the continuum.
+    response's poles times the next of ``start_factors``; the best of all is kept.  All pulses
+    are compared with ``noise_sets`` draws of the noise each, optimally weighted with the
+    components in ``conditional_bins`` of the current amplitude; or, if the drift was stretched,
+    by their moments and by the single sites of the continuum.  If a fit is bad and pulses begin
+    differently than simulated, up to ``drift_terms`` parameters that stretch the drift are
+    tried, and kept if held-out pulses gain.  A calibration tries a ringing at one of
+    ``ringing_mhz``.
     """
 
     method: Literal["matching"]
@@ -408,7 +393,7 @@ class CycleGanSettings(NamedTuple):
 class MatchingSettings(NamedTuple):
     """The parts of a recipe that make a matched response."""
 
-    generator: ResponseConfig | LearnedConfig
+    generator: ResponseConfig
     training: MatchingConfig
 
 
@@ -420,9 +405,7 @@ class Recipe(Config):
     peaks: Annotated[dict[str, PeakConfig], Field(min_length=1, max_length=1000)]
     preparation: PreparationConfig
     cuts: CutConfig
-    generator: Annotated[
-        PunetConfig | ResponseConfig | LearnedConfig, Field(discriminator="name")
-    ]
+    generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
     discriminator: GruConfig | None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
@@ -481,21 +464,8 @@ class Recipe(Config):
             If the recipe does not match a response.
         """
         match self.generator, self.training:
-            case ResponseConfig() | LearnedConfig() as generator, MatchingConfig() as training:
+            case ResponseConfig() as generator, MatchingConfig() as training:
                 return MatchingSettings(generator, training)
-        raise CpunetError(f"recipe {self.name}: does not match a response")
-
-    @property
-    def chain(self) -> ResponseConfig:
-        """The readout chain whose parameters are fitted.
-
-        Raises
-        ------
-        CpunetError
-            If the recipe has none.
-        """
-        if isinstance(self.generator, ResponseConfig):
-            return self.generator
         raise CpunetError(f"recipe {self.name}: fits no readout chain; give the recipe fast")
 
     @model_validator(mode="after")

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from cpunet.networks.generators import stretch
 from cpunet.networks.response_layer import (
-    Readout,
+    ElectronicsResponse,
     current_spectrum,
     padded_length,
 )
@@ -53,7 +53,7 @@ class Ways(NamedTuple):
         samples), for their rows.
     """
 
-    response: Readout
+    response: ElectronicsResponse
     of_transfer: Tensor
     of_pulses: Callable[[slice], Tensor]
 

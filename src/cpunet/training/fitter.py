@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cpunet.electronics.drawn_pile_up import KnownDecay
-from cpunet.networks.response_layer import Readout
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.levenberg_marquardt import levenberg_marquardt
 from cpunet.training.moments import Rows, Values
@@ -106,7 +106,7 @@ class Fitter:
             self.listener(self.steps, chi_square)
 
 
-Case = tuple[Readout, int | None]
+Case = tuple[ElectronicsResponse, int | None]
 
 RESAMPLED, SURE = 200, 2.0
 
@@ -168,7 +168,9 @@ class HeldOutPulses:
         The fitted response.
     """
 
-    def __init__(self, bands: Sequence[Band], known: Sequence[Band], response: Readout) -> None:
+    def __init__(
+        self, bands: Sequence[Band], known: Sequence[Band], response: ElectronicsResponse
+    ) -> None:
         # functions and weights of both sides
         self.sides = []
         for band in bands:

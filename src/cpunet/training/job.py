@@ -21,7 +21,7 @@ from torch import nn
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.networks.response_layer import ElectronicsResponse, Readout
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
@@ -33,12 +33,11 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.recipes.schema import LearnedConfig, PunetConfig, Recipe
+from cpunet.recipes.schema import PunetConfig, Recipe
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.learned_fit import fit_learned
 from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
 from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
@@ -215,7 +214,7 @@ class Training:
         )
 
 
-def known_response(run: Run, like: Recipe) -> Readout:
+def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
     """The response of a run, as a starting point for a recipe.
 
     Raises
@@ -229,12 +228,14 @@ def known_response(run: Run, like: Recipe) -> Readout:
             f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
             f"give a run of {like.name}"
         )
-    known: Readout = run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
+    known: ElectronicsResponse = run.fill(
+        "ren", ResponseGenerator(generator, run.dt_ns)
+    ).response
     return known
 
 
 def match(
-    job: TrainingJob, known: Readout | None, listen: Listener
+    job: TrainingJob, known: ElectronicsResponse | None, listen: Listener
 ) -> tuple[ResponseGenerator, FitInfo]:
     """Measure the noise, fit the response, and tell how well it describes the data.
 
@@ -259,12 +260,11 @@ def match(
         if known.config.drift_terms > allowed:
             known = with_settings(known, drift_terms=allowed)
         recipe = recipe.model_copy(update={"generator": known.config})
-    rng, drawn, learned = np.random.default_rng(job.seed), noise.tails, recipe.generator
+    rng, drawn = np.random.default_rng(job.seed), noise.tails
     sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)
     decay = None if drawn is None else drawn.known_decay
     fitter = Fitter(recipe.matching.training, decay, listen, job.seed)
-    fit_of: Any = fit_learned if isinstance(learned, LearnedConfig) else fit_response
-    response, fit = fit_of(sets, fitter, known)
+    response, fit = fit_response(sets, fitter, known)
     parameters = response.describe()
     stretches = stretched(parameters, fit.gains)
     counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
@@ -317,7 +317,7 @@ def _tell(fit: Fit, info: FitInfo, doubts: list[str]) -> None:
         log.warning(doubt)
 
 
-def train_chain(job: TrainingJob, known: Readout | None = None) -> Run:
+def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> Run:
     """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
     started, clock = datetime.now(UTC), time.perf_counter()
     if job.init is not None:

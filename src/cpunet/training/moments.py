@@ -211,11 +211,6 @@ class Moments:
         )
         return (readings, beyond) if counts.all() else (readings[counts], beyond[counts])
 
-    def with_wider_bins(self, width: float) -> Moments:
-        """The same with bins of the current amplitude no narrower than `width`."""
-        wide = replace(self, amplitude_widths=np.maximum(self.amplitude_widths, width))
-        return replace(wide, values=wide.functions(self.data))
-
     def single_sites(self) -> Moments:
         r"""Only the place and shape of the peak of the single-site pulses.
 

@@ -36,7 +36,7 @@ import numpy as np
 import scipy.linalg
 from torch import Tensor
 
-from cpunet.networks.response_layer import Readout
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.levenberg_marquardt import AT_BOUND, descend
 from cpunet.training.moments import (
@@ -316,7 +316,7 @@ class _Weighted:
         total = sum(self.functions.sum(data[some]) for some in rows)
         self.wanted = total / len(data) @ self.whole.weights
 
-    def deviations(self, response: Readout) -> Values:
+    def deviations(self, response: ElectronicsResponse) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
             return (self.functions.sum(readings),)
 

@@ -18,7 +18,7 @@ import torch
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import Readout, record_length
+from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
@@ -231,7 +231,7 @@ class PulseSets:
             some.append(self._band(band, *chosen))
         return some
 
-    def sides(self, response: Readout) -> list[Sides]:
+    def sides(self, response: ElectronicsResponse) -> list[Sides]:
         """Pulses of both sides in each band for the comparison at every sample.
 
         The simulated ones have passed what stands before the readout.
@@ -290,7 +290,7 @@ class PulseSets:
         return SimulatedSide(sim.waveforms, drawn, moments, weights)
 
 
-def _entering(response: Readout, sim: FloatArray) -> FloatArray:
+def _entering(response: ElectronicsResponse, sim: FloatArray) -> FloatArray:
     """Simulated pulses as they enter the readout."""
     if response.drift is None:
         return sim

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cpunet.networks.response_layer import ElectronicsResponse, Readout
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.deviations import with_deviations
 from cpunet.training.fitter import Fitted, Fitter, held_out_gain
 from cpunet.training.moments import Readings, Values
@@ -126,7 +126,7 @@ def fit_response(
     CpunetError
         If there are too few pulses, or the fit does not find a finite chi-square.
     """
-    config = sets.recipe.chain
+    config, _ = sets.recipe.matching
     some = sets.bands(fitter.training.search_pulses)
     first = ResponseProblem(ElectronicsResponse(config, sets.noise.dt_ns), some, draws=1)
     everything = sets.bands()
@@ -272,7 +272,9 @@ class _Shift(NamedTuple):
     of_mean: float
 
 
-def amplitude_shift(response: Readout, bands: Sequence[Band]) -> tuple[float, float]:
+def amplitude_shift(
+    response: ElectronicsResponse, bands: Sequence[Band]
+) -> tuple[float, float]:
     """Relative shift that the translated current amplitudes need, and its error.
 
     It is a least-squares fit to the densities of its logarithm, with their covariance from the
@@ -292,7 +294,7 @@ def amplitude_shift(response: Readout, bands: Sequence[Band]) -> tuple[float, fl
     return found.shift, found.error
 
 
-def _linear_fit(response: Readout, bands: Sequence[Band], start: float) -> _Shift:
+def _linear_fit(response: ElectronicsResponse, bands: Sequence[Band], start: float) -> _Shift:
     """Fit from amplitudes that are already shifted by `start`."""
     chi_square = weight = weighted = weight_of_mean = weighted_mean = 0.0
     for band in bands:
@@ -313,7 +315,7 @@ def _linear_fit(response: Readout, bands: Sequence[Band], start: float) -> _Shif
 
 
 def _density(
-    band: Band, functions: ConditionalFunctions, response: Readout, start: float
+    band: Band, functions: ConditionalFunctions, response: ElectronicsResponse, start: float
 ) -> tuple[Values, Values, Values]:
     """Mean densities of translated amplitudes, derivatives in the shift, and mean logarithm."""
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +13,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from cpunet.networks.response_layer import Readout, padded_length
+from cpunet.networks.response_layer import ElectronicsResponse, padded_length
 from cpunet.training.differentiable import DifferentiableSet, Ways
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
@@ -24,10 +23,8 @@ POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"
 TIME_WIDTH = 1.0
 # The same for the stretch of the drift, and for its change per us.
 STRETCH, STRETCH_WIDTHS = "drift.stretch", (0.1, 0.05)
-# Of a learned step response, whose coordinates have priors of width 1 around 0.
-COORDINATES, LONGEST = "coordinates", 2.0
 # The same of what is no time: half of the charge may be slow, and the main decay dominates.
-SCALES = {DECAY_WEIGHTS: 0.03, "ringing": 0.3, "slow_weights": 0.1, COORDINATES: 1.0}
+SCALES = {DECAY_WEIGHTS: 0.03, "ringing": 0.3, "slow_weights": 0.1}
 # Step of differences in widths of the priors, for what is computed in double precision.
 STEP = 1e-5
 
@@ -41,9 +38,9 @@ class Parameters:
         Response with the parameters; their current values are the centres of the priors.
     """
 
-    response: Any  # an `ElectronicsResponse` or a `StepResponse`
+    response: ElectronicsResponse
 
-    def __init__(self, response: Readout) -> None:
+    def __init__(self, response: ElectronicsResponse) -> None:
         self.response = response
         named = [(n, p) for n, p in response.named_parameters() if p.numel()]
         self._parts = [part for _, part in named]
@@ -53,9 +50,7 @@ class Parameters:
         self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
         if response.decay_known is not None:
             self.widths[self.labels.index(DECAY)] = response.decay_known
-        learned = np.array([name == COORDINATES for name in self.labels])
-        self.centre[learned] = 0.0
-        self.longest = np.where(learned, LONGEST, self.widths)
+        self.longest = self.widths.copy()
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
         self._stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
@@ -97,7 +92,7 @@ class Parameters:
                 found.append((float(self.widths[i]), change))
         return found
 
-    def _ends(self, i: int) -> tuple[Readout, Readout, float]:
+    def _ends(self, i: int) -> tuple[ElectronicsResponse, ElectronicsResponse, float]:
         """Copies of the response on both sides of it along one coordinate, and their distance.
 
         What they compute in double precision differs in proportion.
@@ -151,7 +146,11 @@ class SmoothParameters(Parameters):
     _decay: int | None = None
 
     def __init__(
-        self, response: Readout, start: Readout | None = None, *, poles: bool = True
+        self,
+        response: ElectronicsResponse,
+        start: ElectronicsResponse | None = None,
+        *,
+        poles: bool = True,
     ) -> None:
         super().__init__(response)
         known = {} if start is None else (own := Parameters(start)).by_name(own.centre)
@@ -252,11 +251,6 @@ class Band:
         """Moments defined by the measured pulses."""
         return self.sim.moments
 
-    def with_wider_bins(self, width: float) -> Band:
-        """The same pulses with bins of the current amplitude no narrower than `width`."""
-        wide = self.moments.with_wider_bins(width)
-        return replace(self, sim=replace(self.sim, moments=wide))
-
     @property
     def pairs(self) -> float:
         """Number of pulses that errors refer to: the harmonic sum of both sides."""
@@ -279,7 +273,7 @@ class ResponseProblem:
     """
 
     def __init__(
-        self, response: Readout, bands: Sequence[Band], draws: int | None = None
+        self, response: ElectronicsResponse, bands: Sequence[Band], draws: int | None = None
     ) -> None:
         self.parameters = SmoothParameters(response)
         self.bands, self.draws = tuple(bands), draws
@@ -287,8 +281,8 @@ class ResponseProblem:
         self._comparisons = [BandComparison(band, draws=draws) for band in self.bands]
 
     @property
-    def response(self) -> Any:
-        """The response that is fitted: an `ElectronicsResponse` or a `StepResponse`."""
+    def response(self) -> ElectronicsResponse:
+        """The response that is fitted."""
         return self.parameters.response
 
     @property
@@ -322,7 +316,9 @@ class ResponseProblem:
             BandComparison(b, b.moments.model_errors, self.draws) for b in self.bands
         ]
 
-    def of(self, response: Readout, bands: Sequence[Band] | None = None) -> ResponseProblem:
+    def of(
+        self, response: ElectronicsResponse, bands: Sequence[Band] | None = None
+    ) -> ResponseProblem:
         """The same for another response, which the priors are centred on, or other pulses."""
         return ResponseProblem(response, bands or self.bands, self.draws)
 
@@ -384,7 +380,7 @@ class BandComparison:
         slopes = DifferentiableSet(self.sim).slopes(ways, functions, draws=self.draws)
         return np.asarray(self.whiten @ (slopes.T / self.sigma).T)
 
-    def pulls(self, response: Readout, clip: float | None) -> Values:
+    def pulls(self, response: ElectronicsResponse, clip: float | None) -> Values:
         def of(readings: Readings) -> tuple[Values, ...]:
             return (readings.weights @ self.moments.functions(readings, clip),)
 

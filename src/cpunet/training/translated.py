@@ -22,7 +22,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.response_layer import (
     DriftClock,
-    Readout,
+    ElectronicsResponse,
     padded_length,
     padding,
     record_length,
@@ -199,7 +199,12 @@ class SimulatedSide:
         return SimulatedSide(self.sim[rows], noise, self.moments, self.weights[rows])
 
     def sums(
-        self, response: Readout, of: Summed, *, cut: bool = True, draws: int | None = None
+        self,
+        response: ElectronicsResponse,
+        of: Summed,
+        *,
+        cut: bool = True,
+        draws: int | None = None,
     ) -> Total:
         """Sums over all pulses and draws of noise, and the weight of the pulses used.
 
@@ -224,7 +229,7 @@ class SimulatedSide:
 
     def sums_of_blocks(
         self,
-        response: Readout,
+        response: ElectronicsResponse,
         of: Summed,
         *,
         size: int = BLOCK,
@@ -263,13 +268,15 @@ class SimulatedSide:
             _added(within if exclude else within + outside) for within, outside, _ in blocks
         ]
 
-    def of_each(self, response: Readout, of: Callable[[Readings], Values]) -> Values:
+    def of_each(
+        self, response: ElectronicsResponse, of: Callable[[Readings], Values]
+    ) -> Values:
         """Functions of each pulse, means over the draws, shape (pulses, functions)."""
         blocks = self.sums_of_blocks(response, lambda readings: (of(readings),), cut=False)
         sums = np.concatenate([functions for (functions,), _ in blocks])
         return np.asarray(sums / len(self.noise.factor))
 
-    def forget_unless(self, response: Readout) -> None:
+    def forget_unless(self, response: ElectronicsResponse) -> None:
         """Forget the spectra of another stretch of the drift than that of a response."""
         drift = response.drift
         stretch = drift.stretch.tolist() if isinstance(drift, DriftClock) else []
@@ -277,7 +284,9 @@ class SimulatedSide:
             self._spectra.clear()
             self._stretch[:] = stretch
 
-    def spectrum(self, response: Readout, first: int, size: int) -> npt.NDArray[np.complex64]:
+    def spectrum(
+        self, response: ElectronicsResponse, first: int, size: int
+    ) -> npt.NDArray[np.complex64]:
         """Fourier transform of the currents of one block, cached up to `SPECTRA_BYTES`."""
         sim = self.sim[first : first + size]
         if (kept := self._spectra.get((first, len(sim)))) is not None:

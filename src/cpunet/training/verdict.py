@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cpunet.networks.response_layer import Readout
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import InfoPart
 from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
 from cpunet.training.comparison import Comparison, Sides, response_transfer
@@ -127,7 +127,7 @@ class Verdict(InfoPart):
         )
 
 
-def verdict(response: Readout, bands: Sequence[Sides]) -> Verdict:
+def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
     """Compare translated and measured pulses of all bands; the worst of each counts."""
     found = [_of_band(response, sides) for sides in bands]
     worst = max(found, key=lambda one: abs(one.z))
@@ -148,7 +148,7 @@ def verdict(response: Readout, bands: Sequence[Sides]) -> Verdict:
     )
 
 
-def _of_band(response: Readout, sides: Sides) -> Verdict:
+def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
     comparison = Comparison(sides, WIDTH)
     transfer = response_transfer(response, sides.padded)
     z, differences = comparison.mean_pulse(transfer), comparison.differences(transfer)

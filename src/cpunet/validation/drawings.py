@@ -8,10 +8,8 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
-from cpunet.networks.learned_response import DriftUNet
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.translation.translator import IREN
@@ -22,7 +20,6 @@ from cpunet.validation.noise import spectrum_of_noise
 from cpunet.validation.peaks import PeakSets
 from cpunet.validation.run_figures import (
     cycle_figure,
-    drift_figure,
     further_histograms,
     loss_curves,
     nearest,
@@ -35,7 +32,7 @@ from cpunet.validation.slices import MeanPulse, around_half
 # methods in the figures; more lines could not be distinguished
 DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
-SHOWN, IN_DRIFT = 10, 2048  # pulses in a figure of cycles, as in the paper, and of the U-Net
+SHOWN = 10  # pulses in a figure of cycles, as in the paper
 
 Drawing = Callable[[], Figure]
 T = TypeVar("T")
@@ -59,11 +56,6 @@ def drawings(found: Evaluation) -> dict[str, Drawing]:
     fullest = max(found.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values()))
     if any(name.startswith(f"{IREN.part}.") for name in found.run.weights):
         drawn |= _cycles(fullest, found.run.iren)
-    for module in fullest.translations.ren.backend.network.modules():
-        if isinstance(module, DriftUNet):
-            pulses = torch.from_numpy(fullest.windows("raw")[:IN_DRIFT])
-            effect = map(torch.Tensor.numpy, module.effect(pulses))
-            drawn["clock and blur of the U-Net"] = partial(drift_figure, *effect)
     if found.run.records:
         drawn["losses"] = partial(loss_curves, found.run.records)
     return drawn

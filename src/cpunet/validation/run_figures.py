@@ -38,7 +38,6 @@ from cpunet.validation.slices import BEFORE_NS, MeanPulse
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is told
 LINEAR = 0.1  # percent of full charge, up to which the scale of differences is linear
-DRIFT_BINS = 20  # bins of equal numbers of pulses
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
@@ -96,31 +95,6 @@ def cycle_figure(pulses: Mapping[str, FloatArray], dt_ns: float) -> Figure:
         axes.plot(np.arange(windows.shape[1]) * dt_ns * 1e-3, windows.T, linewidth=0.8)
         axes.set(title=title, xlabel="Time [µs]")
     grid[0].set_ylabel("Pulse height [normalised]")
-    return figure
-
-
-@styled
-def drift_figure(before_ns: Values, longer: Values, blur_ns2: Values) -> Figure:
-    """What the U-Net before a readout does, against the drift time of the simulated pulse.
-
-    Parameters
-    ----------
-    before_ns, longer, blur_ns2
-        As `cpunet.networks.learned_response.DriftUNet.effect` returns them, shapes (pulses,).
-    """
-    figure, (grid,) = panels((8.4, 3.4), 1, 2)
-    order, blur_ns = np.argsort(before_ns), np.sign(blur_ns2) * np.sqrt(np.abs(blur_ns2))
-    told = {"Longer by [%]": 100 * longer, "Gaussian σ [ns], negative: sharpened": blur_ns}
-    for axes, (text, values) in zip(grid, told.items(), strict=True):
-        axes.plot(before_ns, values, ".", color=COLOURS["raw"], markersize=1.5, alpha=0.3)
-        medians = [
-            [np.median(of[some]) for some in np.array_split(order, DRIFT_BINS) if len(some)]
-            for of in (before_ns, values)
-        ]
-        axes.plot(*medians, color=COLOURS["ren"], marker="o", markersize=3, label="median")
-        axes.axhline(0, color="black", linewidth=0.8)
-        axes.set(xlabel="Simulated time from 2 to 98 % of the charge [ns]", ylabel=text)
-    grid[0].legend()
     return figure
 
 
