@@ -188,3 +188,18 @@ def test_bins_add_up():
     bins, slopes = hats(values, np.array([-1.0, 0.0, 0.5]))
     np.testing.assert_allclose(bins.sum(axis=1), 1)
     np.testing.assert_allclose(slopes.sum(axis=1), 0, atol=1e-12)
+
+
+def test_a_deviation_is_the_same_at_other_sampling_periods():
+    """As for the templates of a library, which are sampled every ns."""
+    lags = deviation_lags(DT_NS)
+    own = deviating(true_response(), 0.01 * np.exp(-0.5 * ((lags * DT_NS - 500) / 80) ** 2))
+    fine = copy.deepcopy(own)
+    fine.dt_ns.fill_(1.0)
+    steps = [
+        np.fft.irfft(response_transfer(one, padded), padded)
+        for one, padded in ((own, 4096), (fine, 40_960))
+    ]
+    time_ns = (np.arange(5, 200) + 0.5) * DT_NS  # samples are means over their period
+    coarse, same = steps[0][5:200], np.interp(time_ns, np.arange(40_960) + 0.5, steps[1])
+    np.testing.assert_allclose(coarse[15:], same[15:], atol=2e-4)

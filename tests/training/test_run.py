@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.training.cyclegan import CycleGan
-from cpunet.training.run import FORMAT, WEIGHTS, Run, append_losses, read_losses
+from cpunet.training.run import FORMAT, WEIGHTS, Run, append_losses, read_losses, used_run
 from synthetic import one_line, write_run
 
 INFO = {"recipe": "paper", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
@@ -128,3 +128,17 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
     made = Run.of(model, recipe, peak="FEP", seed=1, dt_ns=16, seconds=1.5, device="cpu")
     assert (made.weights_sha256, made.records) == (digest, [])
     assert repr(made) == "<Run run in memory: paper, FEP>"
+
+
+def test_who_uses_a_run_whose_own_verdict_is_bad_is_told(run, caplog):
+    checks = {"chi_square": 9.0, "amplitude": 1.0, "z": 40.0, "z_ns": 64.0}
+    checks |= {"beyond_ns": [32.0, 640.0], "off": {"top": 40.0}, "pulses": [900, 900]}
+    (run / "run.json").write_text(facts(fit={"checks": checks}), encoding="utf-8")
+    assert used_run(run).fit.checks.z == 40.0
+    (warning,) = caplog.messages
+    assert warning.startswith(f"{run}: its own verdict is bad: the mean pulse is off by 40.0")
+    assert "charges that are trapped" in warning
+    good = checks | {"chi_square": 1.0, "z": 2.0, "beyond_ns": [], "off": {}}
+    (run / "run.json").write_text(facts(fit={"checks": good}), encoding="utf-8")
+    used_run(run)
+    assert len(caplog.messages) == 1

@@ -134,7 +134,7 @@ def at_times(windows: Tensor, times: Tensor) -> Tensor:
 MIN_FACTOR = 1.6
 STEP_NS = 12_800.0  # of the response to a step whose half rise is the delay
 DEVIATION_NS = -100.0, 8400.0  # in which a step response deviates from its chain
-AXES = 24  # of the covariance of deviations, which are kept
+DRAWS = 64  # of deviations within their errors
 IMAGES = 3  # images of the spectrum on either side
 
 
@@ -191,7 +191,7 @@ class ElectronicsResponse(nn.Module):
     slow_ns: Tensor
     fast_decays_us: Tensor
     deviation: Tensor
-    deviation_axes: Tensor
+    deviation_draws: Tensor
     drift: DriftClock | None
     decay_known: float | None = None
     """Relative error of the main decay, if it is known from baselines."""
@@ -222,18 +222,18 @@ class ElectronicsResponse(nn.Module):
         self.log_ringing = log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
         if config.deviations:
-            shape = AXES, len(deviation_lags(dt_ns))
+            shape = DRAWS, len(deviation_lags(dt_ns))
             self.deviation_dt_ns = float(dt_ns)  # the response itself may be sampled otherwise
             self.register_buffer("deviation", torch.zeros(shape[1], dtype=torch.float64))
-            self.register_buffer("deviation_axes", torch.zeros(shape, dtype=torch.float64))
+            self.register_buffer("deviation_draws", torch.zeros(shape, dtype=torch.float64))
 
     def set_deviation(
-        self, deviation: npt.NDArray[Any], axes: npt.NDArray[Any] | None = None
+        self, deviation: npt.NDArray[Any], draws: npt.NDArray[Any] | None = None
     ) -> None:
-        """Set the deviation at each lag, and the axes of its covariance, shape (lags, axes)."""
+        """Set the deviation at each lag, and draws whose outer products are its covariance."""
         self.deviation.copy_(torch.from_numpy(deviation))
-        if axes is not None:
-            self.deviation_axes[: axes.shape[1]] = torch.from_numpy(axes.T)
+        if draws is not None:  # (lags, draws)
+            self.deviation_draws.copy_(torch.from_numpy(draws.T))
 
     def forward(self, windows: Tensor) -> Tensor:
         """Apply the response to prepared simulated pulses.

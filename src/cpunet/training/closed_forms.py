@@ -76,12 +76,15 @@ class WithDeviation:
         return _derivative(self, t_ns)
 
 
+LATE_NS = 4000.0, 6000.0  # of a step response, within the windows that are compared
+
+
 class PoleZeroed:
     """A step response without the decay of its late part, which becomes 1."""
 
     def __init__(self, whole: WithDeviation) -> None:
         self.whole = whole
-        late_ns = np.linspace(0.5 * whole.last, whole.last, 100)
+        late_ns = np.linspace(*LATE_NS, 100)
         self.slope, self.level = np.polyfit(late_ns, np.log(whole.step(late_ns)), 1)
 
     def step(self, t_ns: npt.ArrayLike) -> FloatArray:
@@ -114,12 +117,21 @@ class Chain:
     noise
         Equally spaced frequencies from 0 in MHz and noise power density in keV²/MHz; None if
         unknown.
+    draws
+        Deviations of the step response within its errors, see `ElectronicsResponse`.
     """
 
     name: str
     whole: StepResponse
     undecayed: StepResponse
     noise: tuple[FloatArray, FloatArray] | None = None
+    draws: CubicSpline | None = None
+
+    def error(self, t_ns: FloatArray) -> FloatArray:
+        """Standard deviation of the step response at times in ns; 0 if unknown."""
+        if self.draws is None:
+            return np.zeros(len(t_ns))
+        return np.asarray(np.sqrt((self.draws(t_ns) ** 2).sum(axis=-1)))
 
 
 def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
@@ -219,14 +231,18 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
         residue = 0.5 * complex(cosine, -sine) * pole
         pair = (np.array([of, of.conjugate()]) for of in (pole, residue))
         undecayed = undecayed * Exponentials(1 + cosine, *pair)
-    shares = [1 - sum(fast), *fast]
-    whole = undecayed * Exponentials.decaying(shares, taus[n + n_slow :])
+    shares, decays = [1 - sum(fast), *fast], taus[n + n_slow :]
+    if response.config.deviations:  # those of samples, whose decays are half a period late
+        late = np.exp(0.5 * float(response.dt_ns) / np.array(decays))
+        shares = (late * shares).tolist()
+    whole = undecayed * Exponentials.decaying(shares, decays)
     if not response.config.deviations:
         return Chain(name, whole, undecayed)
     # a sample is the mean over its period
     time_ns = np.asarray(deviation_lags(dt_ns := float(response.dt_ns)) + 0.5) * dt_ns
     deviating = WithDeviation(whole, time_ns, response.deviation.numpy())
-    return Chain(name, deviating, PoleZeroed(deviating))
+    draws = CubicSpline(time_ns, response.deviation_draws.numpy().T)
+    return Chain(name, deviating, PoleZeroed(deviating), draws=draws)
 
 
 def true_chain_of(electronics: Electronics) -> Chain:
@@ -313,8 +329,8 @@ def propagated(
         empty if the covariance does not match the parameters.
     """
     moved, ends = copy.deepcopy(response), []
-    if response.config.deviations:  # their axes contain the parameters of the chain
-        for axis in response.deviation_axes:
+    if response.config.deviations:  # their draws contain the parameters of the chain
+        for axis in response.deviation_draws:
             for sign in (1, -1):
                 moved.deviation = response.deviation + sign * axis
                 ends.append(numbers(moved))

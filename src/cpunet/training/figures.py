@@ -21,6 +21,7 @@ STEP_NS, IMPULSE_NS, GRID_NS = 2000.0, 600.0, 1.0
 LAYOUT = (("step", "impulse"), ("residual", "impulse"), ("tail", "noise"))
 POINTS = 400  # of the tail, equidistant on the logarithmic axis
 NOISE_BINS = 150  # of the noise spectra
+SIGMAS = 2.0  # of the band about a step response
 
 
 @styled
@@ -108,12 +109,18 @@ def response_figure(
     long_ns = np.arange(-100.0, STEP_NS, GRID_NS)
     short_ns = np.arange(-150.0, IMPULSE_NS, GRID_NS)
     tail = np.geomspace(100.0, tail_ns, POINTS)
-    steps = []
+    steps, errors = [], []
     for chain, colour, width in drawn:
         half_ns = reaches_ns(chain, 0.5)
         steps.append(chain.whole.step(long_ns + half_ns))
         look: dict[str, Any] = {"color": colour, "linewidth": width}
         panels["step"].plot(long_ns, steps[-1], label=chain.name, **look)
+        band = SIGMAS * chain.error(long_ns + half_ns)
+        if band.any():
+            text = f"± {SIGMAS:g} standard deviations"
+            around = steps[-1] - band, steps[-1] + band
+            panels["step"].fill_between(long_ns, *around, color=colour, alpha=0.3, label=text)
+        errors.append(band)
         panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
         panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
         if chain.noise is None:
@@ -129,7 +136,10 @@ def response_figure(
     if truth is not None:
         axes, reference = panels["residual"], steps.pop(0)
         for i, step in enumerate(steps):
-            axes.plot(long_ns, 1e3 * (step - reference), color=shades[i % len(shades)])
+            apart, band = 1e3 * (step - reference), 1e3 * errors[i + 1]
+            colour = shades[i % len(shades)]
+            axes.plot(long_ns, apart, color=colour)
+            axes.fill_between(long_ns, apart - band, apart + band, color=colour, alpha=0.3)
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set(ylabel="Run − truth\n[10⁻³ of full charge]")
     _annotate(panels)
