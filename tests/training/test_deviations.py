@@ -153,7 +153,7 @@ def test_what_a_verdict_says():
     assert "is off by 30.0 standard errors, from 300 to 820 ns after the half height" in str(
         bad
     )
-    assert bad.causes[0] == f"the onset is off by 9 standard errors: {PARTS['onset'][1]}"
+    assert bad.causes[0] == f"the onset is off by 9.0 standard errors: {PARTS['onset'][1]}"
     seen = Verdict.model_validate(right | {"auc": 0.7, "auc_error": 0.02})
     assert not seen.good
     assert not Verdict.model_validate(right | {"chi_square": 1.4}).good

@@ -23,6 +23,7 @@ EARLY = 0.05  # of the height, from which the rise to half of it is taken
 STEEPEST_NS = 1280.0  # after the half height, in which the steepest point lies
 STEPS = 4  # of Newton's method for the crossing within a sample
 FLATTEST = 1e-4  # slope per sample at the half height
+TIE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +136,12 @@ def read(records: Floats, frame: Frame) -> Aligned:
     early = early.clip(1, before - 1)
     low, high = pulses[rows, early].astype(float), pulses[rows, early + 1].astype(float)
     early_part = ((EARLY - low) / np.maximum(high - low, 1e-6)).clip(0, 1)
+    order = TIE * rows / len(rows)  # ranks differ where values are at a limit
     return Aligned(
         pulses,
         slopes,
-        log_amplitude,
-        before - early - early_part,
+        log_amplitude + order,
+        before - early - early_part + order,
         sample,
         part,
         height,

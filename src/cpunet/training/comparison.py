@@ -264,6 +264,8 @@ class Comparison:
         clean, _ = self.sides.translated(transfer)
         noisy = self.sides.noisy(clean)
         kept = self.sides.single(noisy[0])
+        if kept.sum() < 2:  # far from the data
+            kept[:] = True
         views = [self.sides.view(one.pulses)[kept] for one in noisy]
         clean_view = self.sides.view(read(clean, self.sides.frame).pulses)[kept]
         n, ones = len(self.data), np.ones((len(views), int(kept.sum())))

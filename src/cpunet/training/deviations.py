@@ -274,8 +274,10 @@ def with_deviations(
             own.set_deviation(knots.between @ place)
             cost = problem.evaluate(response_transfer(own, padded), place, anew=far)
             count(cost)
-            if cost > 1.02 * before[0] + 5 and halved < HALVED:
+            if not cost <= 1.02 * before[0] + 5:  # worse, or no number
                 place, halved = 0.5 * (place + before[1]), halved + 1
+                if halved > HALVED:
+                    break
                 continue
             gained, before, halved = before[0] - cost, (cost, place), 0
             information = problem.information + GAUGE * np.outer(gauge, gauge)
@@ -295,8 +297,16 @@ def with_deviations(
             far = size > CLOSE
             if size < SETTLED or gained < gain * cost:
                 break
+    if first is None:
+        return Deviated(response, -np.inf)
+    own.set_deviation(knots.between @ place)
+    cost = problem.evaluate(response_transfer(own, padded), place, anew=False)
+    if not cost <= before[0]:
+        cost, place = before
+    alone = problem.evaluate(response_transfer(response, padded), 0 * place, anew=False)
+    if not cost < alone:
+        return Deviated(response, first)
     own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))
-    assert first is not None  # there is a step
     return Deviated(own, first, prior)
 
 

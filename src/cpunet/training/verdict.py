@@ -22,6 +22,7 @@ from cpunet.training.comparison import Comparison, Sides, response_transfer
 MAX_CHI_SQUARE, MAX_AMPLITUDE, MAX_Z, MAX_AUC, SURE = 1.3, 1.6, 5.0, 0.6, 3.0
 CLEAR = 1 / 3  # of the way from what is expected to the limit of chi-square
 WIDTH = 3.0  # of the bounded functions in robust standard deviations
+LARGEST = 100.0  # standard errors that are stated
 # Parts of a pulse by their end in ns from the half height, and likely causes.
 PARTS = {
     "onset": (
@@ -103,7 +104,7 @@ class Verdict(InfoPart):
         """What is off, why that may be, and what to try, worst first; a wrong onset leads."""
         told = []
         for part in sorted(self.off, key=lambda part: (part != "onset", -self.off[part])):
-            size = f"{self.off[part]:.0f} standard errors"
+            size = _size(self.off[part])
             told.append(f"the {part} is off by {size}: {PARTS[part][1]}")
         if self.amplitude > MAX_AMPLITUDE:
             told.append(AMPLITUDE)
@@ -112,7 +113,7 @@ class Verdict(InfoPart):
         return told
 
     def __str__(self) -> str:
-        size = f"{abs(self.z):.1f} standard errors"
+        size = _size(abs(self.z))
         mean = f"the mean pulse is within {size}"
         if self.beyond_ns:
             first, last = self.beyond_ns
@@ -125,6 +126,14 @@ class Verdict(InfoPart):
             f"{self.chi_square:.2f} per sample, of the amplitude {self.amplitude:.2f}, a "
             f"classifier has an AUC of {self.auc:.2f}"
         )
+
+
+def _size(z: float) -> str:
+    return (
+        f"{z:.1f} standard errors"
+        if z < LARGEST
+        else f"more than {LARGEST:.0f} standard errors"
+    )
 
 
 def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
