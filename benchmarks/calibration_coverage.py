@@ -27,7 +27,7 @@ import cpunet
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, named, titled
 from cpunet.calibration.search import Search
-from cpunet.electronics.measured import measured_noise
+from cpunet.electronics.measured import noise_of
 from cpunet.plotting import styled
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
@@ -156,7 +156,7 @@ def _search(
     data = measured.prepared[::simulated]
     for side in (sim, data):  # the line is calibrated to its energy, whatever is trapped
         side.pulses.energy_kev[:] = LINE_KEV
-    noise, _ = measured_noise(measured, recipe.preparation)
+    noise = noise_of(measured)
     stored = StoredSimulation.read(stand.sim.path)
     physics = Physics(stored.detector, stored.settings, before.nuisances)
     truth = [

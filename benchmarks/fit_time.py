@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.electronics.measured import measured_noise
+from cpunet.electronics.measured import noise_of
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
@@ -41,7 +41,7 @@ def one(stand: Path, n: int) -> dict[str, float]:
     files = [PulseFile(stand / f"{side}.lh5") for side in ("sim", "data")]
     sim = load_pulses(files[0], "simulated", recipe, selection).prepared.pulses
     data = load_pulses(files[1], "measured", recipe, selection)
-    noise, _ = measured_noise(data, recipe.preparation)
+    noise = noise_of(data)
     sides = first(sim, n), first(data.prepared.pulses, n)
     loaded = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     wall, cpu = time.perf_counter(), time.process_time()

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.measured import measured_noise
+from cpunet.electronics.measured import noise_of
 from cpunet.networks.response_layer import ElectronicsResponse, record_length
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
@@ -192,7 +192,7 @@ def main() -> None:
     selection = parse_selection("FEP", RECIPE.peaks)
     sim = load_pulses(files[0], "simulated", RECIPE, selection).prepared.pulses
     measured = load_pulses(files[1], "measured", RECIPE, selection)
-    data, (noise, _) = measured.prepared.pulses, measured_noise(measured, RECIPE.preparation)
+    data, noise = measured.prepared.pulses, noise_of(measured)
     if arguments.chain is not None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)
     sets = PulseSets(sim[:2000], data[:2000], noise, RECIPE, np.random.default_rng(0))

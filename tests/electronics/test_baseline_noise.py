@@ -12,7 +12,7 @@ import scipy.signal
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.finishing import finish
-from cpunet.electronics.measured import measured_noise, noise_of
+from cpunet.electronics.measured import noise_of
 from cpunet.electronics.readout import coloured_noise, noise_power
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
@@ -109,8 +109,8 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
 def test_bad_input_is_named(noise) -> None:
     with pytest.raises(CpunetError, match="only 0 of 40 traces have a known energy"):
         BaselineNoise.of(Baselines.of([Pulses.of(traces(40).waveforms, dt_ns=DT_NS)], CONFIG))
-    with pytest.raises(CpunetError, match="ns before the pulse; the noise needs 6400"):
-        BaselineNoise.of(Baselines.of([traces(start=380)], CONFIG))
+    with pytest.raises(CpunetError, match="only 0 of 300 traces have a known energy and can be"):
+        BaselineNoise.of(Baselines.of([traces(start=130)], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
     records = shape(3, 1200).astype(np.float32)
@@ -198,18 +198,6 @@ def test_baselines_of_different_kinds_are_drawn_as_such(n: int) -> None:
     assert width.std() == pytest.approx(0.3, rel=0.25)
 
 
-def test_beginnings_of_windows_show_the_fast_part() -> None:
-    rng = np.random.default_rng(13)
-    raw = on_baselines(2 * coloured(600, 1200, rng))
-    windows = prepare(raw, CONFIG, "measured").pulses
-    noise = BaselineNoise.from_windows(windows, 200)
-    # so short ones leave what is slow to a guess
-    assert noise.rms == pytest.approx(2 * TO_PREPARED, rel=0.1)
-    drawn = noise.draw(np.ones(400), 1200, rng) / TO_PREPARED
-    for lag in (1, 3, 8):
-        assert drift(drawn, lag) == pytest.approx(4 * (1 - 0.8**lag), rel=0.05)
-
-
 def test_traces_without_noise_are_refused() -> None:
     with pytest.raises(CpunetError, match="most baselines are constant"):
         BaselineNoise.of(Baselines.of([on_baselines(np.zeros((100, 1200)))], CONFIG))
@@ -236,9 +224,8 @@ def as_input(raw: Pulses) -> InputSet:
     return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, baselines=baselines)
 
 
-def test_noise_of_raw_traces_needs_no_word() -> None:
-    noise, note = measured_noise(as_input(white_traces()), FAST)
-    assert note is None
+def test_noise_of_raw_traces() -> None:
+    noise = noise_of(as_input(white_traces()))
     assert noise.rms == pytest.approx(WANTED, rel=0.03)
     assert noise.n_baselines > 250
 
@@ -253,25 +240,20 @@ def test_energies_that_are_not_known_do_not_matter() -> None:
     assert noise.n_baselines <= 200
 
 
-def test_prepared_windows_fall_back_on_their_beginnings() -> None:
-    windows = prepare(white_traces(), FAST, "measured").pulses
-    noise, note = measured_noise(as_input(windows), FAST)
-    assert note is not None
-    assert note.startswith(f"noise is taken from {FAST.baseline_samples // 2} samples a pulse")
-    assert "\n" not in note
+@pytest.mark.parametrize("start", [300, 240])
+def test_short_baselines_tell_the_noise(start: int) -> None:
+    noise = noise_of(as_input(white_traces(1200, start=start)))
+    assert noise.rms == pytest.approx(WANTED, rel=0.05)
+
+
+def test_prepared_windows_tell_the_noise() -> None:
+    noise = noise_of(as_input(prepare(white_traces(), FAST, "measured").pulses))
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
     drawn = noise.draw(np.full(300, 2000.0), 1400, np.random.default_rng(2))
     assert drawn.std() == pytest.approx(WANTED / 2000, rel=0.05)
 
 
-def test_traces_that_begin_late_fall_back_too() -> None:
-    noise, note = measured_noise(as_input(white_traces(1200, start=380)), FAST)
-    assert note is not None
-    assert "ns before the pulse; the noise needs 6400 or more" in note
-    assert noise.rms == pytest.approx(WANTED, rel=0.05)
-
-
 def test_without_energies_there_is_no_noise() -> None:
     raw = Pulses.of(white_traces(60).waveforms, dt_ns=DT_NS)
-    with pytest.raises(CpunetError, match="only 0 flat baselines among 60 traces"):
-        measured_noise(as_input(raw), FAST)
+    with pytest.raises(CpunetError, match="only 0 of 60 traces have a known energy"):
+        noise_of(as_input(raw))

@@ -38,7 +38,7 @@ from cpunet.calibration.nuisances import (
 )
 from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
 from cpunet.calibration.search import Search
-from cpunet.electronics.measured import drawn_like, measured_noise, tails_of
+from cpunet.electronics.measured import drawn_like, noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
@@ -306,9 +306,7 @@ class _Job:
         drawn = None
         if tails is not None and tails.law is not None:
             drawn = drawn_like(tails, self.data, preparation)
-        noise, note = measured_noise(self.data, preparation, tails)
-        if note is not None:
-            log.warning(note)
+        noise = noise_of(self.data, tails)
         physics = Physics(self.stored.detector, self.stored.settings, self.freedom.looked_at)
         require_depletion(physics, given)
         pulses, measured = self.sim.prepared.pulses, self.data.prepared.pulses

@@ -22,9 +22,9 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES, SIGMA_PER_MAD
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray
 
-MIN_NS = 6400.0  # of a baseline: a lowest frequency of 156 kHz
+MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
 FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and number of iterations
 # Baselines are clustered along directions in which their band powers spread this many times
@@ -113,15 +113,11 @@ class BaselineNoise:
         """
         if chosen is None:
             chosen = np.ones(len(baselines), bool)
-        values = _in_prepared_units(baselines, chosen)
-        return cls._of_baselines(values, int(chosen.sum()), baselines.first.dt_ns)
-
-    @classmethod
-    def _of_baselines(cls, baselines: Values, n: int, dt_ns: float) -> Self:
-        flat = baselines[_flat(baselines)] if len(baselines) else baselines
+        values, dt_ns = _in_prepared_units(baselines, chosen), baselines.first.dt_ns
+        flat = values[_flat(values)] if len(values) else values
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
-                f"only {len(flat)} flat baselines among {n} traces; give more traces "
+                f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more traces "
                 f"(at least {MIN_BASELINES} with known energy)"
             )
         if not np.ptp(flat, axis=1).any():
@@ -143,30 +139,6 @@ class BaselineNoise:
             shares=counts / counts.sum(),
             rms_error=_rms_error(flat, mean.rms),
         )
-
-    @classmethod
-    def from_windows(cls, windows: Pulses, samples: int) -> Self:
-        """Estimate the spectrum from the first samples of prepared windows.
-
-        For data that are available only as prepared windows. Such baselines are short. Noise
-        slower than their length is extrapolated from its drift over them.
-
-        Parameters
-        ----------
-        windows
-            Prepared measured pulses with their energies.
-        samples
-            Number of samples at the start of each window that precede any pulse.
-
-        Raises
-        ------
-        CpunetError
-            If too few windows have a known energy and a flat baseline.
-        """
-        known = np.isfinite(windows.energy_kev) & (windows.energy_kev > 0)
-        chosen = windows[known]
-        baselines = chosen.waveforms[:, :samples] * chosen.energy_kev[:, np.newaxis]
-        return cls._of_baselines(np.asarray(baselines, float), len(windows), windows.dt_ns)
 
     @property
     def rms(self) -> float:
@@ -324,7 +296,7 @@ def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> V
     rows = np.flatnonzero(known[baselines.prepared.index])
     if len(rows) < MIN_BASELINES:
         raise CpunetError(
-            f"only {len(rows)} of {chosen.sum()} traces have a known energy and can be "
+            f"only {len(rows)} of {len(baselines)} traces have a known energy and can be "
             f"prepared; give {MIN_BASELINES} or more to take the noise from"
         )
     before = baselines.before[rows]

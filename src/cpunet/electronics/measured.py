@@ -40,7 +40,7 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
     Raises
     ------
     CpunetError
-        If neither traces nor windows have enough flat baselines.
+        If there are too few flat baselines.
     """
     found, reason = tails_of(data)
     drawn: DrawnTails | None = None
@@ -58,10 +58,7 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
             f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are "
             "given them"
         )
-    noise, remark = measured_noise(data, config, found)
-    if remark is not None:
-        log.warning(remark)
-    return TraceNoise(noise, drawn), told
+    return TraceNoise(noise_of(data, found), drawn), told
 
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
@@ -98,38 +95,6 @@ def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) ->
         passed=passed,
         decay_error_us=tails.decay_error_us,
     )
-
-
-def measured_noise(
-    data: InputSet, config: PreparationConfig, tails: PileUpTails | None = None
-) -> tuple[BaselineNoise, str | None]:
-    """Measure the noise of the data, from prepared windows if baselines are too short.
-
-    Parameters
-    ----------
-    data
-        Measured pulses, with the baselines of their file.
-    config
-        Preparation of the pulses.
-    tails
-        Pile-up tails in the traces; baselines with tails are left out.
-
-    Returns
-    -------
-    tuple
-        Noise, and a remark on it or None.
-
-    Raises
-    ------
-    CpunetError
-        If neither traces nor windows have enough flat baselines.
-    """
-    try:
-        return noise_of(data, tails), None
-    except CpunetError as error:
-        half = config.at(data.dt_ns).baseline_samples // 2
-        noise = BaselineNoise.from_windows(data.prepared.pulses, half)
-        return noise, f"noise is taken from {half} samples a pulse: {error}"
 
 
 def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
