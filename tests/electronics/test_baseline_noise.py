@@ -109,7 +109,9 @@ def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
 def test_bad_input_is_named(noise) -> None:
     with pytest.raises(CpunetError, match="only 0 of 40 traces have a known energy"):
         BaselineNoise.of(Baselines.of([Pulses.of(traces(40).waveforms, dt_ns=DT_NS)], CONFIG))
-    with pytest.raises(CpunetError, match="only 0 of 300 traces have a known energy and can be"):
+    with pytest.raises(
+        CpunetError, match="only 0 of 300 traces have a known energy and can be"
+    ):
         BaselineNoise.of(Baselines.of([traces(start=130)], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))

@@ -82,7 +82,7 @@ def test_derivatives_are_those_of_differences(plain, at_ns):
         )
         for sign in (1, -1)
     ]
-    for here, up, down in zip(found[1:], ends[0][1:], ends[1][1:], strict=True):
+    for here, up, down in zip(found[2:], ends[0][2:], ends[1][2:], strict=True):
         wanted = (up.values - down.values) / (2 * step)
         off = np.linalg.norm(here.slopes[:, 0] - wanted) / np.linalg.norm(wanted)
         assert off < 0.1, here.name

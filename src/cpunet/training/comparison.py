@@ -13,10 +13,7 @@ draws of opposite sign leave of the simulated noise.  Compared are
   to 50 %.  Slices are ranks of each side, so they are equally full however far apart the sides
   are.  Means are those of bounded functions, :math:`w \tanh((A - m) / w)`, which rare pulses
   do not move;
-* the quantiles of the rise;
-* principal components in bins of the current amplitude, with their joint covariance.  The peak
-  of the single sites determines the amplitude, and what of it comes from the mixture of pulses
-  is told by the components.
+* the quantiles of both, which say what a rank means.
 """
 
 from __future__ import annotations
@@ -53,8 +50,6 @@ RANKS = {
 QUANTILES = np.r_[np.linspace(0.01, 0.95, 13), 0.97, 0.985, 0.995]
 BOOTSTRAPS = 400
 POOLED = 0.5  # of the shapes' covariance, taken from all slices
-COMPONENTS, BINS, NARROWEST, RIDGE = 24, 16, 0.006, 0.05
-OUTLIER = 8.0  # standard deviations of a component at which a pulse counts half
 # A measured pulse with another before it, or on its tail: height of its baseline, time from
 # which the tail counts, and its RMS in units of the median.
 QUIET, TAIL_NS, LATE_RMS = 0.05, 2400.0, 4.0
@@ -224,20 +219,13 @@ class Comparison:
     def __init__(self, sides: Sides, width: float) -> None:
         self.sides, self.width = sides, width
         self.data = sides.view(sides.data.pulses)
-        rise, rng, n = sides.data.rise, np.random.default_rng(0), len(sides.data)
-        drawn = np.quantile(rise[rng.integers(n, size=(BOOTSTRAPS, n))], QUANTILES, axis=1)
-        spread = np.cov(drawn) * (1 + n / len(sides))
-        self.quantiles, self.spread = np.quantile(rise, QUANTILES), spread + 1e-12 * np.eye(16)
-        self.mean = self.data.mean(axis=0)
-        variances, axes = np.linalg.eigh(np.cov((self.data - self.mean).T.astype(float)))
-        sizes = np.sqrt(np.maximum(variances[::-1][:COMPONENTS], 1e-14))
-        self.components = axes[:, ::-1][:, :COMPONENTS] / sizes
-        amplitudes = np.quantile(sides.data.log_amplitude, np.linspace(0.03, 0.995, BINS))
-        centres = [amplitudes[-1]]
-        for amplitude in amplitudes[-2::-1]:
-            if centres[-1] - amplitude >= NARROWEST:
-                centres.append(amplitude)
-        self.centres = np.array(centres[::-1])
+        rng, n = np.random.default_rng(0), len(sides.data)
+        rows = rng.integers(n, size=(BOOTSTRAPS, n))
+        self.spreads = {}
+        for by in RANKS:
+            drawn = np.quantile(getattr(sides.data, by)[rows], QUANTILES, axis=1)
+            spread = np.cov(drawn) * (1 + n / len(sides))
+            self.spreads[by] = spread + 1e-12 * np.eye(len(QUANTILES))
 
     def differences(self, transfer: Spectrum, basis: Basis | None = None) -> list[Difference]:
         """Compare the pulses translated by a response, with derivatives in a basis if given."""
@@ -250,8 +238,7 @@ class Comparison:
         views = [sides.view(one.pulses) for one in noisy]
         clean_view = sides.view(read(clean, sides.frame).pulses)
         return [
-            self._rises(noisy, moves),
-            self._joint(noisy, views, moves),
+            *(self._quantiles(by, noisy, moves) for by in RANKS),
             *self._slices(AMPLITUDE, noisy, views, clean_view, moves),
             *self._slices(RISE, noisy, views, clean_view, moves),
         ]
@@ -278,51 +265,17 @@ class Comparison:
         aligned = np.abs(self.sides.time_ns) <= self.sides.frame.dt_ns
         return np.where(aligned, 0.0, z)
 
-    def _rises(self, noisy: list[Aligned], moves: Derivatives | None) -> Difference:
-        """Quantiles of the rise."""
-        found = np.quantile(np.concatenate([one.rise for one in noisy]), QUANTILES)
-        slopes = None
-        if moves is not None:
-            near, _ = hats(noisy[0].rise, found)
-            slopes = near.T @ moves.rise / np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
-        return Difference("rise quantiles", found - self.quantiles, self.spread, slopes)
-
-    def _joint(
-        self, noisy: list[Aligned], views: list[Floats], moves: Derivatives | None
+    def _quantiles(
+        self, by: str, noisy: list[Aligned], moves: Derivatives | None
     ) -> Difference:
-        """Components in bins of the current amplitude."""
-        sides = self.sides
-        _, _, _, data = self._functions(self.data, sides.data.log_amplitude)
-        found = [
-            self._functions(view, one.log_amplitude)
-            for view, one in zip(views, noisy, strict=True)
-        ]
-        bins, turned, components, sim = found[0]
-        covariance = 0.5 * (np.cov(data.T) + np.cov(sim.T)) * (1 / len(data) + 1 / len(sim))
-        covariance += np.diag(RIDGE * covariance.diagonal() / (1 - RIDGE) + 1e-18)
-        covariance *= 1 - RIDGE
-        values = np.mean([own.mean(axis=0) for _, _, _, own in found], axis=0)
-        values -= data.mean(axis=0)
-        if moves is None:
-            return Difference("components", values, covariance)
-        n, amplitude = len(sim), moves.log_amplitude
-        slopes = [turned.T @ amplitude / n]
-        for k in range(bins.shape[1]):
-            rows = np.flatnonzero(bins[:, k])
-            moved = self.components.T @ moves.mean(rows, bins[rows, k, np.newaxis] / n)
-            with_bin = components[rows] * (turned[rows, k] / n)[:, np.newaxis]
-            slopes.append(moved + with_bin.T @ amplitude[rows])
-        return Difference("components", values, covariance, np.concatenate(slopes))
-
-    def _functions(self, view: Floats, amplitude: Values) -> tuple[Values, ...]:
-        """Bins, their derivatives, components, and all functions, by pulse."""
-        components = np.asarray((view - self.mean) @ self.components)
-        far = np.abs(components).max(axis=1) / OUTLIER
-        counts = (1 / (1 + far**6))[:, np.newaxis]
-        bins, turned = (counts * of for of in hats(amplitude, self.centres))
-        products = bins[:, :, np.newaxis] * components[:, np.newaxis]
-        together = np.concatenate([bins, products.reshape(len(bins), -1)], axis=1)
-        return bins, turned, components, together
+        """Quantiles of a quantity."""
+        found = np.quantile(np.concatenate([getattr(one, by) for one in noisy]), QUANTILES)
+        apart, slopes = found - np.quantile(getattr(self.sides.data, by), QUANTILES), None
+        if moves is not None:
+            near, _ = hats(getattr(noisy[0], by), found)
+            counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
+            slopes = near.T @ getattr(moves, by) / counts
+        return Difference(f"{by} quantiles", apart, self.spreads[by], slopes)
 
     def _slices(
         self,

@@ -15,11 +15,11 @@ import numpy as np
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import InfoPart
 from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
-from cpunet.training.comparison import Comparison, Sides, response_transfer
+from cpunet.training.comparison import AMPLITUDE, Comparison, Sides, response_transfer
 
-# Limits: chi-square per function of the median slice, and of the components; standard errors of
-# the mean pulse; AUC, which must also be so many deviations from its null.
-MAX_CHI_SQUARE, MAX_AMPLITUDE, MAX_Z, MAX_AUC, SURE = 1.3, 1.6, 5.0, 0.6, 3.0
+# Limits: chi-square per sample of the median slice, and per quantile of the amplitude; standard
+# errors of the mean pulse; AUC, which must also be so many deviations from its null.
+MAX_CHI_SQUARE, MAX_AMPLITUDE, MAX_Z, MAX_AUC, SURE = 1.3, 2.5, 5.0, 0.6, 3.0
 CLEAR = 1 / 3  # of the way from what is expected to the limit of chi-square
 WIDTH = 3.0  # of the bounded functions in robust standard deviations
 LARGEST = 100.0  # standard errors that are stated
@@ -45,7 +45,7 @@ PARTS = {
         "tells of pile-up tails",
     ),
 }
-AMPLITUDE = (
+OTHER_MIXTURE = (
     "the distribution of the current amplitude differs: other energies or another mixture of "
     "events than simulated; try: cpunet check compares both sides"
 )
@@ -57,7 +57,7 @@ class Verdict(InfoPart):
     Parameters
     ----------
     chi_square, amplitude
-        Per function: of the median slice, and of components in bins of the amplitude.
+        Per sample of the median slice, and per quantile of the current amplitude.
     z, z_ns
         Largest deviation of the mean pulse in its standard errors, and its time from the half
         height in ns.
@@ -96,8 +96,9 @@ class Verdict(InfoPart):
     @property
     def clear(self) -> bool:
         """Whether nothing asks for more than is there."""
-        apart = max(self.chi_square, self.amplitude) - 1 < CLEAR * (MAX_CHI_SQUARE - 1)
-        return self.good and apart and abs(self.z) < (1 - CLEAR) * MAX_Z
+        near = self.chi_square - 1 < CLEAR * (MAX_CHI_SQUARE - 1)
+        near &= self.amplitude - 1 < CLEAR * (MAX_AMPLITUDE - 1)
+        return self.good and near and abs(self.z) < (1 - CLEAR) * MAX_Z
 
     @property
     def causes(self) -> list[str]:
@@ -107,7 +108,7 @@ class Verdict(InfoPart):
             size = _size(self.off[part])
             told.append(f"the {part} is off by {size}: {PARTS[part][1]}")
         if self.amplitude > MAX_AMPLITUDE:
-            told.append(AMPLITUDE)
+            told.append(OTHER_MIXTURE)
         if not told and not self.good:
             told.append("pulses differ from each other otherwise than simulated")
         return told
@@ -181,7 +182,7 @@ def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
         auc = {"auc": told.auc, "auc_null": told.null_mean, "auc_error": told.null_std}
     return Verdict(
         chi_square=float(np.median([d.chi_square for d in differences if d.sliced])),
-        amplitude=next(d.chi_square for d in differences if d.name == "components"),
+        amplitude=next(d.chi_square for d in differences if d.name == f"{AMPLITUDE} quantiles"),
         z=float(z[worst]),
         z_ns=float(time[worst]),
         beyond_ns=[float(beyond[0]), float(beyond[-1])] if len(beyond) else [],
