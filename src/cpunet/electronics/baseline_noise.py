@@ -117,8 +117,8 @@ class BaselineNoise:
         flat = values[_flat(values)] if len(values) else values
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
-                f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more traces "
-                f"(at least {MIN_BASELINES} with known energy)"
+                f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more "
+                f"traces (at least {MIN_BASELINES} with known energy)"
             )
         if not np.ptp(flat, axis=1).any():
             raise CpunetError(

@@ -145,18 +145,17 @@ class Derivatives:
         rows
             Pulses.
         weights
-            Weights of these, shape (pulses, 1) or (pulses, stretches).
+            Weights of these, shape (pulses, stretches).
         """
         weights = np.asarray(weights, SINGLE)
         widths, basis = self.sides.widths[:, np.newaxis], self.basis
-        currents = weights.T @ self.currents[rows]  # (1 or stretches, times)
+        currents = weights.T @ self.currents[rows]  # (stretches, times)
         sums = np.zeros((len(currents), currents.shape[1] + 1))
         np.cumsum(currents, axis=1, out=sums[:, 1:])
         lags = np.arange(basis.first, basis.last + 1)
         low = self.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
-        both = np.broadcast_to(sums, (len(low), sums.shape[1]))
-        high = np.take_along_axis(both, low + widths, axis=1)
-        found = ((high - np.take_along_axis(both, low, axis=1)) / widths) @ basis.changes
+        high = np.take_along_axis(sums, low + widths, axis=1)
+        found = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ basis.changes
         found -= weights.T @ self.base[rows]
         found += (weights * self.slopes[rows]).T @ self.time[rows]
         found -= (weights * self.values[rows]).T @ self.span[rows]
