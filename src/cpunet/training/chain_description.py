@@ -31,6 +31,9 @@ from cpunet.training.closed_forms import (
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run import FitInfo, Run
 
+# The division of a chain into parts is degenerate, and times of slow parts and decays are
+# fixed: a true part between two of them is split, which the errors do not contain.
+PARTS = re.compile(r"slow_|decay_|fast_decay_")
 # The parts of a chain that deviates are not what its step response consists of.
 HIDDEN = ("slow_", "pole_", "decay_", "fast_decay_", "ringing")
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
@@ -88,8 +91,8 @@ def describe_chain(run: Run) -> DescribedChain:
 
     def derived(moved: ElectronicsResponse) -> Numbers:
         numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
-        if moved.config.deviations:  # which does not part into a rise and decays
-            return {n: value for n, value in numbers.items() if not n.startswith("droop_")}
+        if moved.config.deviations:
+            return numbers
         slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
         return slow_numbers(slow) | numbers
 
@@ -104,7 +107,8 @@ def describe_chain(run: Run) -> DescribedChain:
     if fit.causes:
         told = "these numbers stand in for what is wrong with the simulation, too"
         doubts.insert(0, f"the fit is {fit.verdict}; {told}: {fit.causes[0]}")
-    of_values = {n: e for n, e in errors.items() if n in values} | _noise_error(run, chain)
+    of_values = {n: e for n, e in errors.items() if n in values and not PARTS.match(n)}
+    of_values |= _noise_error(run, chain)
     return DescribedChain(run, chain, values, of_values, parameters, errors, doubts)
 
 

@@ -57,14 +57,10 @@ ROWS = {
     r"fast_decay_(\d)_share": (r"share of fast decay \1", "%"),
     r"effective_decay_us": ("effective decay, tail", "µs"),
     r"decay_(.*)_us": (r"share decaying with \1 µs", "%"),
-    r"droop_(.*)_us": (r"decayed at \1 µs", "%"),
     r"noise_rms_kev": ("noise RMS", "keV"),
     r"noise_corner_mhz": ("noise corner", "MHz"),
     r"chi_square_per_moment": ("chi-square per moment", ""),
 }
-# The division of a chain into parts is degenerate, and times of slow parts and decays are
-# fixed: a true part between two of them is split, which the errors do not contain.
-PARTS = re.compile(r"slow_|missing_|overshoot|decay_|fast_decay_|droop_")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,12 +95,12 @@ class Response:
 
     @cached_property
     def sigma(self) -> Numbers:
-        """The same in units of the error; of `PARTS` and what has no error there is none."""
+        """The same in units of the error; of what has no error there is none."""
         errors = self.runs[0].errors
         return {
             name: apart / errors[name]
             for name, apart in self.difference.items()
-            if errors.get(name) and not PARTS.match(name)
+            if errors.get(name)
         }
 
     @property
