@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags, padding
+from cpunet.networks.response_layer import (
+    ElectronicsResponse,
+    deviation_lags,
+    late_lags,
+    padding,
+)
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
 from cpunet.training.comparison import Comparison, Sides, hats, response_transfer
 from cpunet.training.derivatives import Basis
@@ -17,6 +22,7 @@ from cpunet.training.deviations import with_deviations
 from cpunet.training.fitter import Fitter
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
+from cpunet.training.response_starts import with_settings
 from cpunet.training.verdict import PARTS, Verdict, verdict
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, Unpaired, charge, faster, measured_with, simulated
@@ -170,9 +176,10 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
     apart = moved - plain
     np.testing.assert_allclose(apart[: last + 1], deviation[-lags[0] :], atol=1e-12)
     np.testing.assert_allclose(apart[lags[0] :], deviation[: -lags[0]], atol=1e-12)
-    later = slice(last, 4000)
+    early, late = late_lags(DT_NS)
+    rate = np.log(moved[late] / moved[early]) / (late - early)
     np.testing.assert_allclose(
-        apart[later] / apart[last], plain[later] / plain[last], atol=1e-9
+        moved[last:4000], moved[last] * np.exp(rate * np.arange(4000 - last)), atol=1e-9
     )
     # records are those of its closed form, sampled as means over the period
     step = (torch.arange(1600) >= 400).float()[None]
@@ -203,3 +210,10 @@ def test_a_deviation_is_the_same_at_other_sampling_periods():
     time_ns = (np.arange(5, 200) + 0.5) * DT_NS  # samples are means over their period
     coarse, same = steps[0][5:200], np.interp(time_ns, np.arange(40_960) + 0.5, steps[1])
     np.testing.assert_allclose(coarse[15:], same[15:], atol=2e-4)
+
+
+def test_a_known_response_starts_without_its_deviations():
+    own = deviating(true_response(), 0.01 * np.ones(len(deviation_lags(DT_NS))))
+    plain = with_settings(own, deviations=False)
+    wanted = response_transfer(true_response(), 4096)
+    np.testing.assert_array_equal(response_transfer(plain, 4096), wanted)

@@ -134,8 +134,15 @@ def at_times(windows: Tensor, times: Tensor) -> Tensor:
 MIN_FACTOR = 1.6
 STEP_NS = 12_800.0  # of the response to a step whose half rise is the delay
 DEVIATION_NS = -100.0, 8400.0  # in which a step response deviates from its chain
+LATE_NS, MIN_LEFT = (4000.0, 6400.0), 0.01  # whose decay goes on later, and least part left
 DRAWS = 64  # of deviations within their errors
 IMAGES = 3  # images of the spectrum on either side
+
+
+def late_lags(dt_ns: float) -> tuple[int, int]:
+    """Samples from a step between which its decay is that of later, too."""
+    early, late = (round(ns / dt_ns) for ns in LATE_NS)
+    return early, late
 
 
 def deviation_lags(dt_ns: float) -> npt.NDArray[np.intp]:
@@ -157,7 +164,7 @@ class ElectronicsResponse(nn.Module):
     the current of a pulse is multiplied by :math:`H` and by the spectrum of :math:`d`.  Times
     are kept as logarithms, so that they stay positive and steps are relative.  What no such
     chain does is a deviation of the step response at each lag, see
-    `cpunet.training.deviations`; later, it decays with the chain.
+    `cpunet.training.deviations`; later, the step decays as from 4 to 6.4 µs.
 
     Parameters
     ----------
@@ -290,8 +297,13 @@ class ElectronicsResponse(nn.Module):
         step = torch.zeros(padded, dtype=torch.float64, device=dt_ns.device)
         values = torch.from_numpy(deviation).to(step)
         step[first:], step[: last + 1] = values[:-first], values[-first:]
-        if (at_last := torch.fft.irfft(whole, padded)[last : max(last + 1, kept)]).numel() > 1:
-            step[last:kept] = values[-1] * at_last / at_last[0]
+        if kept > last + 1:  # the whole goes on as it does before the end of the windows
+            base = torch.fft.irfft(whole.detach(), padded)
+            (early, late), there = late_lags(float(dt_ns)), base[: last + 1] + values[-first:]
+            left = float(there[late] / there[early])
+            rate = math.log(max(left, MIN_LEFT)) / (late - early)
+            after = torch.arange(kept - last).to(step)
+            step[last:kept] = there[last] * torch.exp(rate * after) - base[last:kept]
         step[kept : padded + first] = 0
         with_deviation: Tensor = whole + torch.fft.rfft(step, padded)
         return with_deviation

@@ -23,7 +23,12 @@ from cpunet.electronics.chain import Decay, Electronics
 from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
 from cpunet.electronics.readout import noise_power
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
+from cpunet.networks.response_layer import (
+    LATE_NS,
+    MIN_LEFT,
+    ElectronicsResponse,
+    deviation_lags,
+)
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.training.response_problem import SmoothParameters
 
@@ -47,7 +52,9 @@ class StepResponse(Protocol):
 
 
 class WithDeviation:
-    """A closed form plus a deviation of its step response, which decays with the chain later.
+    """A closed form plus a deviation of its step response.
+
+    Later, the whole decays as at the end of the windows, see `ElectronicsResponse`.
 
     Parameters
     ----------
@@ -62,21 +69,22 @@ class WithDeviation:
     ) -> None:
         self.chain, self.first, self.last = chain, time_ns[0], time_ns[-1]
         self.deviation = CubicSpline(time_ns, deviation)
-        self.late = deviation[-1] / chain.step(self.last)
+        early, late = self._inside(np.array(LATE_NS))
+        self.rate = np.log(max(late / early, MIN_LEFT)) / (LATE_NS[1] - LATE_NS[0])
+
+    def _inside(self, time_ns: FloatArray) -> FloatArray:
+        deviation = np.where(time_ns < self.first, 0.0, self.deviation(time_ns))
+        return np.asarray(self.chain.step(time_ns) + deviation)
 
     def step(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Its response to a step."""
-        time, chain = np.asarray(t_ns, float), self.chain.step(t_ns)
-        deviation = self.deviation(np.clip(time, self.first, self.last))
-        deviation = np.where(time < self.first, 0.0, deviation)
-        return np.asarray(chain + np.where(time > self.last, self.late * chain, deviation))
+        time = np.asarray(t_ns, float)
+        after = np.maximum(time - self.last, 0.0)
+        return np.asarray(self._inside(time - after) * np.exp(self.rate * after))
 
     def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Its derivative."""
         return _derivative(self, t_ns)
-
-
-LATE_NS = 4000.0, 6000.0  # of a step response, within the windows that are compared
 
 
 class PoleZeroed:
@@ -164,7 +172,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     }
     for time in (500, 1000):
         numbers[f"missing_{time}_ns"] = float(1 - flat.step(time))
-    inside = _TIMES_NS[_TIMES_NS < LATE_NS[0]]
+    inside = _TIMES_NS[LATE_NS[0] > _TIMES_NS]
     numbers["overshoot"] = max(0.0, float(flat.step(inside).max()) - 1)
     tail_ns = np.arange(end_ns - preparation.decay_fit_ns, end_ns, dt_ns)
     slope = np.polyfit(tail_ns, np.log(np.maximum(chain.whole.step(tail_ns), 1e-3)), 1)[0]

@@ -255,10 +255,9 @@ def match(
     """
     recipe, (sim, data) = job.recipe, (job.sim.prepared, job.data.prepared)
     noise, tails = trace_noise(job.data, recipe.preparation)
-    if isinstance(known, ElectronicsResponse):
-        allowed = recipe.matching.training.drift_terms
-        if known.config.drift_terms > allowed:
-            known = with_settings(known, drift_terms=allowed)
+    if known is not None:  # its deviations are those of another readout
+        terms = min(known.config.drift_terms, recipe.matching.training.drift_terms)
+        known = with_settings(known, drift_terms=terms, deviations=False)
         recipe = recipe.model_copy(update={"generator": known.config})
     rng, drawn = np.random.default_rng(job.seed), noise.tails
     sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)

@@ -1,8 +1,8 @@
-"""Starting points of the fit of a response, and extensions if the fit is poor.
+"""Starting points of the fit of a chain, and what may be added to it.
 
 A fit only finds the minimum of the valley that it starts in.  There are therefore several
-starts and, if the fit is poor, a stretch of the simulated drift, a fast decay with a free time
-and a ringing.  Each is kept only if held-out pulses gain, see `cpunet.training.fitter`.
+starts.  A stretch of the simulated drift and, in a calibration, a fast decay with a free time
+and a ringing are kept only if held-out pulses gain, see `cpunet.training.fitter`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RINGS, PROMISES = 0.7, 0.9
 # third is that of another detector.
 ADDS, SURE, MAX_STRETCH = 16.0, 3.0, 1 / 3
 # Parts that are tried, as the user reads them.
-DECAY, RINGING = "a decay of free time", "a ringing"
+RINGING = "a ringing"
 DRIFT = {1: "a stretch of the drift", 2: "its change with time"}  # by number of terms
 # Starting times of a free fast decay in us, and its shares.
 FAST_DECAYS_US, SHARES = (1.5, 3.0, 6.0), (-0.05, -0.02, 0.02, 0.05, 0.1)
@@ -125,12 +125,6 @@ def drift_if_needed(found: Fitted, fitter: Fitter) -> Fitted:
     simulated = problem.of(with_settings(problem.response, drift_terms=0))
     again = fitter.fit(simulated, coarse=False)
     return again if again.cost < found.cost + ADDS else found
-
-
-def free_decay_if_better(found: Fitted, fitter: Fitter) -> Fitted:
-    """Free the time of a fast decay if that gains."""
-    again = with_free_decay(found.problem, fitter)
-    return again if again is not None and gains(DECAY, found, again, fitter) else found
 
 
 def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
@@ -245,7 +239,7 @@ def most_promising_ringing(
 
 
 def with_settings(response: ElectronicsResponse, **settings: Any) -> ElectronicsResponse:
-    """A copy of a response with a ringing or terms of the drift, which have no effect yet."""
+    """A copy of a response with other parts, which have no effect yet."""
     config = response.config.model_copy(update=settings)
     copied = ElectronicsResponse(config, float(response.dt_ns))
     known = response.state_dict()
