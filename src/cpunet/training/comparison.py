@@ -257,7 +257,7 @@ class Comparison:
         clean_view = self.sides.view(read(clean, self.sides.frame).pulses)[kept]
         n, ones = len(self.data), np.ones((len(views), int(kept.sum())))
         data, simulated, pulses, _ = self._bounded(
-            np.ones(n), views, clean_view, np.arange(len(clean_view))
+            np.ones(n), views, clean_view, np.arange(len(clean_view)), _rms(views, clean_view)
         )
         shapes, noise, n_sim, left = _covariances(simulated, pulses, ones)
         variance = shapes.diagonal() * (1 / n_sim + 1 / n) + noise.diagonal() * (1 / n + left)
@@ -296,10 +296,11 @@ class Comparison:
             counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
             moved = getattr(moves, by) - near @ (near.T @ getattr(moves, by) / counts)
         found: list[Any] = []
+        rms = _rms(views, clean)
         for k in range(len(centres)):
             own_data, own = of_data[:, k], np.array([of[:, k] for of in weights])
             rows = np.flatnonzero(own.any(axis=0))
-            bounded = self._bounded(own_data, views, clean, rows)
+            bounded = self._bounded(own_data, views, clean, rows, rms)
             data, clean_own, noisy_own, slopes = bounded
             w = own[:, rows]
             parts = _covariances(clean_own, noisy_own, w)
@@ -325,15 +326,18 @@ class Comparison:
         return differences
 
     def _bounded(
-        self, own_data: Values, views: list[Floats], clean: Floats, rows: npt.NDArray[np.intp]
+        self,
+        own_data: Values,
+        views: list[Floats],
+        clean: Floats,
+        rows: npt.NDArray[np.intp],
+        rms: Values,
     ) -> tuple[Values, Values, Values, Values]:
         """Bounded functions of data, simulation without and with noise, and derivatives."""
         data = self.data[own_data > 0].astype(float)
         core = data[own_data[own_data > 0] > 0.3 * own_data.max()]
         middle = np.median(core, axis=0)
-        scale = self.width * np.maximum(
-            1.4826 * np.median(np.abs(core - middle), axis=0), self._noise_rms(views, clean)
-        )
+        scale = self.width * np.maximum(1.4826 * np.median(np.abs(core - middle), axis=0), rms)
 
         def bounded(values: Floats) -> Values:
             return np.asarray(scale * np.tanh((values - middle) / scale))
@@ -342,8 +346,10 @@ class Comparison:
         slopes = 1 - (noisy[0] / scale) ** 2
         return bounded(data), bounded(clean[rows].astype(float)), noisy, slopes
 
-    def _noise_rms(self, views: list[Floats], clean: Floats) -> Values:
-        return np.asarray(np.sqrt(np.mean((views[0] - clean) ** 2, axis=0, dtype=float)))
+
+def _rms(views: list[Floats], clean: Floats) -> Values:
+    """RMS of the noise in each stretch."""
+    return np.asarray(np.sqrt(np.mean((views[0] - clean) ** 2, axis=0, dtype=float)))
 
 
 def _covariances(

@@ -225,7 +225,7 @@ class Knots:
 
 
 class Deviated(NamedTuple):
-    """A response with its deviations, what they gain, and the last comparisons.
+    """A response with its deviations, and what they gain.
 
     Parameters
     ----------
@@ -233,13 +233,10 @@ class Deviated(NamedTuple):
         The chain with deviations; the chain itself if they gain nothing.
     evidence
         Logarithm of the evidence of deviations, where they were first tried.
-    prior
-        Their prior.
     """
 
     response: ElectronicsResponse
     evidence: float
-    prior: Prior | None = None
 
 
 def with_deviations(
@@ -307,7 +304,7 @@ def with_deviations(
     if not cost < alone:
         return Deviated(response, first)
     own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))
-    return Deviated(own, first, prior)
+    return Deviated(own, first)
 
 
 def _draws(information: Values, covariance: Values) -> Values:

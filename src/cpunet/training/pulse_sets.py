@@ -244,7 +244,7 @@ class PulseSets:
             if np.ptp(weights) > 0:
                 some = self.rng.choice(some, len(some), p=weights / weights.sum())
             sim = self.sim[band.sim[some]]
-            data = self.data.waveforms[np.sort(band.data[of_data])]
+            data = self.data.waveforms[band.data[of_data]]  # in random order, as the simulated
             data = data[np.isfinite(data).all(axis=1)]
             length = record_length(sim.waveforms.shape[1], sim.dt_ns)
             drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)

@@ -67,8 +67,9 @@ class Verdict(InfoPart):
         Of the classifier, the same of shuffled labels, and the standard deviation of that.
     off
         Largest deviation of the mean pulse by part, of those beyond the limit.
-    pulses
-        Simulated and measured pulses compared.
+    pulses, left_out
+        Simulated and measured pulses compared, and measured ones that are not, since another
+        pulse is before them or on their tail.
     """
 
     chi_square: float
@@ -81,6 +82,7 @@ class Verdict(InfoPart):
     auc_error: float = 0.0
     off: dict[str, float]
     pulses: list[int]
+    left_out: int = 0
 
     @property
     def distinguished(self) -> bool:
@@ -154,6 +156,7 @@ def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
             "auc_error": apart.auc_error,
             "off": off,
             "pulses": np.sum([one.pulses for one in found], axis=0).tolist(),
+            "left_out": sum(one.left_out for one in found),
         }
     )
 
@@ -188,5 +191,6 @@ def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
         beyond_ns=[float(beyond[0]), float(beyond[-1])] if len(beyond) else [],
         off=off,
         pulses=[len(sides), len(sides.data)],
+        left_out=sides.left_out,
         **auc,
     )
