@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numba
 import numpy as np
 import torch
 
@@ -59,9 +60,10 @@ def judged(stand: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def shift(response: ElectronicsResponse, windows: np.ndarray, wanted: np.ndarray) -> float:
     """Median relative error of the translated current amplitude in percent."""
-    with torch.no_grad():
-        records = response(torch.from_numpy(windows)).numpy()
-    return off(finish(records, RECIPE.preparation, dt_ns=float(response.dt_ns)).windows, wanted)
+    return off(
+        finish(response(windows), RECIPE.preparation, dt_ns=float(response.dt_ns)).windows,
+        wanted,
+    )
 
 
 def off(translated: np.ndarray, wanted: np.ndarray) -> float:
@@ -78,8 +80,7 @@ def experiment(
     kev = sim.energy_kev[half:]
 
     def records(pulses: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return response(torch.from_numpy(pulses)).numpy()
+        return response(pulses)
 
     measured = finish(
         records(sim.waveforms[half:]),
@@ -105,13 +106,10 @@ def band_of(sim: Pulses, data: Pulses, noise, rng) -> Band:
 def readings(band: Band, response: ElectronicsResponse) -> torch.Tensor:
     """Readings of each pulse, as input of a network."""
     seen: list[Readings] = []
-    with torch.no_grad():
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # keeps the order of the pulses
-        band.sim.sums(
-            response, lambda r: (seen.append(r), (np.zeros(1),))[1], cut=False, draws=1
-        )
-        torch.set_num_threads(threads)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)  # keeps the order of the pulses
+    band.sim.sums(response, lambda r: (seen.append(r), (np.zeros(1),))[1], cut=False, draws=1)
+    numba.set_num_threads(threads)
     linear = np.clip(np.concatenate([r.linear for r in seen]), -4, 4)
     logs = np.concatenate([r.log_amplitude for r in seen])
     middle, top = np.median(logs), np.quantile(logs, 0.9)
@@ -197,14 +195,14 @@ def main() -> None:
         sim, data, wanted = experiment(arguments.chain, sim, windows, noise)
     sets = PulseSets(sim[:2000], data[:2000], noise, RECIPE, np.random.default_rng(0))
     start, _ = response_fit.fit_response(sets, Fitter(RECIPE.matching.training))
-    state = {name: value.clone() for name, value in start.state_dict().items()}
+    state = {name: value.copy() for name, value in start.arrays().items()}
     shifts: dict[str, list[float]] = {"moments": [], "weighted": []}
     n = arguments.pulses
     for k in range(min(arguments.sets, len(sim) // n, len(data) // n)):
         rows = slice(k * n, (k + 1) * n)
         # with a ringing, if one was found
         response = ElectronicsResponse(start.config, sim.dt_ns)
-        response.load_state_dict(state)
+        response.fill(state)
         band = band_of(sim[rows], data[rows], noise, np.random.default_rng(k))
         problem = ResponseProblem(response, [band])
         levenberg_marquardt(problem, 20, None, coarse=False)

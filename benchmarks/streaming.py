@@ -17,10 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.kernels import use_threads
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.writing import PulseWriter
@@ -58,7 +57,7 @@ def write_fast_run(folder: Path) -> None:
     chain = ResponseGenerator(recipe.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.full(4097, 4.0), 8192, DT_NS, 100))
     facts = {"dt_ns": DT_NS, "peak": "FEP", "seconds": 0, "seed": 0, "device": "cpu"}
-    Run.of(nn.ModuleDict({"ren": chain}), recipe, **facts).save(folder)
+    Run.of({"ren": chain}, recipe, **facts).save(folder)
 
 
 @contextmanager
@@ -106,7 +105,7 @@ def main() -> None:
     arguments.add_argument("--adc", action="store_true", help="raw traces of 1,400 samples")
     arguments.add_argument("--picture", type=Path)
     given = arguments.parse_args()
-    torch.set_num_threads(1)
+    use_threads(1)
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as name:
         folder = Path(name)
         write_fast_run(folder / "run")

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.kernels import use_threads
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes import load_recipe
@@ -49,14 +49,14 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--pulses", type=int, default=32, help="of a batch of the large U-Net")
     given = parser.parse_args()
-    torch.set_num_threads(given.threads)
+    use_threads(given.threads)
     fast = load_recipe("fast").at(16)
-    chain = ResponseGenerator(fast.matching.generator, DT_NS).to(given.device)
+    chain = ResponseGenerator(fast.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.ones(4097), 8192, DT_NS, 100))
     response = ResponseBackend(chain, fast.preparation)
     pulses, energies = windows(8192), np.full(8192, FEP_KEV)
     blocks = [slice(first, first + 512) for first in range(0, len(pulses), 512)]
-    generator = torch.Generator().manual_seed(0)
+    generator = np.random.default_rng(0)
 
     def with_noise(noise: bool) -> None:
         for rows in blocks:
@@ -66,16 +66,14 @@ def main() -> None:
     def unet(width: int, n: int) -> float:
         recipe = load_recipe("paper", [f"generator.width={width}"]).at(16)
         network = PositionalUNet(recipe.cyclegan.generator, 800).to(given.device)
-        drawn = Drawn(generator=torch.Generator(given.device))
-        return rate(partial(NetworkBackend(network, fast.preparation), pulses[:n], drawn), n)
+        return rate(partial(NetworkBackend(network, fast.preparation), pulses[:n], Drawn()), n)
 
-    with torch.inference_mode():
-        rates = {
-            "readout chain, with noise": rate(lambda: with_noise(True), len(pulses)),
-            "readout chain, without": rate(lambda: with_noise(False), len(pulses)),
-            "U-Net of width 8": unet(8, 512),
-            "U-Net of recipe paper": unet(40, given.pulses),
-        }
+    rates = {
+        "readout chain, with noise": rate(lambda: with_noise(True), len(pulses)),
+        "readout chain, without": rate(lambda: with_noise(False), len(pulses)),
+        "U-Net of width 8": unet(8, 512),
+        "U-Net of recipe paper": unet(40, given.pulses),
+    }
     print(f"{given.device}, {given.threads} thread(s)")
     print(f"{'method':<34}{'pulses/s':>10}{'ratio':>8}")
     for name, value in rates.items():

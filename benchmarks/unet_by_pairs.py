@@ -74,7 +74,7 @@ def taught(
     refresh_batch_statistics(model.ren, sampler, config.statistics_batches)
     del model.discriminator_data, model.discriminator_sim  # a training begins with new ones
     run = Run.of(
-        model.eval(),
+        dict(model.eval().named_children()),
         recipe,
         peak=PEAK,
         seed=0,

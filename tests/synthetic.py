@@ -10,7 +10,7 @@ import io
 import resource
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import scipy.signal
-import torch
 from lgdo import ArrayOfEqualSizedArrays, WaveformTable
 from matplotlib.figure import Figure
 
@@ -31,6 +30,7 @@ from cpunet.electronics.finishing import finish, padding
 from cpunet.electronics.tails_law import TailsLaw, energies_at
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
+from cpunet.networks.stored import Stored
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
@@ -275,6 +275,8 @@ def require_drawn(figure: Figure) -> None:
 @pytest.fixture
 def same_random_numbers() -> Iterator[None]:
     """Torch draws the same in each test, whatever ran before."""
+    import torch
+
     with torch.random.fork_rng():
         torch.manual_seed(0)
         yield
@@ -286,11 +288,11 @@ def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) 
 
 
 def write_run(
-    folder: Path, model: torch.nn.Module, recipe: Recipe, info: dict[str, Any]
+    folder: Path, parts: Mapping[str, Any], recipe: Recipe, info: dict[str, Any]
 ) -> None:
     """Write a run of networks as they are; `info` may be the content of a ``run.json``."""
     facts = {key: value for key, value in info.items() if key not in ("recipe", "format")}
-    Run.of(model, recipe, **facts).write(folder)
+    Run.of(parts, recipe, **facts).write(folder)
 
 
 def write_chain(
@@ -298,7 +300,7 @@ def write_chain(
     *settings: str,
     noise_kev: float = 0.0,
     change: Callable[[ResponseGenerator], object] = lambda _chain: None,
-    inverse: Callable[[ResponseGenerator], torch.nn.Module] | None = None,
+    inverse: Callable[[ResponseGenerator], Stored] | None = None,
     **facts: Any,
 ) -> Path:
     """Write a run of a readout chain that was not fitted, with white noise, as changed."""
@@ -308,11 +310,10 @@ def write_chain(
     if noise_kev:
         density = np.full(NOISE_BINS, noise_kev**2)
         chain.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
-    with torch.no_grad():
-        change(chain)
+    change(chain)
     networks = {"ren": chain} | ({} if inverse is None else {"iren": inverse(chain)})
     folder.mkdir(exist_ok=True)
-    write_run(folder, torch.nn.ModuleDict(networks), recipe, FACTS | facts)
+    write_run(folder, networks, recipe, FACTS | facts)
     return folder
 
 

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from torch import nn
 
 from cpunet import CpunetError, FileOptions, PulseFile, info, load
 from cpunet.electronics.pile_up_tails import PileUpTails
@@ -80,7 +79,7 @@ def test_a_run_folder(tmp_path):
     recipe = load_recipe("paper", ["generator.width=2"])
     tails = {"rate_khz": 0.0}
     fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "tails": tails}
-    write_run(tmp_path, nn.ModuleDict(), recipe, INFO | {"fit": fit})
+    write_run(tmp_path, {}, recipe, INFO | {"fit": fit})
     lines = dict(info(tmp_path).lines)
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
@@ -201,7 +200,7 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     fit = {"noise": {"rms": 1.6, "baselines": 9}}
-    write_run(run, nn.ModuleDict(), RECIPE, INFO | {"fit": fit})
+    write_run(run, {}, RECIPE, INFO | {"fit": fit})
     assert dict(info(run).lines)["noise"] == "of 9 baselines"
     numbers = [{"noise_rms_kev": kev} for kev in (1.95, 0.05)]
     told = SimpleNamespace(values=numbers[0], errors=numbers[1])

@@ -78,7 +78,7 @@ def test_a_run_of_a_network(tmp_path):
 
     tiny = ("generator.width=2", "discriminator.embedding_dim=2", "discriminator.hidden=2")
     recipe = load_recipe("paper", tiny).at(16)
-    write_run(tmp_path, CycleGan(recipe), recipe, FACTS)
+    write_run(tmp_path, dict(CycleGan(recipe).named_children()), recipe, FACTS)
     run = cpunet.Run.load(tmp_path)
     assert repr(run) == f"<Run {tmp_path}: paper, FEP>"
     assert "<img" not in run._repr_html_()

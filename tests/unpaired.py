@@ -1,6 +1,6 @@
 """Unpaired sets of pulses, one of which went through a chain of known numbers.
 
-Their alignment at half maximum is in plain tensors: what compiled loops are compared with.
+Their alignment at half maximum is in plain arrays: what compiled loops are compared with.
 """
 
 from __future__ import annotations
@@ -8,8 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
+import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
@@ -23,6 +22,8 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import MatchingConfig
 from synthetic import drifting, load_recipe, two_sites
 
+Floats = npt.NDArray[np.floating]
+Ints = npt.NDArray[np.integer]
 DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
 KEV, NOISE_KEV = 2614.5, 1.95
 N = 600
@@ -98,17 +99,16 @@ def faster(fine: Pulses, factor: float) -> Pulses:
 def edge_errors(response: ElectronicsResponse) -> np.ndarray:
     """RMSE on the edge of other pulses than were fitted, against those of the true chain."""
     fine = charge(200, seed=9)
-    with torch.no_grad():
-        records = response(torch.from_numpy(simulated(fine).waveforms))
+    records = response(simulated(fine).waveforms)
     found, truth = (
-        at_half_maximum(one / one.amax(), 0.5, 900, RECIPE.matching.training, 0.8)
-        for one in (records.double(), torch.from_numpy(linear_response(fine, CHAIN)))
+        at_half_maximum(one / one.max(), 0.5, 900, RECIPE.matching.training, 0.8)
+        for one in (records.astype(float), linear_response(fine, CHAIN))
     )
     edge = slice(RECIPE.matching.training.before - 100, RECIPE.matching.training.before + 30)
-    return (found - truth)[:, edge].square().mean(dim=1).sqrt().numpy()
+    return np.asarray(np.sqrt(((found - truth)[:, edge] ** 2).mean(axis=1)))
 
 
-def crossing(records: Tensor, level: float, last: Tensor) -> tuple[Tensor, Tensor]:
+def crossing(records: Floats, level: float, last: Ints) -> tuple[Floats, Ints]:
     """Last upward crossing of a level before a sample, by linear interpolation.
 
     Parameters
@@ -122,20 +122,20 @@ def crossing(records: Tensor, level: float, last: Tensor) -> tuple[Tensor, Tenso
 
     Returns
     -------
-    tuple of Tensor
+    tuple of arrays
         Time of each crossing in samples, and the sample before it.
     """
-    index = torch.arange(records.shape[1] - 1, device=records.device)
+    index = np.arange(records.shape[1] - 1)
     below = (records[:, :-1] < level) & (index < last[:, None])
-    before = ((below * (index + 1)).amax(dim=1) - 1).clamp_min(0)
-    low = records.gather(1, before[:, None])[:, 0]
-    high = records.gather(1, before[:, None] + 1)[:, 0]
-    return before + (level - low) / (high - low).clamp_min(1e-6), before
+    before = np.maximum((below * (index + 1)).max(axis=1) - 1, 0)
+    rows = np.arange(len(records))
+    low, high = records[rows, before], records[rows, before + 1]
+    return before + (level - low) / np.maximum(high - low, 1e-6), before
 
 
 def at_half_maximum(
-    records: Tensor, level: float, last: int, config: MatchingConfig, tail_level: float
-) -> Tensor:
+    records: Floats, level: float, last: int, config: MatchingConfig, tail_level: float
+) -> Floats:
     """Align records, subtract the baseline and scale.
 
     Parameters
@@ -151,21 +151,20 @@ def at_half_maximum(
 
     Returns
     -------
-    Tensor
+    array
         Windows of ``before + after`` samples around the crossing, shifted by fractions of a
         sample.
     """
-    whole = torch.full((len(records),), last, device=records.device)
-    _, sample = crossing(records, level, whole)
+    _, sample = crossing(records, level, np.full(len(records), last))
     first, stop = config.baseline
     # twice, since baseline and level are relative to the crossing of the normalised record
     for _ in range(2):
-        base = stretch(records, sample, -first, -stop).mean(dim=1, keepdim=True)
+        base = stretch(records, sample, -first, -stop).mean(axis=1, keepdims=True)
         records = records - base
         tail = stretch(records, sample, config.after - config.level_samples, config.after)
-        records = records * (tail_level / tail.mean(dim=1, keepdim=True))
+        records = records * (tail_level / tail.mean(axis=1, keepdims=True))
         time, sample = crossing(records, level, sample + 20)
-    start = time.floor()
+    start = np.floor(time).astype(int)
     fraction = (time - start)[:, None]
-    window = stretch(records, start.long(), -config.before, config.after + 1)
+    window = stretch(records, start, -config.before, config.after + 1)
     return window[:, :-1] * (1 - fraction) + window[:, 1:] * fraction

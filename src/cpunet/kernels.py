@@ -14,6 +14,7 @@ import importlib
 import os
 import re
 import shutil
+import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -73,10 +74,10 @@ def start_threads() -> None:
 
 
 def use_threads(count: int) -> None:
-    """Set the number of threads of torch, and let parallel loops use no more than these."""
-    import torch  # seconds, which compiled loops alone do not need
-
-    torch.set_num_threads(count)
+    """Set the number of threads of this process, for torch as well if that is imported."""
+    os.environ["OMP_NUM_THREADS"] = str(count)  # which torch reads when it is imported later
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(count)
     start_threads()
     numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))
 

@@ -69,16 +69,17 @@ def outcomes(
     if (jobs := min(jobs, len(tasks))) > 1:
         yield from _in_processes(make, tasks, jobs, once)
         return
-    import torch  # imported late, too
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch = sys.modules.get("torch")
+    before = 0 if torch is None else torch.get_num_threads()
     try:
+        if torch is not None:
+            torch.set_num_threads(1)
         work = make()
         for task in tasks:
             yield task, _outcome(partial(work, task))
     finally:
-        torch.set_num_threads(before)
+        if torch is not None:
+            torch.set_num_threads(before)
 
 
 def _outcome(result: Callable[[], R]) -> R | CpunetError:
@@ -91,7 +92,7 @@ def _outcome(result: Callable[[], R]) -> R | CpunetError:
 def _in_processes(
     make: Callable[[], Callable[[T], R]], tasks: Sequence[T], jobs: int, once: bool
 ) -> Generator[tuple[T, R | CpunetError]]:
-    context = multiprocessing.get_context("spawn")  # torch does not survive a fork
+    context = multiprocessing.get_context("spawn")  # threads do not survive a fork
     others = {*multiprocessing.active_children()}
     noted: set[str] = set()
     left: dict[Future[tuple[Any, list[logging.LogRecord]]], T] = {}

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
-import torch
 
 from cpunet.calibration import joint_problem
 from cpunet.calibration.identifiability import Information
@@ -64,7 +64,7 @@ class ReadExactly:
         self.side = side
 
     def slopes(self, ways, functions, *, draws=None):
-        changes = ways.of_pulses(slice(None)).numpy()
+        changes = ways.of_pulses(slice(None))
         of_chain = np.zeros((len(ways.of_transfer), self.side.sim.shape[1]))
         return np.concatenate([of_chain, changes.mean(axis=1)]).T
 
@@ -217,7 +217,7 @@ def test_derivatives_are_those_of_wide_differences(monkeypatch):
 
     Noise makes the readings of single pulses jump; over wide steps of many that is a motion.
     """
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)  # which share one response
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)  # which share one response
     n = 3000
     sides = measured_with(CHAIN, n)
     sets = PulseSets(*sides, RECIPE, np.random.default_rng(0))
@@ -230,7 +230,7 @@ def test_derivatives_are_those_of_wide_differences(monkeypatch):
     derivatives = {i: Derivative(np.float32(s), at, half) for i, s in enumerate(slopes)}
     nearby = Nearby(SimpleNamespace(physics=PHYSICS), at, base, derivatives)
     response = with_settings(ElectronicsResponse(RECIPE.matching[0], DT_NS), drift_terms=1)
-    response.drift.stretch.data.fill_(0.05)
+    response.drift.stretch[...] = 0.05
     set_decay(response, band.moments.slope)
     parameters = JointParameters(response, PHYSICS, at, [0, 1], {}, response)
     functions = [SlicedFunctions(band.moments)]

@@ -198,7 +198,7 @@ MISTAKES = {
     "hits without energies": Mistake(f"{SIMULATE} --hits noenergy.npz", r"noenergy.npz: .*"),
     # machine
     "no GPU": Mistake(
-        f"{TRAIN} --device cuda",
+        f"{TRAIN} --recipe paper --device cuda",
         r"no GPU was found; use --device cpu or install .*",
         lambda patch: patch.setattr("torch.cuda.is_available", lambda: False),
     ),

@@ -425,7 +425,7 @@ def plain_chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def stretched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, and charges drift for a tenth longer than simulated."""
-    stretch = lambda chain: chain.response.drift.stretch.fill_(0.1)  # noqa: E731
+    stretch = lambda chain: chain.response.drift.stretch.fill(0.1)  # noqa: E731
     folder = tmp_path_factory.mktemp("stretched")
     return write_chain(folder, *KNOWN, "generator.drift_terms=1", change=stretch)
 

@@ -40,7 +40,7 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_stretched_drift_is_not_in_the_parameters(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stretch = lambda chain: chain.response.drift.stretch.fill_(0.08)  # noqa: E731
+    stretch = lambda chain: chain.response.drift.stretch.fill(0.08)  # noqa: E731
     run = write_chain(tmp_path / "run", "generator.drift_terms=1", change=stretch)
     told = export_legend(run, tmp_path / "pars")
     assert any("charges drift for 8.0 % longer than simulated" in n for n in caplog.messages)

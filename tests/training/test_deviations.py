@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from cpunet.networks.response_layer import (
     ElectronicsResponse,
@@ -16,7 +15,7 @@ from cpunet.networks.response_layer import (
     padding,
 )
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
-from cpunet.training.comparison import Comparison, Sides, hats, response_transfer
+from cpunet.training.comparison import Comparison, Sides, hats
 from cpunet.training.derivatives import Basis
 from cpunet.training.deviations import with_deviations
 from cpunet.training.fitter import Fitter
@@ -38,7 +37,7 @@ def true_response(poles_ns: tuple[float, float] = (55.0, 35.0)) -> ElectronicsRe
         update={"poles_ns": poles_ns, "decay_us": CHAIN.decays[0].tau_us}
     )
     response = ElectronicsResponse(config, DT_NS)
-    response.slow_weights.data.fill_(0.065)
+    response.slow_weights.fill(0.065)
     return response
 
 
@@ -59,7 +58,7 @@ def rings() -> Unpaired:
 
 def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> ElectronicsResponse:
     own = ElectronicsResponse(response.config.model_copy(update={"deviations": True}), DT_NS)
-    own.load_state_dict(response.state_dict(), strict=False)
+    own.fill(own.arrays() | response.arrays())
     own.set_deviation(deviation)
     return own
 
@@ -67,7 +66,7 @@ def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> Electroni
 def test_chi_square_at_the_truth_is_one(plain):
     response = true_response()
     sides = sides_of(plain, response)
-    found = Comparison(sides, 1.5).differences(response_transfer(response, sides.padded))
+    found = Comparison(sides, 1.5).differences(response.transfer(sides.padded))
     assert np.mean([d.chi_square for d in found if d.sliced]) == pytest.approx(1.0, abs=0.15)
     assert all(d.chi_square < 1.6 for d in found)
 
@@ -81,11 +80,9 @@ def test_derivatives_are_those_of_differences(plain, at_ns):
     change = np.exp(-0.5 * ((lags * DT_NS - at_ns) / 60.0) ** 2)
     comparison, step = Comparison(sides, 6.0), 1e-4
     basis = Basis(int(lags[0]), change[:, np.newaxis])
-    found = comparison.differences(response_transfer(response, sides.padded), basis)
+    found = comparison.differences(response.transfer(sides.padded), basis)
     ends = [
-        comparison.differences(
-            response_transfer(deviating(response, sign * step * change), sides.padded)
-        )
+        comparison.differences(deviating(response, sign * step * change).transfer(sides.padded))
         for sign in (1, -1)
     ]
     for here, up, down in zip(found[2:], ends[0][2:], ends[1][2:], strict=True):
@@ -170,9 +167,7 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
     deviation = 0.01 * np.exp(-0.5 * ((lags * DT_NS - 800) / 100) ** 2) + 0.004
     own = deviating(response, deviation)
     padded, last = 8192, int(lags[-1])
-    plain, moved = (
-        np.fft.irfft(response_transfer(one, padded), padded) for one in (response, own)
-    )
+    plain, moved = (np.fft.irfft(one.transfer(padded), padded) for one in (response, own))
     apart = moved - plain
     np.testing.assert_allclose(apart[: last + 1], deviation[-lags[0] :], atol=1e-12)
     np.testing.assert_allclose(apart[lags[0] :], deviation[: -lags[0]], atol=1e-12)
@@ -182,8 +177,8 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
         moved[last:4000], moved[last] * np.exp(rate * np.arange(4000 - last)), atol=1e-9
     )
     # records are those of its closed form, sampled as means over the period
-    step = (torch.arange(1600) >= 400).float()[None]
-    record = own(step)[0].detach().numpy()[padding(DT_NS)[0] + 400 :]
+    step = np.float32(np.arange(1600) >= 400)[np.newaxis]
+    record = own(step)[0][padding(DT_NS)[0] + 400 :]
     time_ns = (np.arange(1000) + 0.5) * DT_NS
     closed = learned_chain(copy.deepcopy(own), "").whole.step(time_ns)
     np.testing.assert_allclose(record[30:1000], closed[30:], atol=3e-4)
@@ -202,9 +197,9 @@ def test_a_deviation_is_the_same_at_other_sampling_periods():
     lags = deviation_lags(DT_NS)
     own = deviating(true_response(), 0.01 * np.exp(-0.5 * ((lags * DT_NS - 500) / 80) ** 2))
     fine = copy.deepcopy(own)
-    fine.dt_ns.fill_(1.0)
+    fine.dt_ns.fill(1.0)
     steps = [
-        np.fft.irfft(response_transfer(one, padded), padded)
+        np.fft.irfft(one.transfer(padded), padded)
         for one, padded in ((own, 4096), (fine, 40_960))
     ]
     time_ns = (np.arange(5, 200) + 0.5) * DT_NS  # samples are means over their period
@@ -215,5 +210,5 @@ def test_a_deviation_is_the_same_at_other_sampling_periods():
 def test_a_known_response_starts_without_its_deviations():
     own = deviating(true_response(), 0.01 * np.ones(len(deviation_lags(DT_NS))))
     plain = with_settings(own, deviations=False)
-    wanted = response_transfer(true_response(), 4096)
-    np.testing.assert_array_equal(response_transfer(plain, 4096), wanted)
+    wanted = true_response().transfer(4096)
+    np.testing.assert_array_equal(plain.transfer(4096), wanted)

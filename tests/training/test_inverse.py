@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
@@ -58,8 +57,7 @@ def readout(noise_kev: float) -> ResponseGenerator:
 
 def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> FloatArray:
     """Windows as the data's, with the noise of an energy or none."""
-    with torch.no_grad():
-        records = generator(torch.from_numpy(sim)).numpy()
+    records = generator(sim)
     noise = None if kev is None else generator.noise
     energy = None if kev is None else np.full(len(sim), kev)
     windows = finish(
@@ -71,8 +69,8 @@ def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> Flo
 
 def half_time(windows: FloatArray) -> np.ndarray:
     """Last interpolated crossing of half the height before the maximum."""
-    unit = torch.from_numpy(windows / windows.max(axis=1, keepdims=True))
-    return crossing(unit, 0.5, unit.argmax(dim=1))[0].numpy()
+    unit = windows / windows.max(axis=1, keepdims=True)
+    return crossing(unit, 0.5, unit.argmax(axis=1))[0]
 
 
 def at_half(windows: FloatArray) -> np.ndarray:
@@ -96,7 +94,7 @@ class Case(NamedTuple):
     inverse: LinearInverse
 
     def iren(self, windows: FloatArray) -> FloatArray:
-        return as_simulated(self.inverse(torch.from_numpy(windows)).numpy())
+        return as_simulated(self.inverse(windows))
 
 
 def fitted(noise_kev: float, energy_kev: float = FEP_KEV) -> Case:
@@ -130,16 +128,13 @@ def test_without_noise_the_charge_comes_back(quiet, held_out):
 
 
 def test_a_pulse_keeps_its_place(quiet, held_out):
-    with torch.no_grad():
-        records = quiet.generator(torch.from_numpy(held_out)).numpy()
+    records = quiet.generator(held_out)
     windows = ren(quiet.generator, held_out, None)
-    with torch.no_grad():
-        found = quiet.inverse(torch.from_numpy(windows)).numpy()
+    found = quiet.inverse(windows)
     delay = half_time(records) - PADDING_BEFORE - half_time(held_out)
     assert np.quantile(np.abs(half_time(windows) - half_time(found) - delay), 0.95) < 0.02
     later = np.concatenate([windows[:, :1], windows[:, :-1]], axis=1)
-    with torch.no_grad():
-        moved = quiet.inverse(torch.from_numpy(later)).numpy()
+    moved = quiet.inverse(later)
     np.testing.assert_allclose(moved[:, 1:], found[:, :-1], atol=1e-3)
 
 
@@ -169,10 +164,10 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     sim = charge(1200, seed=1)
     inverse = fit_inverse(generator, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
     windows = ren(generator, held_out, FEP_KEV)
-    found = inverse(torch.from_numpy(windows)).numpy()
+    found = inverse(windows)
     white = readout(generator.noise.rms)
     other = fit_inverse(white, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
-    mistaken = other(torch.from_numpy(windows)).numpy()
+    mistaken = other(windows)
     truth = at_half(held_out)
     # of most pulses: noise at half the height may move the alignment of a few by far
     assert np.median(error(at_half(found), truth)) < 0.85 * np.median(

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
@@ -80,11 +79,9 @@ def test_the_datas_own_windows_in_records_have_the_datas_own_values(moments, win
 
 
 def test_stretches_are_deviations_in_robust_standard_deviations(moments, windows) -> None:
-    aligned = at_half_maximum(
-        torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
-    )
+    aligned = at_half_maximum(windows, moments.level, 401, CONFIG, PREPARATION.tail_level)
     first, stop = CONFIG.segments[6:8]
-    means = aligned[:, CONFIG.before + first : CONFIG.before + stop].mean(dim=1).numpy()
+    means = aligned[:, CONFIG.before + first : CONFIG.before + stop].mean(axis=1)
     centre = np.median(means)
     sigma = 1.4826 * np.median(np.abs(means - centre))
     wanted = np.clip((means - centre) / sigma, -CONFIG.clip, CONFIG.clip)
@@ -106,10 +103,8 @@ def test_principal_components_are_uncorrelated_with_unit_variance() -> None:
 def test_the_density_of_the_current_amplitude_is_that_of_its_definition(
     moments, windows
 ) -> None:
-    aligned = at_half_maximum(
-        torch.from_numpy(windows), moments.level, 401, CONFIG, PREPARATION.tail_level
-    )
-    amplitude = np.log(current_amplitude(aligned.numpy(), 16.0))
+    aligned = at_half_maximum(windows, moments.level, 401, CONFIG, PREPARATION.tail_level)
+    amplitude = np.log(current_amplitude(aligned, 16.0))
     edges = np.quantile(amplitude, np.linspace(0.02, 0.995, CONFIG.amplitude_bins + 1))
     centres = 0.5 * (edges[1:] + edges[:-1])
     widths = np.maximum(np.diff(edges), CONFIG.amplitude_width)

@@ -55,7 +55,7 @@ def test_a_known_response_starts_with_the_main_decay_that_fits(
 
     recipe = load_recipe("fast")
     known = ElectronicsResponse(recipe.matching[0], 16.0)
-    known.log_decay_us.data.fill_(math.log(300.0))
+    known.log_decay_us.fill(math.log(300.0))
     fitter = Fitter(recipe.matching[1], tails)
     monkeypatch.setattr(fitter, "fit", lambda of, **_: Fitted(of, 0.0, np.eye(1)))
     found = response_starts.from_known(Problem(known), known, fitter)
@@ -105,7 +105,7 @@ def test_a_response_near_the_truth_gains(bands):
     def with_poles(*poles_ns: float) -> ElectronicsResponse:
         of_chain = {"poles_ns": poles_ns, "decay_us": CHAIN.decays[0].tau_us}
         response = ElectronicsResponse(RECIPE.matching[0].model_copy(update=of_chain), DT_NS)
-        response.slow_weights.data.fill_(0.065)
+        response.slow_weights.fill(0.065)
         return response
 
     true, slow = with_poles(55, 35), with_poles(90, 60)

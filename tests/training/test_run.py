@@ -32,7 +32,7 @@ def model(recipe) -> CycleGan:
 
 @pytest.fixture
 def run(tmp_path: Path, model, recipe) -> Path:
-    write_run(tmp_path, model, recipe, INFO)
+    write_run(tmp_path, dict(model.named_children()), recipe, INFO)
     return tmp_path
 
 
@@ -125,7 +125,15 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
         assert (copy / name).read_bytes() == (run / name).read_bytes()
     digest = hashlib.sha256((run / WEIGHTS).read_bytes()).hexdigest()
     assert known.weights_sha256 == digest
-    made = Run.of(model, recipe, peak="FEP", seed=1, dt_ns=16, seconds=1.5, device="cpu")
+    made = Run.of(
+        dict(model.named_children()),
+        recipe,
+        peak="FEP",
+        seed=1,
+        dt_ns=16,
+        seconds=1.5,
+        device="cpu",
+    )
     assert (made.weights_sha256, made.records) == (digest, [])
     assert repr(made) == "<Run run in memory: paper, FEP>"
 

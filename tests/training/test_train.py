@@ -42,7 +42,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-        write_run(folder, CycleGan(RECIPE), RECIPE, info | {"seconds": 1, "device": "cpu"})
+        write_run(
+            folder,
+            dict(CycleGan(RECIPE).named_children()),
+            RECIPE,
+            info | {"seconds": 1, "device": "cpu"},
+        )
     return folder
 
 
@@ -73,16 +78,17 @@ def test_sets_of_different_sampling(sim_set, files):
 
 
 def test_devices(monkeypatch):
-    assert resolve_device("cpu") == "cpu"
-    assert resolve_device("auto") in ("cpu", "cuda")
+    assert resolve_device("cpu", RECIPE) == "cpu"
+    assert resolve_device("auto", RECIPE) in ("cpu", "cuda")
     for name in ("gpu", "", "CPU", "mps", "cudas", "cuda:-1", "cuda:"):
         with pytest.raises(CpunetError, match="is not known; use cpu, cuda or auto"):
-            resolve_device(name)
+            resolve_device(name, RECIPE)
+    assert resolve_device("cuda", load_recipe("fast")) == "cpu"  # chains are NumPy
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert resolve_device("cuda:1") == "cuda:1"
+    assert resolve_device("cuda:1", RECIPE) == "cuda:1"
     with pytest.raises(CpunetError, match="'cuda:2': the last of 2 GPUs is cuda:1"):
-        resolve_device("cuda:2")
+        resolve_device("cuda:2", RECIPE)
 
 
 def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):

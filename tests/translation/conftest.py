@@ -51,7 +51,9 @@ def run(tmp_path_factory: pytest.TempPathFactory, recipe: Recipe) -> Path:
     model = train(sim.pulses.waveforms, data.pulses.waveforms, recipe, seed=0)
     folder = tmp_path_factory.mktemp("run")
     info = {"recipe": recipe.name, "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
-    write_run(folder, model, recipe, info | {"seconds": 1.0, "device": "cpu"})
+    write_run(
+        folder, dict(model.named_children()), recipe, info | {"seconds": 1.0, "device": "cpu"}
+    )
     return folder
 
 

@@ -16,7 +16,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
-from torch import nn
 
 from cpunet.electronics.drawn_pile_up import SIZES_KEV
 from cpunet.errors import CpunetError
@@ -97,7 +96,7 @@ def network(tmp_path_factory):
     """A narrow network that was not trained."""
     recipe = load_recipe("paper", ["generator.width=2"])
     torch.manual_seed(0)
-    model = nn.ModuleDict({"ren": PositionalUNet(recipe.cyclegan.generator, 800)})
+    model = {"ren": PositionalUNet(recipe.cyclegan.generator, 800)}
     folder = tmp_path_factory.mktemp("networks") / "run"
     folder.mkdir()
     write_run(folder, model, recipe, FACTS)

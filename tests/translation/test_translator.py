@@ -71,7 +71,7 @@ def test_sets_keep_their_rows(ren, sim):
     pulses = Pulses.of(
         sim, dt_ns=16, energy_kev=[1, 2, 3, 4, 5], event_number=[10, 20, 30, 40, 50]
     )
-    done = ren.translate_pulses(pulses, generator=ren.seeded(6))
+    done = ren.translate_pulses(pulses, generator=np.random.default_rng(6))
     assert np.array_equal(done.pulses.waveforms, ren.translate(sim, seed=6))
     assert done.pulses.event_number.tolist() == [10, 20, 30, 40, 50]
     assert done.pulses.energy_kev.tolist() == [1, 2, 3, 4, 5]

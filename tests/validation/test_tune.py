@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
@@ -77,9 +76,6 @@ class Giving(REN):
 
     def __init__(self, windows: np.ndarray, recipe: Recipe) -> None:
         self.windows, self.recipe = windows, recipe
-
-    def seeded(self, seed: int | None) -> torch.Generator:
-        return torch.Generator()
 
     def apply(self, *_: Any, **__: Any) -> Any:
         return self.windows

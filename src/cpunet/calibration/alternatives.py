@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nearby import Simulator
@@ -194,8 +193,7 @@ def _numbers(
     waveforms = Simulator(hits, physics).exact(parameters.coordinates)
     pulses = Pulses.of(waveforms, dt_ns=physics.settings.dt_ns, energy_kev=energy_kev)
     windows = prepare(pulses, recipe.preparation, "simulated").pulses
-    with torch.no_grad():
-        records = parameters.chain.response(torch.from_numpy(windows.waveforms)).numpy()
+    records = parameters.chain.response(windows.waveforms)
     records /= records[:, -padding(pulses.dt_ns)[1] :].mean(axis=1, keepdims=True)
     ends = np.minimum(windows.waveforms, COLLECTED)
     return {

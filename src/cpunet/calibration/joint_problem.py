@@ -9,8 +9,6 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
-import torch
-from torch import Tensor
 
 from cpunet.calibration.nearby import FloatArray, Nearby, cut
 from cpunet.calibration.nuisances import Physics, Values
@@ -32,7 +30,7 @@ HOLD = 4.0
 FOR_DERIVATIVES, OF_BAND = 1536, 100
 # Simulated pulses of a band for the covariance of the functions.
 FOR_COVARIANCE = 4096
-OfPulses = Callable[[slice], Tensor]
+OfPulses = Callable[[slice], FloatArray]
 # Step in the physics, in which pulses are linear, as a fraction of the reach of a derivative.
 STEP = 0.1
 
@@ -284,9 +282,9 @@ class JointProblem:
                 rows: slice,
                 of_chain: OfPulses = ways.of_pulses,
                 band: Rows = self.bands[k].rows,
-            ) -> Tensor:
-                own = [torch.from_numpy(change[band[rows]])[None] for change in changes]
-                return torch.cat([of_chain(rows), *own])
+            ) -> FloatArray:
+                own = [change[band[rows]][np.newaxis] for change in changes]
+                return np.concatenate([of_chain(rows), *own])
 
             mean = DifferentiableSet(side).slopes(
                 ways._replace(of_pulses=of_pulses),
@@ -298,9 +296,8 @@ class JointProblem:
 
     def _entering(self, coordinates: Values) -> FloatArray:
         """Simulated pulses of some events at some coordinates as they enter the readout."""
-        windows = torch.from_numpy(self.windows(coordinates, self.few))
-        entering: FloatArray = self.parameters.chain.response.drifted(windows).detach().numpy()
-        return entering
+        windows = self.windows(coordinates, self.few)
+        return self.parameters.chain.response.drifted(windows)
 
     def windows(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Prepared simulated pulses of the first `most` events, as input of a readout.

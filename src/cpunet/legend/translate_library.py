@@ -18,7 +18,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import torch
 from scipy.ndimage import binary_fill_holes
 
 import cpunet
@@ -51,7 +50,7 @@ from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.writing import written_hdf5
-from cpunet.training.run import RunLike, resolve_device, used_run
+from cpunet.training.run import RunLike, used_run
 from cpunet.translation.translator import BATCH, REN
 
 
@@ -80,9 +79,8 @@ class TemplateTranslator:
                 "the run's network translates whole pulses, not the templates that they are "
                 "summed from; give a run of the recipe fast"
             )
-        self._device = ren.backend.device
         self._chain = copy.deepcopy(ren.backend.chain)
-        self._chain.response.dt_ns.fill_(dt_ns)
+        self._chain.response.dt_ns[...] = dt_ns
         if self._chain.response.drift is not None:
             self._chain.response.drift.keeps_begin = True  # templates are summed by time
 
@@ -91,11 +89,8 @@ class TemplateTranslator:
         results = np.empty(templates.shape, np.float32)
         before = padding(float(self._chain.response.dt_ns))[0]
         inside = slice(before, before + templates.shape[1])
-        with torch.inference_mode():
-            for rows in blocks(len(templates), BATCH):
-                charge = torch.from_numpy(np.ascontiguousarray(templates[rows], np.float32))
-                records = self._chain(charge.to(self._device))
-                results[rows] = records[:, inside].cpu().numpy()
+        for rows in blocks(len(templates), BATCH):
+            results[rows] = self._chain(templates[rows].astype(np.float32))[:, inside]
         return results
 
 
@@ -206,7 +201,7 @@ def translate_library(
     """
     run, source, out = used_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
-    translate = TemplateTranslator(REN.of(run, resolve_device("auto")), PERIOD_NS)
+    translate = TemplateTranslator(REN.of(run), PERIOD_NS)
     numbers: dict[str, LibraryNumbers] = {}
     with opened(source) as given:
         names = chosen_libraries(given, source, detector, known_detector(run))

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-import torch
-from torch import Tensor, nn
+import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise, record_samples
 from cpunet.electronics.drawn_pile_up import DrawnTails
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse, Floats, Values
+from cpunet.networks.stored import Stored
 from cpunet.recipes.schema import MatchingConfig, ResponseConfig
 
 
-class KeptNoise(nn.Module):
-    """Spectra of noise as buffers.
+class KeptNoise(Stored):
+    """Spectra of noise, to be stored.
 
     Parameters
     ----------
@@ -21,52 +23,41 @@ class KeptNoise(nn.Module):
         Sampling period in ns.
     """
 
-    noise_continua: Tensor
-    noise_lines: Tensor
-    noise_shares: Tensor
-    n_baselines: Tensor
-
     def __init__(self, dt_ns: float) -> None:
-        super().__init__()
-        self._dt_ns = float(dt_ns)
+        self.noise_dt_ns = float(dt_ns)
         bins = record_samples(dt_ns) // 2 + 1
         # (prepared units x keV)^2, see `BaselineNoise`; kinds that are absent have a share of 0
-        for name in ("noise_continua", "noise_lines"):
-            self.register_buffer(name, torch.zeros(KINDS, bins))
-        self.register_buffer("noise_shares", torch.zeros(KINDS, dtype=torch.float64))
-        self.register_buffer("n_baselines", torch.zeros((), dtype=torch.long))
-
-    @property
-    def noise_dt_ns(self) -> float:
-        """Sampling period of the noise in ns."""
-        return self._dt_ns
+        self.noise_continua = np.zeros((KINDS, bins), np.float32)
+        self.noise_lines = np.zeros((KINDS, bins), np.float32)
+        self.noise_shares = np.zeros(KINDS)
+        self.n_baselines = np.array(0)
 
     def set_noise(self, noise: BaselineNoise) -> None:
         """Store a measured spectrum."""
-        one = noise.density_of(record_samples(self._dt_ns))[np.newaxis]
+        one = noise.density_of(record_samples(self.noise_dt_ns))[np.newaxis]
         continua = one if noise.kinds is None else noise.kinds
         lines = np.zeros_like(continua) if noise.lines is None else noise.lines
         shares = np.ones(1) if noise.shares is None else noise.shares
-        for buffer, values in (
+        for array, values in (
             (self.noise_continua, continua),
             (self.noise_lines, lines),
             (self.noise_shares, shares),
         ):
-            buffer.zero_()
-            buffer[: len(values)] = torch.from_numpy(values).to(buffer)
-        self.n_baselines.fill_(noise.n_baselines)
+            array[...] = 0
+            array[: len(values)] = values
+        self.n_baselines[...] = noise.n_baselines
 
     @property
     def noise(self) -> BaselineNoise:
         """The noise, to be drawn from."""
-        there = self.noise_shares.cpu().numpy() > 0
+        present = self.noise_shares > 0
         continua, lines, shares = (
-            buffer.cpu().numpy()[there].astype(float)
-            for buffer in (self.noise_continua, self.noise_lines, self.noise_shares)
+            array[present].astype(float)
+            for array in (self.noise_continua, self.noise_lines, self.noise_shares)
         )
         return BaselineNoise(
             shares @ (continua + lines),
-            record_samples(self._dt_ns),
+            record_samples(self.noise_dt_ns),
             self.noise_dt_ns,
             int(self.n_baselines),
             continua,
@@ -79,7 +70,7 @@ AFTER_NS = 2720.0  # from the half maximum until charge and slow response have a
 MIN_LEVEL = 1e-3  # below it, there is no pulse
 
 
-class LinearInverse(nn.Module):
+class LinearInverse(Stored):
     """Prepared measured windows → simulation-like, almost noise-free pulses.
 
     Of all linear functions of a measured pulse it is the one that comes closest to the charge
@@ -104,25 +95,17 @@ class LinearInverse(nn.Module):
         First sample and stop, from the half maximum, of the parts that are scaled to 0 and 1.
     """
 
-    half_height: Tensor
-    mean_in: Tensor
-    mean_out: Tensor
-    weights: Tensor
-
     def __init__(self, length: int, config: MatchingConfig) -> None:
-        super().__init__()
         self.length = length
         self.before, stop = config.baseline
         self.after = min(config.samples(AFTER_NS), config.after)
         self.baseline = (-self.before, -stop)
         self.level = (config.after - config.level_samples, config.after)
         n = self.before + self.after
-        # the first: half of the maximum, the same number for all windows
-        shapes = {"half_height": (), "mean_in": (n,), "mean_out": (n,), "weights": (n, n)}
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+        self.half_height = np.array(0.0)  # half of the maximum, the same for all windows
+        self.mean_in, self.mean_out, self.weights = np.zeros(n), np.zeros(n), np.zeros((n, n))
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def __call__(self, windows: Floats) -> Floats:
         """Translate measured windows.
 
         Parameters
@@ -132,28 +115,27 @@ class LinearInverse(nn.Module):
 
         Returns
         -------
-        Tensor
+        array
             Shape (n, length): pulses within 0 … 1 at the times of the measured ones,
             to be aligned and normalised like simulated ones.  NaN where a window has NaN.
         """
         sample = self.half_sample(windows)
         inside = self.region(windows, sample) - self.mean_in
         # charge is within 0 … 1; ripples beyond that would affect the scale of the pulses
-        pulses = (self.mean_out + inside @ self.weights.T).clamp(0, 1)
+        pulses = (self.mean_out + inside @ self.weights.T).clip(0, 1)
         # 0 before the region and 1 after it: one sample on either side stands for the rest
-        pulses = nn.functional.pad(pulses, (1, 0), value=0.0)
-        pulses = nn.functional.pad(pulses, (0, 1), value=1.0)
+        pulses = np.pad(pulses, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
         start = 1 + self.before - sample
-        return stretch(pulses, start, 0, self.length).to(windows.dtype)
+        return stretch(pulses, start, 0, self.length).astype(windows.dtype)
 
-    def half_sample(self, windows: Tensor) -> Tensor:
+    def half_sample(self, windows: Floats) -> npt.NDArray[np.intp]:
         """Last sample below half of the maximum before the maximum, shape (n,)."""
-        index = torch.arange(windows.shape[1], device=windows.device)
-        highest = windows.argmax(dim=1, keepdim=True)
+        index = np.arange(windows.shape[1])
+        highest = windows.argmax(axis=1)[:, np.newaxis]
         below = (windows < self.half_height) & (index < highest)
-        return ((below * (index + 1)).amax(dim=1) - 1).clamp_min(0)
+        return np.asarray(np.maximum((below * (index + 1)).max(axis=1) - 1, 0))
 
-    def region(self, windows: Tensor, sample: Tensor) -> Tensor:
+    def region(self, windows: Floats, sample: npt.NDArray[np.intp]) -> Values:
         """The translated stretch of each window, with baseline 0 and level 1, float64.
 
         Parameters
@@ -165,27 +147,31 @@ class LinearInverse(nn.Module):
         """
         base, level = self.base_and_level(windows, sample)
         inside = stretch(windows, sample, -self.before, self.after)
-        return (inside - base[:, None]) / level.clamp_min(MIN_LEVEL)[:, None]
+        scale = np.maximum(level, MIN_LEVEL)[:, np.newaxis]
+        return np.asarray((inside - base[:, np.newaxis]) / scale)
 
-    def base_and_level(self, windows: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
+    def base_and_level(
+        self, windows: Floats, sample: npt.NDArray[np.intp]
+    ) -> tuple[Values, Values]:
         """Mean before each pulse, and mean of its tail above that."""
-        base = stretch(windows, sample, *self.baseline).double().mean(dim=1)
-        tail = stretch(windows, sample, *self.level).double().mean(dim=1)
+        base = stretch(windows, sample, *self.baseline).mean(axis=1, dtype=float)
+        tail = stretch(windows, sample, *self.level).mean(axis=1, dtype=float)
         return base, tail - base
 
 
-def stretch(pulses: Tensor, sample: Tensor, first: int, stop: int) -> Tensor:
+def stretch(pulses: Any, sample: npt.NDArray[np.intp], first: int, stop: int) -> Floats:
     """Samples `first` to `stop`, counted from `sample` of each pulse; edges are repeated.
 
     Parameters
     ----------
     pulses
-        Shape (n, samples).
+        Shape (..., n, samples).
     sample
         Sample from which is counted, shape (n,).
     """
-    index = sample[:, None] + torch.arange(first, stop, device=pulses.device)
-    return pulses.gather(1, index.clamp(0, pulses.shape[1] - 1))
+    index = (sample[:, np.newaxis] + np.arange(first, stop)).clip(0, pulses.shape[-1] - 1)
+    rows = np.arange(len(sample))[:, np.newaxis]
+    return np.asarray(pulses[..., rows, index])
 
 
 class ResponseGenerator(KeptNoise):
@@ -206,12 +192,6 @@ class ResponseGenerator(KeptNoise):
         super().__init__(dt_ns)
         self.response = ElectronicsResponse(config, dt_ns)
 
-    @property
-    def noise_dt_ns(self) -> float:
-        """Current sampling period of the response in ns."""
-        return float(self.response.dt_ns)
-
-    def forward(self, windows: Tensor) -> Tensor:
+    def __call__(self, windows: Floats) -> npt.NDArray[np.float32]:
         """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""
-        records: Tensor = self.response(windows)
-        return records
+        return self.response(windows)

@@ -1,4 +1,4 @@
-"""The response of a readout chain as a differentiable layer: a few physical parameters.
+"""The response of a readout chain: a few physical parameters, and what deviates from these.
 
 Charge becomes signal through bandwidth poles, slow components (or overshoot, if negative), an
 optional ringing, and decays.  All act on the current of a pulse in the frequency domain, so
@@ -9,19 +9,21 @@ may be stretched in time.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-import torch
 from scipy.interpolate import CubicSpline
-from torch import Tensor, nn
 
 from cpunet.electronics.finishing import padding as padding
 from cpunet.electronics.finishing import record_length as record_length
+from cpunet.networks.stored import Stored
 from cpunet.recipes.schema import ResponseConfig
+
+Values = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating[Any]]
+Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
 
 # Fractions of the final charge at which collection begins and ends.
 BEGIN, END = 1e-6, 0.999
@@ -30,7 +32,7 @@ MIN_STRETCH = 0.2
 ROUNDS = 20  # in which a duration converges
 
 
-class DriftClock(nn.Module):
+class DriftClock(Stored):
     r"""Stretches the drift of simulated pulses; nothing changes at the start.
 
     If the simulated charges drift faster or slower than those of the detector (temperature,
@@ -54,8 +56,8 @@ class DriftClock(nn.Module):
     A charge that rises over 40 samples rises over 44 if drift takes a tenth longer:
 
     >>> clock = DriftClock(1)
-    >>> _ = clock.stretch.data.fill_(0.1)
-    >>> ramp = torch.arange(-60, 20).div(40.0).add(1).clamp(0, 1)[None]
+    >>> clock.stretch[:] = 0.1
+    >>> ramp = np.clip(np.arange(-60, 20) / 40 + 1, 0, 1)[np.newaxis]
     >>> int((ramp > 0.5).sum()), int((clock(ramp, dt_ns=16.0) > 0.5).sum())
     (39, 41)
     """
@@ -64,10 +66,9 @@ class DriftClock(nn.Module):
     """Whether a pulse stays where its charge begins to move, not where its collection ends."""
 
     def __init__(self, terms: int) -> None:
-        super().__init__()
-        self.stretch = nn.Parameter(torch.zeros(terms, dtype=torch.float64))
+        self.stretch = np.zeros(terms)
 
-    def forward(self, windows: Tensor, *, dt_ns: float) -> Tensor:
+    def __call__(self, windows: Floats, *, dt_ns: float) -> Floats:
         """Stretch pulses in time about the end of their collection.
 
         Parameters
@@ -79,29 +80,28 @@ class DriftClock(nn.Module):
 
         Returns
         -------
-        Tensor
-            Of the same shape and height.
+        array
+            Of the same shape, type and height.
         """
-        highest = windows.amax(dim=1, keepdim=True)
+        highest = windows.max(axis=1, keepdims=True)
         end = _first(windows >= END * highest)
-        later = torch.zeros_like(end)
+        later: Values = np.zeros(end.shape)
         if self.keeps_begin:
             took = end - _first(windows > BEGIN * highest) + 1
             later = self._duration(took, 1e-3 * dt_ns) - took
-        before = end + later - torch.arange(windows.shape[1], device=windows.device)
+        before = end + later - np.arange(windows.shape[1])
         source = end - before / self._factor(before, 1e-3 * dt_ns)
         return at_times(windows, source)
 
-    def _factor(self, before: Tensor, dt_us: float) -> Tensor:
+    def _factor(self, before: Values, dt_us: float) -> Values:
         """Factor of the time of each sample before the end."""
-        us = (dt_us * before).clamp(0.0, LONGEST_US)
-        powers = torch.stack([us**i for i in range(len(self.stretch))], dim=-1)
-        factor: Tensor = 1 + powers.to(self.stretch.dtype) @ self.stretch
-        return factor.clamp_min(MIN_STRETCH)
+        us = (dt_us * before).clip(0.0, LONGEST_US)
+        factor = 1 + sum(term * us**i for i, term in enumerate(self.stretch))
+        return np.maximum(factor, MIN_STRETCH)
 
-    def _duration(self, took: Tensor, dt_us: float) -> Tensor:
+    def _duration(self, took: npt.NDArray[np.intp], dt_us: float) -> Values:
         """Duration of a drift in samples in the detector, given the simulated one."""
-        longer = took.to(self.stretch.dtype)
+        longer = took.astype(float)
         for _ in range(ROUNDS):  # t = u (1 + a + b t)
             longer = took * self._factor(longer, dt_us)
         return longer
@@ -112,21 +112,22 @@ class DriftClock(nn.Module):
         return dict(zip(names, self.stretch.tolist(), strict=False))
 
 
-def _first(where: Tensor) -> Tensor:
+def _first(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
     """First sample of each row for which a condition holds, shape (batch, 1)."""
-    return where.to(torch.uint8).argmax(dim=1, keepdim=True)
+    return np.asarray(where.argmax(axis=1))[:, np.newaxis]
 
 
-def at_times(windows: Tensor, times: Tensor) -> Tensor:
+def at_times(windows: Floats, times: Values) -> Floats:
     """Values at times in samples, by cubics (Catmull-Rom); ends are held."""
     last = windows.shape[1] - 1
-    first = times.detach().floor().clamp(0.0, float(last))
-    part, first = (times - first).clamp(0.0, 1.0).to(windows.dtype), first.long()
-    a, b, c, d = (windows.gather(1, (first + i).clamp(0, last)) for i in (-1, 0, 1, 2))
+    first = np.floor(times).clip(0, last)
+    part, first = (times - first).clip(0, 1).astype(windows.dtype), first.astype(np.intp)
+    a, b, c, d = (
+        np.take_along_axis(windows, (first + i).clip(0, last), axis=1) for i in (-1, 0, 1, 2)
+    )
     rise, bend = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d
     skew = 0.5 * (d - a) + 1.5 * (b - c)
-    between: Tensor = b + part * (rise + part * (bend + part * skew))
-    return between
+    return np.asarray(b + part * (rise + part * (bend + part * skew)))
 
 
 # Charge is zero before a window and constant after it, but decays outlast the record: their
@@ -151,7 +152,7 @@ def deviation_lags(dt_ns: float) -> npt.NDArray[np.intp]:
     return np.arange(first, stop)
 
 
-class ElectronicsResponse(nn.Module):
+class ElectronicsResponse(Stored):
     r"""Charge pulses → noise-free records of any height, by physical parameters.
 
     With bandwidth poles :math:`\tau_k`, weights :math:`w_j` of slow parts of fixed times
@@ -186,63 +187,55 @@ class ElectronicsResponse(nn.Module):
     >>> config = load_recipe("fast").generator.model_copy(
     ...     update={"poles_ns": (64.0,), "decay_us": 100.0})
     >>> response = ElectronicsResponse(config, dt_ns=16)
-    >>> complex(response.bandwidth(torch.tensor([1j / 64]))[0].detach())
+    >>> complex(response.bandwidth(np.array([1j / 64]))[0].round(6))
     (0.5-0.5j)
-    >>> step = (torch.arange(800) >= 400).float()[None]
-    >>> record = response(step)[0].detach()[padding(16)[0] + 400 :]
+    >>> step = (np.arange(800) >= 400)[np.newaxis].astype(np.float32)
+    >>> record = response(step)[0, padding(16)[0] + 400 :]
     >>> round(float(record[200] / record[100]), 5), round(math.exp(-1.6 / 100), 5)
     (0.98413, 0.98413)
     """
 
-    dt_ns: Tensor
-    slow_ns: Tensor
-    fast_decays_us: Tensor
-    deviation: Tensor
-    deviation_draws: Tensor
-    drift: DriftClock | None
     decay_known: float | None = None
     """Relative error of the main decay, if it is known from baselines."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
-        super().__init__()
-        self.register_buffer("dt_ns", torch.tensor(float(dt_ns), dtype=torch.float64))
-        self.config = config
-
-        def log(values: Sequence[float]) -> nn.Parameter:
-            return nn.Parameter(torch.tensor(values, dtype=torch.float64).log())
-
-        def weights(values: Sequence[float]) -> nn.Parameter:
-            return nn.Parameter(torch.zeros(len(values), dtype=torch.float64))
-
-        self.log_poles_ns = log(config.poles_ns)
-        self.log_decay_us = log([config.decay_us])
-        self.slow_weights = weights(config.slow_ns)
-        self.decay_weights = weights(config.fast_decays_us)
-        for name in ("slow_ns", "fast_decays_us"):
-            times = torch.tensor(getattr(config, name), dtype=torch.float64)
-            self.register_buffer(name, times)
+        self.config, self.dt_ns = config, np.array(float(dt_ns))
+        self.log_poles_ns, self.log_decay_us = (
+            np.log(config.poles_ns),
+            np.log([config.decay_us]),
+        )
+        self.slow_ns = np.array(config.slow_ns, float)
+        self.fast_decays_us = np.array(config.fast_decays_us, float)
+        self.slow_weights = np.zeros(len(self.slow_ns))
+        self.decay_weights = np.zeros(len(self.fast_decays_us))
         if config.free_decays:
-            self.log_fast_decays_us = log(config.fast_decays_us)
+            self.log_fast_decays_us = np.log(self.fast_decays_us)
         rings = [] if config.ringing_mhz is None else [config.ringing_mhz, config.ringing_ns]
         # weights of sine and cosine; frequency in MHz and damping in ns
-        self.ringing = weights(rings)
-        self.log_ringing = log(rings)
+        self.ringing, self.log_ringing = np.zeros(len(rings)), np.log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
         if config.deviations:
-            shape = DRAWS, len(deviation_lags(dt_ns))
+            lags = len(deviation_lags(dt_ns))
             self.deviation_dt_ns = float(dt_ns)  # the response itself may be sampled otherwise
-            self.register_buffer("deviation", torch.zeros(shape[1], dtype=torch.float64))
-            self.register_buffer("deviation_draws", torch.zeros(shape, dtype=torch.float64))
+            self.deviation, self.deviation_draws = np.zeros(lags), np.zeros((DRAWS, lags))
 
-    def set_deviation(
-        self, deviation: npt.NDArray[Any], draws: npt.NDArray[Any] | None = None
-    ) -> None:
+    @property
+    def parameters(self) -> dict[str, Values]:
+        """What is fitted, by name: the arrays themselves."""
+        fixed = {"dt_ns", "slow_ns", "fast_decays_us", "deviation", "deviation_draws"}
+        return {
+            name: values
+            for name, values in self.arrays().items()
+            if name not in fixed and len(values)
+        }
+
+    def set_deviation(self, deviation: Values, draws: Values | None = None) -> None:
         """Set the deviation at each lag, and draws whose outer products are its covariance."""
-        self.deviation.copy_(torch.from_numpy(deviation))
+        self.deviation[:] = deviation
         if draws is not None:  # (lags, draws)
-            self.deviation_draws.copy_(torch.from_numpy(draws.T))
+            self.deviation_draws[:] = draws.T
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def __call__(self, windows: Floats) -> npt.NDArray[np.float32]:
         """Apply the response to prepared simulated pulses.
 
         Parameters
@@ -252,25 +245,21 @@ class ElectronicsResponse(nn.Module):
 
         Returns
         -------
-        Tensor
+        array
             Shape (batch, record_length).
         """
         length = record_length(windows.shape[1], dt_ns := float(self.dt_ns))
         padded = padded_length(length)
-        windows = self.drifted(windows)
-        transfer = self.transfer(padded).to(torch.complex64)
-        spectrum = current_spectrum(windows, padded, dt_ns) * transfer
-        signal: Tensor = torch.fft.irfft(spectrum, padded)[:, :length]
-        return signal
+        spectrum = current_spectrum(self.drifted(windows), padded, dt_ns)
+        spectrum *= self.transfer(padded).astype(np.complex64)
+        signal: npt.NDArray[np.float32] = scipy.fft.irfft(spectrum, padded, overwrite_x=True)
+        return signal[:, :length]
 
-    def drifted(self, windows: Tensor) -> Tensor:
+    def drifted(self, windows: Floats) -> Floats:
         """Simulated pulses with their drift stretched, as they enter the readout."""
-        if self.drift is None:
-            return windows
-        stretched: Tensor = self.drift(windows, dt_ns=float(self.dt_ns))
-        return stretched
+        return windows if self.drift is None else self.drift(windows, dt_ns=float(self.dt_ns))
 
-    def transfer(self, padded: int) -> Tensor:
+    def transfer(self, padded: int) -> npt.NDArray[np.complex128]:
         """Response to a step of charge at sample 0, as a spectrum of `padded` samples.
 
         The samples of a pulse are means over the sampling period, and so are those of the
@@ -278,91 +267,89 @@ class ElectronicsResponse(nn.Module):
         causes images of the spectrum above half the sampling rate; the part of them that passes
         the electronics is aliased back.
         """
-        dt_ns = self.dt_ns
-        frequency = torch.fft.rfftfreq(padded, d=1.0, dtype=torch.float64).to(dt_ns.device)
-        image = torch.arange(-IMAGES, IMAGES + 1, device=dt_ns.device)[:, None]
-        everywhere = frequency + image  # (images, frequencies), in units of 1/period
+        dt_ns = float(self.dt_ns)
+        frequency = np.fft.rfftfreq(padded)
+        image = np.arange(-IMAGES, IMAGES + 1)[:, np.newaxis]
+        everywhere = frequency + image.astype(
+            float
+        )  # (images, frequencies), in units of 1/period
         passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
-        fast = (_spline(everywhere) * passed).sum(dim=0)
-        kept = math.ceil(padded / MIN_FACTOR) - padding(float(dt_ns))[0]
-        time_us = torch.arange(kept, dtype=torch.float64, device=dt_ns.device) * dt_ns * 1e-3
-        whole: Tensor = fast * torch.fft.rfft(self.decay(time_us), padded)
+        fast = (_spline(everywhere) * passed).sum(axis=0)
+        n_after = math.ceil(padded / MIN_FACTOR) - padding(dt_ns)[0]
+        decays = self.decay(1e-3 * dt_ns * np.arange(n_after, dtype=float))
+        whole: npt.NDArray[np.complex128] = fast * scipy.fft.rfft(decays, padded)
         if not self.config.deviations:
             return whole
-        lags, deviation = deviation_lags(float(dt_ns)), self.deviation.cpu().numpy()
-        if float(dt_ns) != self.deviation_dt_ns:
+        lags, deviation = deviation_lags(dt_ns), self.deviation
+        if dt_ns != self.deviation_dt_ns:
             time_ns = (deviation_lags(self.deviation_dt_ns) + 0.5) * self.deviation_dt_ns
-            deviation = CubicSpline(time_ns, deviation)((lags + 0.5) * float(dt_ns))
+            deviation = CubicSpline(time_ns, deviation)((lags + 0.5) * dt_ns)
         first, last = int(lags[0]), int(lags[-1])
-        step = torch.zeros(padded, dtype=torch.float64, device=dt_ns.device)
-        values = torch.from_numpy(deviation).to(step)
-        step[first:], step[: last + 1] = values[:-first], values[-first:]
-        if kept > last + 1:  # the whole goes on as it does before the end of the windows
-            base = torch.fft.irfft(whole.detach(), padded)
-            (early, late), there = late_lags(float(dt_ns)), base[: last + 1] + values[-first:]
-            left = float(there[late] / there[early])
-            rate = math.log(max(left, MIN_LEFT)) / (late - early)
-            after = torch.arange(kept - last).to(step)
-            step[last:kept] = there[last] * torch.exp(rate * after) - base[last:kept]
-        step[kept : padded + first] = 0
-        with_deviation: Tensor = whole + torch.fft.rfft(step, padded)
-        return with_deviation
+        step = np.zeros(padded)
+        step[first:], step[: last + 1] = deviation[:-first], deviation[-first:]
+        if n_after > last + 1:  # the whole goes on as it does before the end of the windows
+            base = scipy.fft.irfft(whole, padded)
+            (early, late), inside = late_lags(dt_ns), base[: last + 1] + deviation[-first:]
+            rate = math.log(max(inside[late] / inside[early], MIN_LEFT)) / (late - early)
+            after = np.exp(rate * np.arange(n_after - last))
+            step[last:n_after] = inside[last] * after - base[last:n_after]
+        step[n_after : padded + first] = 0
+        return np.asarray(whole + scipy.fft.rfft(step))
 
-    @torch.no_grad()
     def delay_ns(self) -> float:
         """Time in ns at which the response to a step is half as high as its maximum."""
         dt_ns = float(self.dt_ns)
         padded = padded_length(record_length(round(STEP_NS / dt_ns), dt_ns))
         lead = padding(dt_ns)[0]
-        step = torch.fft.irfft(self.transfer(padded), padded).roll(lead)[: padded - lead]
-        after = int((step >= 0.5 * step.max()).int().argmax())
+        step = np.roll(scipy.fft.irfft(self.transfer(padded), padded), lead)[: padded - lead]
+        after = int((step >= 0.5 * step.max()).argmax())
         low, high = step[after - 1], step[after]
         place = after - 1 + float((0.5 * step.max() - low) / (high - low))
         # a sample is the mean over its period
         return (place + 0.5 - lead) * dt_ns
 
     @property
-    def fast_times_us(self) -> Tensor:
+    def fast_times_us(self) -> Values:
         """Times of the faster decays, fixed or free."""
-        return self.log_fast_decays_us.exp() if self.config.free_decays else self.fast_decays_us
+        free = self.config.free_decays
+        return np.exp(self.log_fast_decays_us) if free else self.fast_decays_us
 
-    def bandwidth(self, s: Tensor) -> Tensor:
+    def bandwidth(self, s: Spectrum) -> Spectrum:
         """Transfer function of all but the decays at `s` in 1/ns."""
-        transfer = torch.ones_like(s)
-        for tau in self.log_poles_ns.exp():
+        transfer = np.ones_like(s)
+        for tau in np.exp(self.log_poles_ns):
             transfer = transfer / (1 + s * tau)
-        slow = torch.ones_like(s)
+        slow = np.ones_like(s)
         for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True):
             slow = slow + weight * (1 / (1 + s * tau) - 1)
         if len(self.ringing):
-            frequency_mhz, damping = self.log_ringing.exp()
+            frequency_mhz, damping = np.exp(self.log_ringing)
             omega = 2e-3 * math.pi * frequency_mhz
             damped = s + 1 / damping
             wave = self.ringing[0] * omega + self.ringing[1] * damped
             slow = slow * (1 + s * wave / (damped**2 + omega**2))
         return transfer * slow
 
-    def decay(self, time_us: Tensor) -> Tensor:
+    def decay(self, time_us: Values) -> Values:
         """Response of the decays alone to a step of 1 at time 0, at times from 0 on in µs."""
-        main = torch.exp(-time_us / self.log_decay_us.exp())
+        main = np.exp(-time_us / np.exp(self.log_decay_us))
         step = main
         for weight, tau in zip(self.decay_weights, self.fast_times_us, strict=True):
-            step = step + weight * (torch.exp(-time_us / tau) - main)
+            step = step + weight * (np.exp(-time_us / tau) - main)
         return step
 
-    @torch.no_grad()
     def named(self) -> dict[str, tuple[str, float]]:
         """Fitted parameters by name, with the unit at its end: label and value of each.
 
         A label is the name of the tensor and the place in it, as ``"slow_weights.1"``.
         """
-        poles = enumerate(self.log_poles_ns.exp().tolist(), 1)
+        poles = enumerate(np.exp(self.log_poles_ns).tolist(), 1)
         falling = enumerate(sorted(poles, key=lambda pole: -pole[1]), 1)
         told = {f"pole_{i}_ns": (f"log_poles_ns.{k}", tau) for i, (k, tau) in falling}
         slow = zip(self.slow_ns.tolist(), self.slow_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(slow, 1):
             told[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
-        told["decay_us"] = "log_decay_us.1", float(self.log_decay_us.exp())
+        told["decay_us"] = "log_decay_us.1", float(np.exp(self.log_decay_us[0]))
         fast = zip(self.fast_times_us.tolist(), self.decay_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(fast, 1):
             share = f"decay_{tau:g}_us"
@@ -371,7 +358,7 @@ class ElectronicsResponse(nn.Module):
                 share = f"fast_decay_{i}_share"
             told[share] = f"decay_weights.{i}", weight
         if len(self.ringing):
-            mhz, damping_ns = self.log_ringing.exp().tolist()
+            mhz, damping_ns = np.exp(self.log_ringing).tolist()
             sine, cosine = self.ringing.tolist()
             told["ringing_mhz"] = "log_ringing.1", mhz
             told["ringing_damping_ns"] = "log_ringing.2", damping_ns
@@ -389,24 +376,24 @@ class ElectronicsResponse(nn.Module):
         """
         told = {name: value for name, (_, value) in self.named().items()}
         if self.config.deviations:
-            told["deviation"] = float(self.deviation.abs().max())
+            told["deviation"] = float(np.abs(self.deviation).max())
         return told
 
 
-def _spline(frequency: Tensor) -> Tensor:
+def _spline(frequency: Values) -> Values:
     """Spectrum of the cardinal cubic spline at frequencies in units of the sampling rate.
 
     Unser, Aldroubi and Eden, IEEE Trans. Signal Process. 41 (1993) 821.
     """
-    spline: Tensor = torch.sinc(frequency) ** 4 * 3 / (2 + torch.cos(2 * math.pi * frequency))
-    return spline
+    return np.asarray(np.sinc(frequency) ** 4 * 3 / (2 + np.cos(2 * math.pi * frequency)))
 
 
-def current_spectrum(windows: Tensor, padded: int, dt_ns: float) -> Tensor:
+def current_spectrum(windows: Floats, padded: int, dt_ns: float) -> Spectrum:
     """Spectra of the current of windows (..., samples) within records."""
-    current = torch.diff(windows, dim=-1, prepend=torch.zeros_like(windows[..., :1]))
-    current = nn.functional.pad(current, (padding(dt_ns)[0], 0))
-    spectrum: Tensor = torch.fft.rfft(current, padded)
+    before = padding(dt_ns)[0]
+    current = np.zeros((*windows.shape[:-1], before + windows.shape[-1]), windows.dtype)
+    current[..., before:] = np.diff(windows, axis=-1, prepend=0)
+    spectrum: Spectrum = scipy.fft.rfft(current, padded)
     return spectrum
 
 

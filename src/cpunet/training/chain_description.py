@@ -87,7 +87,7 @@ def describe_chain(run: Run) -> DescribedChain:
         chain = with_noise(chain, network, preparation)
     parameters = response.describe()
     if len(response.ringing):
-        parameters["ringing"] = response.ringing.norm().item()
+        parameters["ringing"] = float(np.linalg.norm(response.ringing))
 
     def derived(moved: ElectronicsResponse) -> Numbers:
         numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)

@@ -218,7 +218,7 @@ _FOREVER_US = 1e9  # decay time of a chain without decay
 
 def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     """The closed form of a fitted chain: a sum of exponentials, like a true chain."""
-    poles, main = response.log_poles_ns.exp().tolist(), response.log_decay_us.exp().item()
+    poles, main = np.exp(response.log_poles_ns).tolist(), np.exp(response.log_decay_us).item()
     slow, fast = response.slow_weights.tolist(), response.decay_weights.tolist()
     fast_ns = [1e3 * tau for tau in response.fast_times_us.tolist()]
     taus = moved_apart([*poles, *response.slow_ns.tolist(), 1e3 * main, *fast_ns])
@@ -232,7 +232,7 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     for tau in taus[:n]:
         undecayed = undecayed * Exponentials.low_pass(tau)
     if len(response.ringing):  # a step response 1 + exp(-t/damping) (a sin + b cos)
-        frequency_mhz, damping_ns = response.log_ringing.exp().tolist()
+        frequency_mhz, damping_ns = np.exp(response.log_ringing).tolist()
         sine, cosine = response.ringing.tolist()
         pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
         residue = 0.5 * complex(cosine, -sine) * pole
@@ -247,8 +247,8 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
         return Chain(name, whole, undecayed)
     # a sample is the mean over its period
     time_ns = np.asarray(deviation_lags(dt_ns := float(response.dt_ns)) + 0.5) * dt_ns
-    deviating = WithDeviation(whole, time_ns, response.deviation.numpy())
-    draws = CubicSpline(time_ns, response.deviation_draws.numpy().T)
+    deviating = WithDeviation(whole, time_ns, response.deviation)
+    draws = CubicSpline(time_ns, response.deviation_draws.T)
     return Chain(name, deviating, PoleZeroed(deviating), draws=draws)
 
 

@@ -28,7 +28,7 @@ import numpy.typing as npt
 import scipy.fft
 
 from cpunet.electronics.finishing import padding
-from cpunet.networks.response_layer import ElectronicsResponse, padded_length
+from cpunet.networks.response_layer import padded_length
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Floats, Frame, Values, read
 from cpunet.training.derivatives import Basis, Derivatives
@@ -400,8 +400,3 @@ def hats(values: Values, centres: Values) -> tuple[Values, Values]:
     bins[rows, low], bins[rows, low + 1] = 1 - place, place
     derivatives[rows, low], derivatives[rows, low + 1] = -slope, slope
     return bins, derivatives
-
-
-def response_transfer(response: ElectronicsResponse, padded: int) -> Spectrum:
-    """Spectrum of the response to a step, without its graph of derivatives."""
-    return np.asarray(response.transfer(padded).detach().numpy())

@@ -31,7 +31,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import padding
-from cpunet.networks.generators import KeptNoise, stretch
+from cpunet.networks.generators import KeptNoise
 from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
@@ -112,7 +112,8 @@ def as_measured(records: Tensor, config: PreparationConfig, dt_ns: float) -> Ten
     align = np.full(len(records), padding(dt_ns)[0] + config.samples_before)
     align[prepared.index] = prepared.align_sample
     start = torch.from_numpy(align - config.samples_before).to(records.device)
-    windows = stretch(records, start, 0, config.length)
+    index = start[:, None] + torch.arange(config.length, device=records.device)
+    windows = records.gather(1, index.clamp(0, records.shape[1] - 1))
     windows = windows - windows[:, : config.baseline_samples].mean(dim=1, keepdim=True)
     level = windows[:, -config.tail_samples :].mean(dim=1, keepdim=True)
     scale = (level / config.tail_level).clamp_min(MIN_SCALE)
@@ -141,6 +142,7 @@ class CycleGan(nn.Module):
         self.iren = PositionalUNet(config.generator, self.length)
         self.discriminator_data = GruDiscriminator(config.discriminator)
         self.discriminator_sim = GruDiscriminator(config.discriminator)
+        self.noise: KeptNoise | None = None
         if outside is not None:
             self.noise = KeptNoise(outside.noise.dt_ns)
             self.noise.set_noise(outside.noise.noise)

@@ -33,7 +33,7 @@ from scipy.special import expit
 
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
 from cpunet.training.aligned import Values
-from cpunet.training.comparison import MOST, Comparison, Sides, Spectrum, response_transfer
+from cpunet.training.comparison import MOST, Comparison, Sides, Spectrum
 from cpunet.training.derivatives import Basis
 from cpunet.training.response_problem import SmoothParameters
 
@@ -198,7 +198,7 @@ class Knots:
         self.between = np.zeros((len(lags), len(knots)))
         spline = CubicSpline(scale(places), np.eye(len(knots)), bc_type="natural")
         self.between[inside] = spline(scale(lags[inside]))
-        base = self._at_lags(response_transfer(response, padded), padded)
+        base = self._at_lags(response.transfer(padded), padded)
         # beyond the last knot a deviation decays with the chain
         at_last = base[last - lags[0]]
         self.between[~inside, -1] = base[~inside] / at_last
@@ -212,7 +212,7 @@ class Knots:
     def _tangents(self, response: ElectronicsResponse, base: Values, padded: int) -> Values:
         parameters = SmoothParameters(response)
         columns = [
-            FREE * width * self._at_lags(np.asarray(change.numpy()), padded)
+            FREE * width * self._at_lags(change, padded)
             for width, change in parameters.slopes_of_transfer(padded)
         ]
         # half a sample of delay, and a variance of a sample squared, of either sign
@@ -258,7 +258,7 @@ def with_deviations(
     own = ElectronicsResponse(
         response.config.model_copy(update={"deviations": True}), float(response.dt_ns)
     )
-    own.load_state_dict(response.state_dict(), strict=False)
+    own.fill(own.arrays() | response.arrays())
     own.decay_known = response.decay_known
     basis = Basis(int(knots.lags[0]), knots.between)
     inside = (knots.lags >= frame.level[0]) & (knots.lags < frame.level[1])
@@ -269,7 +269,7 @@ def with_deviations(
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
             own.set_deviation(knots.between @ place)
-            cost = problem.evaluate(response_transfer(own, padded), place, anew=far)
+            cost = problem.evaluate(own.transfer(padded), place, anew=far)
             count(cost)
             if not cost <= 1.02 * before[0] + 5:  # worse, or no number
                 place, halved = 0.5 * (place + before[1]), halved + 1
@@ -297,10 +297,10 @@ def with_deviations(
     if first is None:
         return Deviated(response, -np.inf)
     own.set_deviation(knots.between @ place)
-    cost = problem.evaluate(response_transfer(own, padded), place, anew=False)
+    cost = problem.evaluate(own.transfer(padded), place, anew=False)
     if not cost <= before[0]:
         cost, place = before
-    alone = problem.evaluate(response_transfer(response, padded), 0 * place, anew=False)
+    alone = problem.evaluate(response.transfer(padded), 0 * place, anew=False)
     if not cost < alone:
         return Deviated(response, first)
     own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))

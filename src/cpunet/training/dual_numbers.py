@@ -2,7 +2,7 @@ r"""Numbers with their derivatives, for functions of pulses along many direction
 
 A value :math:`v` carries its derivatives :math:`v_k` in all directions :math:`k` through what
 is computed from it, as :math:`(uv)_k = u_k v + u v_k` (automatic differentiation in forward
-mode; Wengert, Comm. ACM 7 (1964) 463).  PyTorch has the same, but not in several threads.
+mode; Wengert, Comm. ACM 7 (1964) 463).
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torch import Tensor, cat
+import numpy as np
+
+from cpunet.pulses.container import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,15 +22,14 @@ class Dual:
 
     Examples
     --------
-    >>> import torch
-    >>> x = Dual(torch.tensor([[3.0]]), torch.tensor([[[1.0]]]))
+    >>> x = Dual(np.array([[3.0]]), np.array([[[1.0]]]))
     >>> y = (x**2 - 1) * x
-    >>> float(y.value), float(y.slopes)  # of x³ - x
+    >>> y.value.item(), y.slopes.item()  # of x³ - x
     (24.0, 26.0)
     """
 
-    value: Tensor
-    slopes: Tensor
+    value: FloatArray
+    slopes: FloatArray
 
     def __getitem__(self, key: tuple[Any, ...]) -> Dual:
         return Dual(self.value[key], self.slopes[(slice(None), *key)])
@@ -40,10 +41,6 @@ class Dual:
     def shape(self) -> Sequence[int]:
         """Shape of the values."""
         return self.value.shape
-
-    def new_tensor(self, constant: Any) -> Tensor:
-        """A constant as these values are."""
-        return self.value.new_tensor(constant)
 
     def __sub__(self, constant: Any) -> Dual:
         return Dual(self.value - constant, self.slopes)
@@ -60,12 +57,12 @@ class Dual:
     def __pow__(self, power: int) -> Dual:
         return Dual(self.value**power, power * self.value ** (power - 1) * self.slopes)
 
-    def __matmul__(self, matrix: Tensor) -> Dual:
+    def __matmul__(self, matrix: FloatArray) -> Dual:
         return Dual(self.value @ matrix, self.slopes @ matrix)
 
     def exp(self) -> Dual:
         """Exponential function."""
-        value = self.value.exp()
+        value = np.exp(self.value)
         return Dual(value, value * self.slopes)
 
     def clip(self, low: float, high: float) -> Dual:
@@ -81,6 +78,6 @@ class Dual:
     def joined(columns: Sequence[Dual]) -> Dual:
         """Columns side by side."""
         return Dual(
-            cat([each.value for each in columns], dim=-1),
-            cat([each.slopes for each in columns], dim=-1),
+            np.concatenate([each.value for each in columns], axis=-1),
+            np.concatenate([each.slopes for each in columns], axis=-1),
         )

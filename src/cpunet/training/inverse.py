@@ -12,8 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 import scipy.linalg
-import torch
-from torch import Tensor
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
@@ -78,11 +76,10 @@ def fit_inverse(
     rows = np.sort(rng.choice(len(sim), min(len(sim), MAX_PULSES), replace=False))
     windows, delay, used = _translated(generator, sim[rows], recipe)
     inverse = LinearInverse(recipe.preparation.length, training)
-    inverse.half_height.fill_(0.5 * float(windows.amax(dim=1).median()))
+    inverse.half_height[...] = 0.5 * np.median(windows.max(axis=1))
     sample = inverse.half_sample(windows)
-    measured = inverse.region(windows, sample).numpy()
-    charge = torch.from_numpy(sim[rows[used]])
-    wanted = stretch(charge, sample + delay, -inverse.before, inverse.after).double().numpy()
+    measured, charge = inverse.region(windows, sample), sim[rows[used]].astype(float)
+    wanted = stretch(charge, sample + delay, -inverse.before, inverse.after)
     _, level = inverse.base_and_level(windows, sample)
     mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
     noise = _noise_covariance(generator.noise, inverse, mean_in)
@@ -91,15 +88,13 @@ def fit_inverse(
     own = measured.T @ measured / len(measured) + noise
     own[np.diag_indices(len(own))] += FLOOR**2
     weights = scipy.linalg.solve(own, measured.T @ wanted / len(measured), assume_a="pos").T
-    for name, values in (("mean_in", mean_in), ("mean_out", mean_out), ("weights", weights)):
-        getattr(inverse, name).copy_(torch.from_numpy(np.ascontiguousarray(values)))
+    inverse.mean_in[:], inverse.mean_out[:], inverse.weights[:] = mean_in, mean_out, weights
     return inverse
 
 
-@torch.no_grad()
 def _translated(
     generator: ResponseGenerator, sim: FloatArray, recipe: Recipe
-) -> tuple[Tensor, Tensor, npt.NDArray[np.int64]]:
+) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Noise-free translated windows prepared like the data, and the shift of each pulse.
 
     Returns
@@ -109,18 +104,18 @@ def _translated(
         rows of the pulses that could be prepared, (n',).
     """
     preparation = recipe.preparation
-    records = torch.cat([generator(torch.from_numpy(sim[rows])) for rows in blocks(len(sim))])
+    records = np.concatenate([generator(sim[rows]) for rows in blocks(len(sim))])
     # a record without noise can have equal samples at its top without being clipped
     config = preparation.model_copy(update={"saturation_run": records.shape[1] + 1})
     dt_ns = float(generator.response.dt_ns)
-    prepared = prepare(Pulses.of(records.numpy(), dt_ns=dt_ns), config, "measured")
+    prepared = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
     if len(prepared) < MIN_PULSES:
         raise CpunetError(
             f"only {len(prepared)} of {len(sim)} translated pulses can be prepared, the "
             f"inverse needs {MIN_PULSES}: {prepared.rejections}; check the fit of the response"
         )
     delay = prepared.align_sample - preparation.samples_before - padding(dt_ns)[0]
-    return torch.from_numpy(prepared.pulses.waveforms), torch.from_numpy(delay), prepared.index
+    return prepared.pulses.waveforms, delay, prepared.index
 
 
 def _noise_covariance(noise: BaselineNoise, sizes: LinearInverse, pulse: Values) -> Values:

@@ -6,6 +6,7 @@ import logging
 import resource
 import sys
 import time
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -14,12 +15,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numba
 import numpy as np
-import torch
-from torch import nn
 
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
+from cpunet.networks import require_torch
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside
@@ -38,9 +39,7 @@ from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.loop import Record
 from cpunet.training.moments import MIN_PULSES
-from cpunet.training.networks import train_networks, unfinished_folder, unfinished_name
 from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import Fit, fit_response
 from cpunet.training.response_starts import DRIFT, with_settings
@@ -48,6 +47,7 @@ from cpunet.training.run import (
     INFO,
     RUN,
     FitInfo,
+    Record,
     Run,
     RunLike,
     append_losses,
@@ -93,7 +93,11 @@ class TrainingJob:
     def trained(self, out: Path | None) -> Run:
         """Train, and write the folder of the job, which becomes `out`."""
         keep_freed_memory()
-        train = train_chain if self.recipe.training.method == "matching" else train_networks
+        train: Callable[[TrainingJob], Run] = train_chain
+        if self.recipe.training.method == "cyclegan":
+            from cpunet.training.networks import train_networks  # torch takes seconds
+
+            train = train_networks
         with one_thread_for_matrices():
             run = train(self)
         run.write(self.folder)
@@ -102,14 +106,19 @@ class TrainingJob:
         return run
 
     def run(
-        self, model: nn.Module, recipe: Recipe, started: str, seconds: float, **more: Any
+        self,
+        parts: Mapping[str, Any],
+        recipe: Recipe,
+        started: str,
+        seconds: float,
+        **more: Any,
     ) -> Run:
         """The run of trained networks.
 
         Parameters
         ----------
-        model
-            Module with ``ren`` and ``iren``.
+        parts
+            ``ren``, ``iren`` and others to store.
         recipe
             Recipe as trained; a ringing may have been added to its chain.
         started, seconds
@@ -120,15 +129,17 @@ class TrainingJob:
         unit = 2**20 if sys.platform == "darwin" else 2**10
         memory = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
         if self.device.startswith("cuda"):
+            import torch
+
             memory["gpu"] = torch.cuda.max_memory_allocated(self.device) / 2**20
         return Run.of(
-            model,
+            parts,
             recipe,
             peak=self.peak,
             seed=self.seed,
             init=None if self.init is None else self.init.name,
             device=self.device,
-            threads=torch.get_num_threads(),
+            threads=numba.get_num_threads(),
             started=started,
             seconds=round(seconds, 1),
             peak_memory_mb={where: round(mb, 1) for where, mb in memory.items()},
@@ -161,11 +172,10 @@ class Training:
         if isinstance(init, str | Path):
             init = own_folder(Path(init), name, INFO)
         start = None if init is None else as_run(init)
-        go_on = self.resume and unfinished_name(folder).exists()
-        self.run(pair, folder, start, go_on=go_on)
+        self.run(pair, folder, start)
         return folder
 
-    def run(self, pair: Pair, out: Path | None, start: Run | None, *, go_on: bool) -> Run:
+    def run(self, pair: Pair, out: Path | None, start: Run | None) -> Run:
         """Read, train and write a run."""
         files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
         networks = self.recipe.training.method == "cyclegan"
@@ -173,13 +183,16 @@ class Training:
         if out is None:
             place = TemporaryDirectory()
         elif networks:
-            place = unfinished_folder(out, *files, resume=go_on, force=self.force)
+            require_torch()
+            from cpunet.training.networks import unfinished_folder
+
+            place = unfinished_folder(out, *files, resume=self.resume, force=self.force)
         else:
             place = folder_written_aside(out, RUN, *files, force=self.force)
         with place as folder:
-            return self._job(pair, Path(folder), start, go_on).trained(out)
+            return self._job(pair, Path(folder), start).trained(out)
 
-    def _job(self, pair: Pair, folder: Path, init: Run | None, resume: bool) -> TrainingJob:
+    def _job(self, pair: Pair, folder: Path, init: Run | None) -> TrainingJob:
         """Read and prepare both sides, and warn of what makes a training on them doubtful."""
         recipe, selection = self.recipe, parse_selection(self.peak, self.recipe.peaks)
 
@@ -209,7 +222,7 @@ class Training:
             data,
             folder,
             init,
-            resume,
+            self.resume,
             beside,
         )
 
@@ -335,6 +348,6 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
     recipe = job.recipe.model_copy(update={"generator": chain.response.config})
     sim = job.sim.prepared.pulses
     iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)
-    model = nn.ModuleDict({"ren": chain, "iren": iren})
+    parts = {"ren": chain, "iren": iren}
     took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
-    return job.run(model, recipe, began, took, fit=info)
+    return job.run(parts, recipe, began, took, fit=info)

@@ -23,10 +23,10 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import Recipe
 from cpunet.training.cyclegan import CycleGan, Outside, Step
+from cpunet.training.run import Record
 
 log = logging.getLogger(__name__)
 
-Record = dict[str, float | int | dict[str, float]]
 Listener = Callable[[list[Record]], None]
 # dicts and lists of tensors, numbers and text; has "iteration"
 State = dict[str, Any]

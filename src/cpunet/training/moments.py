@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
-import torch
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -255,7 +254,7 @@ class Moments:
         Parameters
         ----------
         readings
-            Readings of the pulses, as arrays, tensors, or tensors with derivatives (`Dual`).
+            Readings of the pulses, as arrays or with derivatives (`Dual`).
         clip
             Replaces the clip of the recipe: wider far from the data, where all is clipped.
         """
@@ -264,7 +263,7 @@ class Moments:
             readings.log_amplitude, self.amplitude_centres, self.amplitude_widths
         )
         if self.balance is not None:
-            of_bins: Values = density @ like(density, self.balance)
+            of_bins: Values = density @ self.balance
             return of_bins
         linear = readings.linear.clip(-limit, limit)
         first = len(self.config.segments) - 1
@@ -331,25 +330,19 @@ class Moments:
         return Readings(np.concatenate(linear), logs, np.ones(len(logs)))
 
 
-# The functions take arrays, tensors, and tensors with derivatives (`Dual`).
-
-
-def like(values: Any, constant: Values) -> Any:
-    """Constants of the kind and precision of other values."""
-    return constant if isinstance(values, np.ndarray) else values.new_tensor(constant)
+# The functions take arrays, and arrays with derivatives (`Dual`).
 
 
 def joined(columns: Sequence[Any]) -> Any:
     """Columns side by side."""
     if isinstance(columns[0], Dual):
         return Dual.joined(columns)
-    of_arrays = isinstance(columns[0], np.ndarray)
-    return np.concatenate(columns, axis=1) if of_arrays else torch.cat(tuple(columns), dim=1)
+    return np.concatenate(columns, axis=1)
 
 
 def gaussian_bins(values: Any, centres: Values, widths: Values) -> Any:
     """Bins with smooth edges, shape (pulses, bins)."""
-    distance = (values[:, np.newaxis] - like(values, centres)) / like(values, widths)
+    distance = (values[:, np.newaxis] - centres) / widths
     exponent = distance**2 * -0.5
     return np.exp(exponent) if isinstance(exponent, np.ndarray) else exponent.exp()
 

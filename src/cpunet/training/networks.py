@@ -47,8 +47,8 @@ from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import flat
 from cpunet.training.cyclegan import CycleGan, Outside
-from cpunet.training.loop import Record, State, discriminators_noted, train
-from cpunet.training.run import LOSSES, RUN, FitInfo, Run, read_losses
+from cpunet.training.loop import State, discriminators_noted, train
+from cpunet.training.run import LOSSES, RUN, FitInfo, Record, Run, read_losses
 
 if TYPE_CHECKING:
     from cpunet.training.job import TrainingJob
@@ -112,7 +112,10 @@ def train_networks(job: TrainingJob) -> Run:
         log.warning(line)
     resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
     more: dict[str, Any] = resumed | ({} if fit is None else {"fit": fit})
-    return job.run(model, recipe, run.started, run.seconds, **more)
+    parts = dict(model.named_children()) | (
+        {} if model.noise is None else {"noise": model.noise}
+    )
+    return job.run(parts, recipe, run.started, run.seconds, **more)
 
 
 def outside_noise(

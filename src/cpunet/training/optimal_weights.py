@@ -34,9 +34,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from torch import Tensor
 
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.pulses.container import FloatArray
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.levenberg_marquardt import AT_BOUND, descend
 from cpunet.training.moments import (
@@ -330,13 +330,15 @@ def _simulated(
     """Sums over each part of the simulated pulses, including those of derivatives."""
     size = -(-len(sim) // PARTS)
 
-    def of(first: int, values: Tensor, moved: Tensor, weights: Tensor) -> dict[int, Sums]:
+    def of(
+        first: int, values: FloatArray, moved: FloatArray, weights: FloatArray
+    ) -> dict[int, Sums]:
         found = {}
         # a block can lie in two parts
         for part in range(first // size, (first + len(values) - 1) // size + 1):
             rows = slice(max(part * size - first, 0), (part + 1) * size - first)
-            v, w = values[rows].double().numpy(), weights[rows].double().numpy()
-            column = (weights[rows] @ moved[:, rows]).double().numpy().T
+            v, w = values[rows].astype(float), weights[rows].astype(float)
+            column = (weights[rows] @ moved[:, rows]).astype(float).T
             found[part] = Sums(w.sum(), w @ v, (w * v.T) @ v, column)
         return found
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
@@ -101,7 +101,7 @@ def import_weights(
                 settings[f"{part}.{name}"] = value * dt_ns / PUBLISHED_DT_NS
     recipe = load_recipe("paper", settings)
     run = Run.of(
-        nn.ModuleDict(networks),
+        networks,
         recipe,
         peak="FEP",
         seed=None,

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_pile_up import DrawnTails
@@ -294,6 +293,5 @@ def _entering(response: ElectronicsResponse, sim: FloatArray) -> FloatArray:
     """Simulated pulses as they enter the readout."""
     if response.drift is None:
         return sim
-    with torch.no_grad():
-        parts = torch.split(torch.from_numpy(np.ascontiguousarray(sim)), BLOCK)
-        return np.concatenate([response.drifted(part).numpy() for part in parts])
+    parts = (sim[first : first + BLOCK] for first in range(0, len(sim), BLOCK))
+    return np.concatenate([response.drifted(part) for part in parts])

@@ -10,10 +10,9 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
-import torch
-from torch import Tensor
 
-from cpunet.networks.response_layer import ElectronicsResponse, padded_length
+from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, padded_length
+from cpunet.pulses.container import FloatArray
 from cpunet.training.differentiable import DifferentiableSet, Ways
 from cpunet.training.moments import Moments, Readings, Values
 from cpunet.training.translated import SimulatedSide
@@ -42,10 +41,9 @@ class Parameters:
 
     def __init__(self, response: ElectronicsResponse) -> None:
         self.response = response
-        named = [(n, p) for n, p in response.named_parameters() if p.numel()]
-        self._parts = [part for _, part in named]
-        self.labels = [n for n, p in named for _ in range(p.numel())]
-        self._names = [f"{n}.{i + 1}" for n, p in named for i in range(p.numel())]
+        named = response.parameters.items()
+        self.labels = [n for n, p in named for _ in p]
+        self._names = [f"{n}.{i}" for n, p in named for i in range(1, len(p) + 1)]
         self.centre = self.vector()
         self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
         if response.decay_known is not None:
@@ -58,33 +56,32 @@ class Parameters:
 
     def vector(self) -> Values:
         """Parameters as one vector."""
-        return torch.cat([p.detach().flatten() for p in self._parts]).numpy().copy()
+        return np.concatenate([*self.response.parameters.values()])
 
     def set(self, vector: Values) -> None:
         """Set the parameters of the response from a vector."""
-        sizes = [part.numel() for part in self._parts]
-        values = torch.split(torch.from_numpy(vector), sizes)
-        for part, own in zip(self._parts, values, strict=True):
-            part.data.copy_(own.view_as(part))
+        first = 0
+        for part in self.response.parameters.values():
+            part[:] = vector[first : first + len(part)]
+            first += len(part)
 
-    @torch.no_grad()
     def ways(self, sim: SimulatedSide) -> Ways:
         """How records of some pulses change with each parameter, those of a stretch last."""
         ends = [self._ends(i) for i in self._stretched]
         slopes = [slope for _, slope in self.slopes_of_transfer(padded_length(sim.length))]
 
-        @torch.no_grad()
-        def of_pulses(rows: slice) -> Tensor:
-            pulses = torch.from_numpy(sim.sim[rows]).double()
-            found = [(b.drifted(pulses) - a.drifted(pulses)) / step for a, b, step in ends]
-            return torch.stack(found).float() if found else torch.empty((0, *pulses.shape))
+        def of_pulses(rows: slice) -> FloatArray:
+            pulses = sim.sim[rows].astype(float)
+            found = np.empty((len(ends), *pulses.shape), np.float32)
+            for change, (a, b, step) in zip(found, ends, strict=True):
+                change[:] = (b.drifted(pulses) - a.drifted(pulses)) / step
+            return found
 
-        return Ways(self.response, torch.stack(slopes), of_pulses)
+        return Ways(self.response, np.stack(slopes), of_pulses)
 
-    @torch.no_grad()
-    def slopes_of_transfer(self, padded: int) -> list[tuple[float, Tensor]]:
+    def slopes_of_transfer(self, padded: int) -> list[tuple[float, Spectrum]]:
         """Widths of all parameters but a stretch, and how the spectrum changes with each."""
-        found = []
+        found: list[tuple[float, Spectrum]] = []
         for i, label in enumerate(self.labels):
             if label != STRETCH:
                 a, b, step = self._ends(i)

@@ -71,7 +71,7 @@ def from_start(
 ) -> Fitted:
     """Fit from the recipe's chain, with its poles times a factor and the data's decay."""
     start = ElectronicsResponse(config, float(first.response.dt_ns))
-    start.log_poles_ns.data.add_(math.log(factor))
+    start.log_poles_ns += math.log(factor)
     set_decay(start, first.slope)
     return fitter.fit(first.of(start))
 
@@ -98,7 +98,7 @@ def drift_if_better(found: Fitted, fitter: Fitter) -> Fitted:
     tried = with_settings(response, drift_terms=terms)
     again = fitter.fit(found.problem.of(tried), coarse=terms == 1)
     assert tried.drift is not None
-    sane = float(tried.drift.stretch.detach().abs().max()) < MAX_STRETCH
+    sane = np.abs(tried.drift.stretch).max() < MAX_STRETCH
     return again if sane and gains(DRIFT[terms], found, again, fitter) else found
 
 
@@ -167,14 +167,14 @@ def _free_decay_starts(
         for share in shares:
             response = ElectronicsResponse(config, dt_ns)
             set_decay(response, problem.slope + dt_us * share * steeper, decay)
-            response.log_poles_ns.data.copy_(known.log_poles_ns.data)
+            response.log_poles_ns[:] = known.log_poles_ns
             if with_slow:
                 kept = [tau in config.slow_ns for tau in known.config.slow_ns]
-                response.slow_weights.data.copy_(known.slow_weights.data[kept])
+                response.slow_weights[:] = known.slow_weights[kept]
             if response.drift is not None and known.drift is not None:
-                response.drift.load_state_dict(known.drift.state_dict())
-            response.log_fast_decays_us.data.fill_(math.log(fast_us))
-            response.decay_weights.data.fill_(share)
+                response.drift.fill(known.drift.arrays())
+            response.log_fast_decays_us[:] = math.log(fast_us)
+            response.decay_weights[:] = share
             yield problem.of(response)
 
 
@@ -242,11 +242,11 @@ def with_settings(response: ElectronicsResponse, **settings: Any) -> Electronics
     """A copy of a response with other parts, which have no effect yet."""
     config = response.config.model_copy(update=settings)
     copied = ElectronicsResponse(config, float(response.dt_ns))
-    known = response.state_dict()
-    for name, values in copied.state_dict().items():  # these share their memory
+    known = response.arrays()
+    for name, values in copied.arrays().items():
         if name in known:
-            old = known[name].flatten()[: values.numel()]
-            values.view(-1)[: len(old)] = old
+            n = min(values.size, known[name].size)
+            values.reshape(-1)[:n] = known[name].reshape(-1)[:n]
     copied.decay_known = response.decay_known
     return copied
 
@@ -256,7 +256,7 @@ def set_decay(
 ) -> None:
     """Set the main decay to that of the data: known from pile-up, or from the tails."""
     if decay is not None:
-        response.log_decay_us.data.fill_(math.log(decay.us))
+        response.log_decay_us[:] = math.log(decay.us)
         response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)
     elif slope < 0:
-        response.log_decay_us.data.fill_(math.log(-float(response.dt_ns) * 1e-3 / slope))
+        response.log_decay_us[:] = math.log(-float(response.dt_ns) * 1e-3 / slope)

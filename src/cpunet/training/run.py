@@ -18,34 +18,36 @@ import logging
 import platform
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias, TypeVar
 
-import torch
+import numpy as np
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
-from safetensors.torch import load, save
-from torch import Tensor, nn
+from safetensors.numpy import load, save
 
 import cpunet
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.errors import CpunetError
+from cpunet.networks import require_torch
+from cpunet.networks.stored import Array, Stored
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values
 from cpunet.tables import aligned
-from cpunet.training.loop import Record
 from cpunet.training.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+    from torch import nn
 
     from cpunet.pulses.channels import Outcome
     from cpunet.translation.translation import Translation
@@ -57,6 +59,17 @@ log = logging.getLogger(__name__)
 FORMAT = 2
 """Format of run folders; those of other versions cannot be loaded."""
 
+
+class Shaped(Protocol):
+    """Array of either library."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+
+Record = dict[str, float | int | dict[str, float]]
+"""What is logged of a step: ``iteration``, ``rate`` and ``losses``."""
+
 INFO, RECIPE, LOSSES, WEIGHTS = "run.json", "recipe.yaml", "losses.jsonl", "weights.safetensors"
 RUN = FolderKind(
     name="run",
@@ -64,7 +77,7 @@ RUN = FolderKind(
     own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
     r"|calibration\.json|(profiles|pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
 )
-Network = TypeVar("Network", bound=nn.Module)
+Network = TypeVar("Network", bound="Stored | nn.Module")
 _NOT_STORED: Any = {"exclude": True, "repr": False}
 
 
@@ -105,7 +118,7 @@ class Run(InfoPart):
     recipe
         All settings of the training.
     weights
-        Weights of the networks by name, on the CPU.
+        Arrays of all parts by name.
     folder
         Folder of the run; None if it is in memory only.
     peak, seed, device, init
@@ -126,7 +139,7 @@ class Run(InfoPart):
 
     dt_ns: Annotated[float, Field(gt=0, le=1e9)]
     recipe: Recipe = Field(**_NOT_STORED)
-    weights: dict[str, Tensor] = Field(**_NOT_STORED)
+    weights: dict[str, Array] = Field(**_NOT_STORED)
     folder: Path | None = Field(None, **_NOT_STORED)
     peak: str
     seed: Annotated[int, Field(ge=0)] | None
@@ -149,9 +162,13 @@ class Run(InfoPart):
     __hash__ = object.__hash__
 
     @classmethod
-    def of(cls, model: nn.Module, recipe: Recipe, **facts: Any) -> Self:
-        """Make a run of trained networks, the children of a model."""
-        weights = {n: w.detach().cpu().contiguous() for n, w in model.state_dict().items()}
+    def of(cls, parts: Mapping[str, Stored | nn.Module], recipe: Recipe, **facts: Any) -> Self:
+        """Make a run of trained parts."""
+        weights = {
+            f"{part}.{name}": np.array(values, order="C")
+            for part, of in parts.items()
+            for name, values in arrays_of(of).items()
+        }
         return cls.model_validate({**facts, "recipe": recipe, "weights": weights})
 
     @classmethod
@@ -177,7 +194,7 @@ class Run(InfoPart):
             )
         recipe = checked(Recipe, read_values(folder / RECIPE), str(folder / RECIPE))
         try:
-            weights: dict[str, Tensor] = load((folder / WEIGHTS).read_bytes())
+            weights = load((folder / WEIGHTS).read_bytes())
         except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
             raise CpunetError(
                 f"{folder / WEIGHTS}: no readable weights; train again"
@@ -216,7 +233,7 @@ class Run(InfoPart):
         return self.model_copy(update={"folder": Path(folder)})
 
     def fill(self, part: str, network: Network, device: str = "cpu") -> Network:
-        """Fill a network with the weights of a part (``"ren"``, ``"iren"``, …) to apply it.
+        """Fill a network, or a readout, with the arrays of a part (``"ren"``, ``"iren"``, …).
 
         Raises
         ------
@@ -229,18 +246,23 @@ class Run(InfoPart):
             for key, values in self.weights.items()
             if key.startswith(prefix)
         }
-        if wrong := differing(own, network.state_dict()):
+        if wrong := differing(own, arrays_of(network)):
             raise CpunetError(
                 f"{where}: weights of another network: {len(wrong)} tensors differ, first "
                 f"{wrong[0]}"
             )
-        floating = {key: values for key, values in own.items() if values.is_floating_point()}
+        floating = {key: values for key, values in own.items() if values.dtype.kind == "f"}
         for key, values in floating.items():
-            if not bool(torch.isfinite(values).all()):
+            if not np.isfinite(values).all():
                 raise CpunetError(f"{where}: {part}.{key} is not finite; train again")
-        if floating and not any(bool(values.any()) for values in floating.values()):
+        if floating and not any(values.any() for values in floating.values()):
             raise CpunetError(f"{where}: all weights of {part} are zero; train again")
-        network.load_state_dict(own)
+        if isinstance(network, Stored):
+            network.fill(own)
+            return network
+        import torch
+
+        network.load_state_dict({key: torch.from_numpy(values) for key, values in own.items()})
         return network.to(torch.device(device)).eval()
 
     @property
@@ -378,20 +400,38 @@ def used_run(run: RunLike) -> Run:
     return used
 
 
-def differing(own: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> list[str]:
-    """Names of tensors that only one side has, or in another shape."""
+def arrays_of(part: Stored | nn.Module) -> dict[str, Array]:
+    """What a run stores of a part, by name."""
+    if isinstance(part, Stored):
+        return part.arrays()
+    return {name: values.detach().cpu().numpy() for name, values in part.state_dict().items()}
+
+
+def differing(own: Mapping[str, Shaped], expected: Mapping[str, Shaped]) -> list[str]:
+    """Names of arrays that only one side has, or in another shape."""
     shapes = [{name: value.shape for name, value in side.items()} for side in (own, expected)]
     return sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()})
 
 
-def resolve_device(device: str) -> str:
-    """Resolve ``"auto"`` to a device; raise a `CpunetError` if a device is missing."""
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    known = re.fullmatch(r"cpu|cuda(?::(\d+))?", device)
+def resolve_device(device: str, recipe: Recipe) -> str:
+    """Resolve ``"auto"`` to the device of a recipe's networks; that of a chain is the CPU.
+
+    Raises
+    ------
+    CpunetError
+        If a device, or torch, is missing.
+    """
+    known = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
     if known is None:
         raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
-    if device != "cpu" and not torch.cuda.is_available():
+    if device == "cpu" or recipe.training.method == "matching":
+        return "cpu"
+    require_torch()
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if not torch.cuda.is_available():
         raise CpunetError("no GPU was found; use `device` cpu or install a CUDA build of torch")
     if known[1] and int(known[1]) >= torch.cuda.device_count():
         count = torch.cuda.device_count()
@@ -401,8 +441,11 @@ def resolve_device(device: str) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of the software that affects the result."""
-    packages = {name: version(name) for name in ("torch", "numpy", "numba")}
-    return {"python": platform.python_version(), "cpunet": cpunet.__version__} | packages
+    found = {"python": platform.python_version(), "cpunet": cpunet.__version__}
+    for name in ("numpy", "scipy", "numba", "torch"):
+        with suppress(PackageNotFoundError):  # torch is needed by networks only
+            found[name] = version(name)
+    return found
 
 
 def append_losses(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:

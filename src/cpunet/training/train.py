@@ -87,7 +87,7 @@ def train(
 
     ``cpunet train --sim sim.lh5 --data raw.lh5 --data-table all --out runs``
     """
-    # imported late: torch takes seconds, and the help of the command must not wait for it
+    # imported late: this takes a second, and the help of the command must not wait for it
     from cpunet.recipes import load_recipe
     from cpunet.recipes.schema import Recipe
     from cpunet.settings import require_seed
@@ -98,7 +98,8 @@ def train(
     if target is not None and not isinstance(recipe, Recipe):
         refuse_inputs(target, recipe)
     require_seed(seed)
-    chosen, device = load_recipe(recipe, settings), resolve_device(device)
+    chosen = load_recipe(recipe, settings)
+    device = resolve_device(device, chosen)
     sides = read.files(sim, data)
 
     training = Training(chosen, peak, init, seed, device, resume, force)
@@ -106,7 +107,7 @@ def train(
     of_all: list[str] = []
     if sides[1].table != ALL:
         start = None if init is None else as_run(init)
-        trained = training.run(sides, target, start, go_on=resume)
+        trained = training.run(sides, target, start)
     elif target is None:
         raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
     else:

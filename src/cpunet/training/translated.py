@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TypeVar
 
+import numba
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
@@ -131,12 +131,12 @@ class Noise:
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     """Threads for blocks, which are kept: to start them takes a tenth of the time of these."""
-    return ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+    return ThreadPoolExecutor(threads)
 
 
 def in_threads(of: Callable[[int], T], starts: range) -> list[T]:
     """What is made of blocks of pulses, in their order, whichever thread finishes first."""
-    threads = torch.get_num_threads()
+    threads = numba.get_num_threads()
     if threads == 1 or len(starts) == 1:
         return [of(first) for first in starts]
     return list(_pool(threads).map(of, starts))
@@ -238,8 +238,7 @@ class SimulatedSide:
     ) -> list[Total]:
         """Same as `sums`, for each block of `size` pulses in their order."""
         padded = padded_length(self.length)
-        with torch.no_grad():
-            transfer = np.asarray(response.transfer(padded).numpy(), np.complex64)
+        transfer = response.transfer(padded).astype(np.complex64)
         self.forget_unless(response)
 
         def one(first: int) -> tuple[list[Total], list[Total], int]:
@@ -292,8 +291,7 @@ class SimulatedSide:
         if (kept := self._spectra.get((first, len(sim)))) is not None:
             return kept
         if response.drift is not None:
-            with torch.no_grad():
-                sim = response.drifted(torch.from_numpy(np.ascontiguousarray(sim))).numpy()
+            sim = response.drifted(sim)
         current = np.zeros((len(sim), self.length), np.float32)
         before, after = padding(self.dt_ns)
         current[:, before] = sim[:, 0]

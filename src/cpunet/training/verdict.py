@@ -15,7 +15,7 @@ import numpy as np
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import InfoPart
 from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
-from cpunet.training.comparison import AMPLITUDE, Comparison, Sides, response_transfer
+from cpunet.training.comparison import AMPLITUDE, Comparison, Sides
 
 # Limits: chi-square per sample of the median slice, and per quantile of the amplitude; standard
 # errors of the mean pulse; AUC, which must also be so many deviations from its null.
@@ -163,7 +163,7 @@ def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
 
 def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
     comparison = Comparison(sides, WIDTH)
-    transfer = response_transfer(response, sides.padded)
+    transfer = response.transfer(sides.padded)
     z, differences = comparison.mean_pulse(transfer), comparison.differences(transfer)
     time, worst = sides.time_ns, int(np.abs(z).argmax())
     beyond = time[np.abs(z) > MAX_Z]

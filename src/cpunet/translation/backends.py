@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.electronics.finishing import finish, padding, with_room
+from cpunet.networks import require_torch
 from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
-from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig, PunetConfig
 from cpunet.training.run import Run
+
+if TYPE_CHECKING:
+    from cpunet.networks.positional_unet import PositionalUNet
 
 Energies = npt.NDArray[np.float64]
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
@@ -45,7 +46,7 @@ class Drawn:
 
     energy_kev: Energies | None = None
     noise: bool = True
-    generator: torch.Generator | None = None
+    generator: np.random.Generator = field(default_factory=np.random.default_rng)
     tails_kev: Energies | None = None
     piled: InTracePileUp | None = None
 
@@ -62,11 +63,6 @@ class Drawn:
             tails_kev=None if self.tails_kev is None else self.tails_kev[rows],
             piled=None if self.piled is None else self.piled.of_rows(rows),
         )
-
-    def seed(self, default: torch.device) -> int:
-        """Seed of the electronic noise, from the random generator."""
-        device = default if self.generator is None else self.generator.device
-        return int(torch.randint(2**62, (), generator=self.generator, device=device))
 
 
 class Translated(NamedTuple):
@@ -92,8 +88,8 @@ class Backend(ABC):
 
     Attributes
     ----------
-    network : torch.nn.Module
-        Module with the weights.
+    network
+        What the run stores.
     config : PreparationConfig
         Preparation of the pulses that it gives.
     dt_ns : float
@@ -108,19 +104,13 @@ class Backend(ABC):
         Distribution of the pile-up tails under the data, if known.
     """
 
-    network: nn.Module
+    network: PositionalUNet | ResponseGenerator | LinearInverse
     config: PreparationConfig
     dt_ns: float
     needs_energies: bool = False
     chain: ResponseGenerator | None = None
     noise: BaselineNoise | None = None
     tails: DrawnTails | None = None
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the computation."""
-        weights: torch.Tensor = next(iter(self.network.state_dict().values()))
-        return weights.device
 
     @abstractmethod
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
@@ -135,8 +125,7 @@ class Backend(ABC):
 
         `windows` are those of which `shapes` makes the other pulses.
         """
-        energy_kev, piled = drawn.energy_kev, drawn.piled
-        seed, added = drawn.seed(self.device), None
+        energy_kev, piled, added = drawn.energy_kev, drawn.piled, None
         if drawn.others and energy_kev is not None:
             added = np.zeros(records.shape)
             if drawn.tails_kev is not None and self.tails is not None:
@@ -152,7 +141,7 @@ class Backend(ABC):
             dt_ns=self.dt_ns,
             noise=self.noise if drawn.noise else None,
             energy_kev=energy_kev if drawn.noise else None,
-            seed=seed,
+            seed=drawn.generator,
             added=added,
         )
         return Translated(done.windows, done.codes, done.begin - padding(self.dt_ns)[0])
@@ -193,8 +182,13 @@ class NetworkBackend(Backend):
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Run the network; add noise in proportion to 1/energy, and prepare like data."""
-        batch = torch.from_numpy(windows).to(self.device)
-        out = self.network(batch[:, None], generator=drawn.generator, mean=not drawn.noise)
+        import torch
+
+        device = next(self.network.parameters()).device
+        generator = torch.Generator(device).manual_seed(int(drawn.generator.integers(2**62)))
+        with torch.inference_mode():
+            batch = torch.from_numpy(windows).to(device)[:, None]
+            out = self.network(batch, generator=generator, mean=not drawn.noise)
         clean: FloatArray = out[:, 0].cpu().numpy()
         if self.noise is None or not drawn.noise:
             n = len(windows)
@@ -209,17 +203,17 @@ class ResponseBackend(Backend):
     """A readout chain with electronic noise and the preparation of measured traces."""
 
     needs_energies = True
+    network: ResponseGenerator
     chain: ResponseGenerator
 
     def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
-        self.network = self.chain = generator.eval()
+        self.network = self.chain = generator
         self.noise, self.tails = generator.noise, generator.tails
         self.config, self.dt_ns = config, float(generator.response.dt_ns)
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
-        records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
-        return self.finished(windows, records, drawn)
+        return self.finished(windows, self.network(windows), drawn)
 
     def levels(self, windows: FloatArray, n_pre: int, length: int) -> Translated:
         """Noise-free traces of prepared simulated windows, aligned at sample `n_pre`."""
@@ -240,8 +234,7 @@ class ResponseBackend(Backend):
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
         """Records without noise, and the same prepared; flat tops do not count as saturated."""
-        with torch.inference_mode():
-            records = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
+        records = self.network(windows)
         config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
         pulses = Pulses.of(records, dt_ns=self.dt_ns)
         return records, prepare(pulses, config, "measured")
@@ -259,14 +252,13 @@ class InverseBackend(Backend):
     network: LinearInverse
 
     def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
-        self.network = inverse.eval()
+        self.network = inverse
         self.config = config
         self.dt_ns = dt_ns
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Invert the response and suppress the noise; deterministic."""
-        pulses = self.network(torch.from_numpy(windows).to(self.device)).cpu().numpy()
-        pulses = np.asarray(pulses, np.float32)
+        pulses = np.asarray(self.network(windows), np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
         result, begin = np.full_like(windows, np.nan), np.zeros(len(windows), np.int64)
         result[prepared.index] = prepared.pulses.waveforms
@@ -285,14 +277,17 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
     recipe, forward = run.recipe, part == "ren"
     generator, preparation = recipe.generator, recipe.preparation
     if isinstance(generator, PunetConfig):
+        require_torch()
+        from cpunet.networks.positional_unet import PositionalUNet
+
         network = run.fill(part, PositionalUNet(generator, preparation.length), device)
         if not forward or recipe.cyclegan.training.noise == "none":
             return NetworkBackend(network, preparation)
-        kept = run.fill(NOISE, KeptNoise(run.dt_ns), device)
+        kept = run.fill(NOISE, KeptNoise(run.dt_ns))
         return NetworkBackend(network, preparation, kept, run.tails)
     if forward:
-        response = run.fill(part, ResponseGenerator(generator, run.dt_ns), device)
+        response = run.fill(part, ResponseGenerator(generator, run.dt_ns))
         response.tails = run.tails
         return ResponseBackend(response, preparation)
     inverse = LinearInverse(preparation.length, recipe.matching.training)
-    return InverseBackend(run.fill(part, inverse, device), preparation, run.dt_ns)
+    return InverseBackend(run.fill(part, inverse), preparation, run.dt_ns)

@@ -71,7 +71,7 @@ def _processor(translator: Translator, period: Any, noise: bool, seed: int) -> G
     if period is not None:
         dt_ns = float(period.to("ns").magnitude) if hasattr(period, "to") else float(period)
         translator.require_sampling("waveforms", dt_ns)
-    generator = translator.seeded(seed)
+    generator = np.random.default_rng(seed)
 
     def translate(
         waveforms: npt.NDArray[Any], energy_kev: npt.ArrayLike | None = None

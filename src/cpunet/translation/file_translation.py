@@ -97,7 +97,7 @@ class FileTranslation:
     def __init__(self, run: RunLike, options: TranslateOptions) -> None:
         self.run, self.options = as_run(run), options
         self.kind: type[Translator] = IREN if options.inverse else REN
-        self.translator = self.kind.of(self.run, resolve_device("auto"))
+        self.translator = self.kind.of(self.run, resolve_device("auto", self.run.recipe))
         self.form = form_of(self.run, self.translator, options)
         identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
         self._print = hashlib.sha256(identity.encode()).hexdigest()
@@ -226,7 +226,7 @@ class FileTranslation:
         with stage("Translating", pulses.n_pulses) as bar:
             for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
                 seed = noise_seed(self.options.seed, noise_key, number)
-                generator = self.translator.seeded(seed)
+                generator = np.random.default_rng(seed)
                 yield self.form(block, noise=self.options.noise, generator=generator)
 
 

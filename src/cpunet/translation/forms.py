@@ -10,11 +10,9 @@ baseline before them and with the decay fitted to their end after them, both wit
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from cpunet.electronics.drawn_pile_up import Columns, DrawnPileUp, DrawnTails
 from cpunet.electronics.finishing import extended
@@ -73,13 +71,13 @@ class Windows:
         self.record = before + self.n_pre, record_length(self.length, translator.dt_ns)
 
     def __call__(
-        self, pulses: Pulses, *, noise: bool, generator: torch.Generator | None
+        self, pulses: Pulses, *, noise: bool, generator: np.random.Generator
     ) -> TranslatedPulses:
         """Translate pulses, keeping their rows."""
         left, piled = drawn_kev(self.tails, len(pulses), generator), None
         truth: Columns = {} if left is None else {"tails_kev": (left, "keV")}
         if self.pile_up is not None:
-            piled = self.pile_up.draw(len(pulses), *self.record, rng_of(generator))
+            piled = self.pile_up.draw(len(pulses), *self.record, generator)
             truth |= piled.columns()
         known = Drawn(pulses.energy_kev, noise, generator, left, piled)
         return replace(self._translated(pulses, known), truth=truth)
@@ -147,8 +145,7 @@ class AdcTraces(Windows):
     def _translated(self, pulses: Pulses, known: Drawn) -> TranslatedPulses:
         """Traces of all pulses; those without energy are rejected."""
         if self.translator.backend.chain is not None:
-            act = partial(self._of_chain, rng_of(known.generator))
-            done = self.translator.translate_drawn(pulses, known, act, self.length)
+            done = self.translator.translate_drawn(pulses, known, self._of_chain, self.length)
             windows, t0_ns = done.pulses.waveforms, done.pulses.t0_ns
         else:
             done = self.translator.translate_drawn(pulses, replace(known, tails_kev=None))
@@ -172,16 +169,14 @@ class AdcTraces(Windows):
         whole = replace(pulses, waveforms=traces.astype(np.float32), t0_ns=t0_ns)
         return TranslatedPulses(whole, codes, saturated)
 
-    def _of_chain(
-        self, rng: np.random.Generator, windows: FloatArray, known: Drawn
-    ) -> Translated:
+    def _of_chain(self, windows: FloatArray, known: Drawn) -> Translated:
         """Traces in prepared units from a readout chain."""
         backend, piled, dt_ns = self.translator.backend, known.piled, self.translator.dt_ns
         energies = known.energy_kev
         assert energies is not None  # those of the pulses
         levels, codes, begin = backend.levels(windows, self.n_pre, self.length)
         if known.noise and backend.noise is not None:
-            levels += backend.noise.draw(energies, self.length, rng)
+            levels += backend.noise.draw(energies, self.length, known.generator)
         if piled is not None and len(piled.row):
             # early piled-up pulses need longer traces
             reached = self.length + piled.reach(dt_ns)
@@ -288,17 +283,10 @@ def _height(translator: Translator) -> float:
 
 
 def drawn_kev(
-    tails: DrawnTails | None, n: int, generator: torch.Generator | None
+    tails: DrawnTails | None, n: int, generator: np.random.Generator
 ) -> npt.NDArray[np.float64] | None:
     """Pile-up tails of `n` pulses in keV, drawn from the random generator of the noise."""
-    return None if tails is None else tails.draw_kev(n, rng_of(generator))
-
-
-def rng_of(generator: torch.Generator | None) -> np.random.Generator:
-    """A NumPy generator, seeded by a draw from that of torch."""
-    device = "cpu" if generator is None else generator.device
-    seed = torch.randint(2**62, (), generator=generator, device=device)
-    return np.random.default_rng(int(seed))
+    return None if tails is None else tails.draw_kev(n, generator)
 
 
 def wanted_tails(

@@ -7,15 +7,15 @@ of any length are accepted.  Preparation leaves prepared pulses unchanged.
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from cpunet.electronics.drawn_pile_up import Columns, DrawnTails
 from cpunet.errors import CpunetError
@@ -26,7 +26,10 @@ from cpunet.tables import counted
 from cpunet.training.run import Run
 from cpunet.translation.backends import Backend, Drawn, Energies, Translated, backend_of
 
-Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], torch.Tensor)
+if TYPE_CHECKING:
+    import torch
+
+Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], "torch.Tensor")
 
 Act: TypeAlias = Callable[[FloatArray, Drawn], Translated]
 
@@ -191,11 +194,11 @@ class Translator:
             If pulses cannot be translated, with their numbers by reason; their rows are NaN.
             `translate_pulses` returns a code for each instead.
         """
-        array = (
-            waveforms.detach().cpu().float().numpy()  # NumPy has no bfloat16
-            if isinstance(waveforms, torch.Tensor)
-            else np.asarray(waveforms)
-        )
+        torch: Any = sys.modules.get("torch")  # without which there are no tensors
+        given: Any = waveforms
+        tensor = torch is not None and isinstance(given, torch.Tensor)
+        # NumPy has no bfloat16
+        array = given.detach().cpu().float().numpy() if tensor else np.asarray(given)
         if not array.ndim:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
         if noise and self.needs_energies and energy_kev is None:
@@ -208,7 +211,7 @@ class Translator:
         if tails_kev is not None:
             left = _one_each("tails_kev", tails_kev, len(pulses))
         done = self.translate_pulses(
-            pulses, noise=noise, generator=self.seeded(seed), tails_kev=left
+            pulses, noise=noise, generator=np.random.default_rng(seed), tails_kev=left
         )
         reasons = counted(done.rejections)
         if array.ndim == 1 and reasons:
@@ -220,17 +223,16 @@ class Translator:
                 RejectionWarning,
                 stacklevel=2,
             )
-        result = done.pulses.waveforms[0] if array.ndim == 1 else done.pulses.waveforms
-        if isinstance(waveforms, torch.Tensor):
-            return torch.from_numpy(result).to(waveforms.device)
-        return result
+        result: Any = done.pulses.waveforms[0] if array.ndim == 1 else done.pulses.waveforms
+        translated: Waveforms = torch.from_numpy(result).to(given.device) if tensor else result
+        return translated
 
     def translate_pulses(
         self,
         pulses: Pulses,
         *,
         noise: bool = True,
-        generator: torch.Generator | None = None,
+        generator: np.random.Generator | None = None,
         tails_kev: Energies | None = None,
     ) -> TranslatedPulses:
         """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
@@ -252,6 +254,7 @@ class Translator:
         CpunetError
             If the sampling period is not that of the training.
         """
+        generator = generator or np.random.default_rng()
         drawn = Drawn(pulses.energy_kev, noise, generator, tails_kev)
         return self.translate_drawn(pulses, drawn)
 
@@ -291,11 +294,11 @@ class Translator:
         *,
         energy_kev: Energies | None = None,
         noise: bool = True,
-        generator: torch.Generator | None = None,
+        generator: np.random.Generator | None = None,
         tails_kev: Energies | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        drawn = Drawn(energy_kev, noise, generator, tails_kev)
+        drawn = Drawn(energy_kev, noise, generator or np.random.default_rng(), tails_kev)
         return self.apply_with_codes(windows, drawn).windows
 
     def apply_with_codes(
@@ -333,21 +336,11 @@ class Translator:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
         result = np.empty((len(windows), length or windows.shape[1]), np.float32)
         codes, begin = np.zeros(len(windows), np.uint8), np.zeros(len(windows), np.int64)
-        with torch.inference_mode():
-            for first in range(0, len(windows), BATCH):
-                rows = np.arange(first, min(first + BATCH, len(windows)))
-                some = windows[rows], drawn.of_rows(rows)
-                result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)
+        for first in range(0, len(windows), BATCH):
+            rows = np.arange(first, min(first + BATCH, len(windows)))
+            some = windows[rows], drawn.of_rows(rows)
+            result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)
         return Translated(result, codes, begin)
-
-    def seeded(self, seed: int | None) -> torch.Generator:
-        """Return a random generator for the noise, randomly seeded if the seed is None."""
-        generator = torch.Generator(device=self.backend.device)
-        if seed is None:
-            generator.seed()
-        else:
-            generator.manual_seed(seed)
-        return generator
 
 
 def _one_each(name: str, energy_kev: npt.ArrayLike, n: int) -> Energies:

@@ -89,7 +89,7 @@ def evaluate(
         If the input cannot be used, or no peak can be scored.
     """
     recipe, trained_on = run.recipe, run.peak
-    ren = REN.of(run, resolve_device("auto"))
+    ren = REN.of(run, resolve_device("auto", run.recipe))
     others = further.replace(" ", "").split(",") if further else []
     names = list(dict.fromkeys([*recipe.peaks, trained_on, *others]))
     selection = _selected(recipe, names)

@@ -19,7 +19,6 @@ from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
@@ -313,7 +312,7 @@ def translate_all(
     if responses is not None:
         truth = np.empty(shape, np.float32)
         squares = {m: np.zeros((len(pulses), 4)) for m in ("raw", *baselines.methods, "ren")}
-    generator = ren.seeded(seed)
+    generator = np.random.default_rng(seed)
     # all methods get the same noise
     rngs = {name: np.random.default_rng(seed) for name in others}
     with stage("Translating", len(pulses)) as bar:
@@ -358,7 +357,7 @@ def translate_all(
     )
 
 
-def like_data(ren: REN, pulses: Pulses, generator: torch.Generator) -> FloatArray:
+def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:
     """Translated windows with noise and pile-up tails as those of the data."""
     tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
     return ren.apply(

@@ -105,7 +105,7 @@ def tune(
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     out, sides = Path(out), read.files(sim, data)
     recipe = load_recipe(recipe, settings)
-    device, space = resolve_device(device), search_space(recipe)
+    device, space = resolve_device(device, recipe), search_space(recipe)
     refuse_inputs(out, *sides[0].files, *sides[1].files)
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
@@ -289,7 +289,7 @@ class HeldOut:
         CpunetError
             If pulses cannot be translated.
         """
-        windows = like_data(ren, self.sim, ren.seeded(self.seed))
+        windows = like_data(ren, self.sim, np.random.default_rng(self.seed))
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MAX_LOST:
             raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")

@@ -1,0 +1,61 @@
+"""Readouts need no torch; networks say what they need."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from synthetic import write_chain
+
+PROGRAM = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from cpunet.cli import main
+main()
+"""
+
+
+def without_torch(*words: object) -> subprocess.CompletedProcess[str]:
+    """Run a command where torch cannot be imported."""
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONWARNINGS": "error"},
+    )
+
+
+@pytest.mark.parametrize(
+    "words", ["translate {run} {sim} --seed 1 --out {out}", "response {run} --out {out}"]
+)
+def test_a_readout_is_used_without_torch(tmp_path: Path, stand, words):
+    run, out = write_chain(tmp_path / "run", noise_kev=2), tmp_path / "out.lh5"
+    done = without_torch(*words.format(run=run, sim=stand.sim, out=out).split())
+    assert (done.returncode, out.exists()) == (0, True), done.stderr
+
+
+def test_what_networks_need_is_named(tmp_path: Path, stand):
+    done = without_torch("train", *stand.inputs, "--recipe", "paper", "--out", tmp_path / "run")
+    assert done.stderr.splitlines()[-1] == (
+        "error: networks need torch, which is not installed; "
+        "pip install 'cpunet-hpge[networks]'"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.thorough
+def test_the_demo_needs_no_torch(tmp_path: Path):
+    done = without_torch("demo", "--quick", "--out", tmp_path / "demo")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "demo" / "report" / "report.html").exists()
