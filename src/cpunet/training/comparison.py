@@ -48,7 +48,8 @@ RANKS = {
     RISE: np.linspace(0.02, 0.98, 8),
 }
 QUANTILES = np.r_[np.linspace(0.01, 0.95, 13), 0.97, 0.985, 0.995]
-BOOTSTRAPS = 400
+_ODDS = QUANTILES / (1 - QUANTILES)
+CORRELATION = np.sqrt(np.minimum.outer(_ODDS, _ODDS) / np.maximum.outer(_ODDS, _ODDS))
 POOLED = 0.5  # of the shapes' covariance, taken from all slices
 # A measured pulse with another before it, or on its tail: height of its baseline, time from
 # which the tail counts, and its RMS in units of the median.
@@ -219,13 +220,6 @@ class Comparison:
     def __init__(self, sides: Sides, width: float) -> None:
         self.sides, self.width = sides, width
         self.data = sides.view(sides.data.pulses)
-        rng, n = np.random.default_rng(0), len(sides.data)
-        rows = rng.integers(n, size=(BOOTSTRAPS, n))
-        self.spreads = {}
-        for by in RANKS:
-            drawn = np.quantile(getattr(sides.data, by)[rows], QUANTILES, axis=1)
-            spread = np.cov(drawn) * (1 + n / len(sides))
-            self.spreads[by] = spread + 1e-12 * np.eye(len(QUANTILES))
 
     def differences(self, transfer: Spectrum, basis: Basis | None = None) -> list[Difference]:
         """Compare the pulses translated by a response, with derivatives in a basis if given."""
@@ -269,13 +263,19 @@ class Comparison:
         self, by: str, noisy: list[Aligned], moves: Derivatives | None
     ) -> Difference:
         """Quantiles of a quantity."""
-        found = np.quantile(np.concatenate([getattr(one, by) for one in noisy]), QUANTILES)
-        apart, slopes = found - np.quantile(getattr(self.sides.data, by), QUANTILES), None
+        own = getattr(self.sides.data, by)
+        simulated = np.concatenate([getattr(one, by) for one in noisy])
+        found = np.quantile(simulated, QUANTILES)
+        apart, slopes = found - np.quantile(own, QUANTILES), None
+        errors = np.hypot(
+            quantile_errors(own, len(own)), quantile_errors(simulated, len(self.sides))
+        )
+        covariance = np.outer(errors, errors) * CORRELATION + 1e-12 * np.eye(len(errors))
         if moves is not None:
             near, _ = hats(getattr(noisy[0], by), found)
             counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
             slopes = near.T @ getattr(moves, by) / counts
-        return Difference(f"{by} quantiles", apart, self.spreads[by], slopes)
+        return Difference(f"{by} quantiles", apart, covariance, slopes)
 
     def _slices(
         self,
@@ -345,6 +345,17 @@ class Comparison:
         noisy = np.array([bounded(view[rows].astype(float)) for view in views])
         slopes = 1 - (noisy[0] / scale) ** 2
         return bounded(data), bounded(clean[rows].astype(float)), noisy, slopes
+
+
+def quantile_errors(values: Values, n: int) -> Values:
+    """Standard errors of the `QUANTILES` of `n` values: half of those an error of rank around.
+
+    Where a rare population begins, as that of events at the contact, the error is as large as
+    the jump to it, on whichever side of it the quantile is.
+    """
+    rank = np.sqrt(QUANTILES * (1 - QUANTILES) / n)
+    low, high = (np.quantile(values, (QUANTILES + s * rank).clip(0, 1)) for s in (-1, 1))
+    return np.asarray(0.5 * (high - low))
 
 
 def _rms(views: list[Floats], clean: Floats) -> Values:

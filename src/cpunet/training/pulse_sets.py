@@ -240,8 +240,10 @@ class PulseSets:
         for band, orders in self.parted:
             some, of_data = (order[:MOST] for order in orders)
             weights = band.weights[some]
-            if np.ptp(weights) > 0:
-                some = self.rng.choice(some, len(some), p=weights / weights.sum())
+            if np.ptp(weights) > 0:  # each as often as its weight says, to a whole number
+                share = np.cumsum(weights) / weights.sum()
+                places = (np.arange(len(some)) + 0.5) / len(some)
+                some = some[np.searchsorted(share, places)]
             sim = self.sim[band.sim[some]]
             data = self.data.waveforms[band.data[of_data]]  # in random order, as the simulated
             data = data[np.isfinite(data).all(axis=1)]
