@@ -223,6 +223,16 @@ def test_what_the_metadata_lack_is_named(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("value", ["4.4 kV", True, [4400], {"V": 4400}, -4400])
+@pytest.mark.parametrize("place", ["recommended_voltage_in_V", ""])
+def test_a_wrong_value_is_not_passed_over(tmp_path: Path, value: object, place: str) -> None:
+    sites = {"l200_site": {place: value} if place else value, **DIODE["characterization"]}
+    path = metadata(tmp_path, CRYSTAL, DIODE | {"characterization": sites})
+    if place or not isinstance(value, dict):
+        said = refused(path)
+        assert "l200_site.recommended_voltage_in_V" in said
+
+
 def test_an_exponential_that_ends_before_the_detector(tmp_path: Path) -> None:
     crystal = copy.deepcopy(CRYSTAL)
     crystal["impurity_curve"]["parameters"] |= {"l": 200.0, "m": 0.1}

@@ -104,11 +104,12 @@ def load_prepared(
         If no pulse is left; the message gives the file, the counts by reason and a remedy.
     """
     sets: list[Prepared] = []
-    n_kept = 0
+    n_kept, seen_before = 0, set[int]()
     rng, drawn = np.random.default_rng(0), list[FloatColumn]()
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
             part = _prepare_selected(block, config, kind, selection)
+            part = part.rejected(_copies(block[part.index], kind, seen_before))
             if seen is not None:
                 seen(block, part)
             n_kept += len(part)
@@ -122,6 +123,20 @@ def load_prepared(
     if max_pulses is not None and n_kept > max_pulses:
         n_kept = _thin(sets, drawn, max_pulses)
     return _joined(sets, n_kept)
+
+
+def _copies(pulses: Pulses, kind: Kind, before: set[int]) -> Codes:
+    """Codes of pulses, in which those read before, as of rows written twice, are copies.
+
+    Simulated pulses without noise can be alike; their events must be the same, too.
+    """
+    codes: Codes = np.zeros(len(pulses), np.uint8)
+    numbers = pulses.event_number if kind == "simulated" else codes
+    for row, (trace, number) in enumerate(zip(pulses.waveforms, numbers, strict=True)):
+        key = hash((int(number), trace.tobytes()))
+        codes[row] = Rejection.COPIES if key in before else Rejection.ACCEPTED
+        before.add(key)
+    return codes
 
 
 def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> int:
@@ -393,7 +408,7 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
         raise CpunetError(
             f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
             f"{data.dt_ns:g} ns",
-            "resample one of them",
+            "resample one of them, or give `dt_ns` if one says it wrongly",
         )
 
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.description import rolled_over
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.provenance import apparent_side, recorded_side, refuse_other_side
@@ -127,6 +128,7 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
 # and from which a warning tells of it; traces in which a second rate is looked for.
 MAX_APART, FEW_APART, RATE_TRACES = 0.2, 0.1, 512
+MIN_ROLLED = 0.05  # share of traces whose counts roll over
 SWAPPED = "are `sim` and `data` swapped?"
 
 
@@ -192,6 +194,8 @@ class Seen:
 
     def explained(self, error: CpunetError, selection: EnergySelection) -> CpunetError:
         """Why no pulse can be used, if what was read tells: polarity, energies, calibration."""
+        if refusal := self._rolled_over():
+            return refusal
         if self._first is not None and go_down(self._first):
             return CpunetError(
                 f"{self._path}: the traces go down: their polarity is negative",
@@ -206,10 +210,22 @@ class Seen:
             return error
         return CpunetError(f"{error}; their amplitudes look like {found}")
 
+    def _rolled_over(self) -> CpunetError | None:
+        found = None if self._first is None else rolled_over(self._first)
+        if found is None or found.share < MIN_ROLLED:
+            return None
+        return CpunetError(
+            f"{self._path}: {found}",
+            "write them as unsigned (values.view('uint16') in NumPy), or as "
+            f"numpy.unwrap(values, period={found.period})",
+        )
+
     def require_sense(self) -> None:
-        """Refuse energies that are of other pulses; warn of a second rate."""
+        """Refuse counts that roll over, and energies of other pulses; warn of a second rate."""
         if self._insist or self._first is None:
             return
+        if refusal := self._rolled_over():
+            raise refusal
         share = apart(np.concatenate(self._kev), np.concatenate(self._amplitudes))
         told = (
             f"{self._path}: {100 * share:.0f} % of amplitudes and energies do not go together"
