@@ -289,7 +289,11 @@ def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
         ("pc_radius 14", "", "point_contact_radius", 12),
         ("pc_radius 0", "", "point_contact_radius", 12),
         ("hole_bullet_radius 6", "", "bore_bullet_radius", 5),
-        ("inner_taper_length 60", "", "inner_taper_length", 50),
+        # a taper ends where the bottom of the hole is rounded, as wide as it was meant to be
+        ("inner_taper_length 60", "", "inner_taper_length", 48),
+        ("inner_taper_length 60", "", "inner_taper_angle_deg", 6.241112),
+        ("hole_bullet_radius 6", "", "inner_taper_length", 44),
+        ("inner_taper_length 48", "", "inner_taper_angle_deg", 5),
         ("hole_length_gap 32", "", "bore_length", 48),
         ("pc_offset_x 0\nhole_offset_y_top 0.0", "", "bore_radius", 5),
         # no ditch: a wrap-around as far as the wall, or further, is none

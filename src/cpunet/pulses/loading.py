@@ -233,6 +233,8 @@ class SideInfo(InfoPart):
         Number of pulses read, of those used (text if unknown), and of others by reason.
     cuts
         Quality cuts of measured pulses.
+    counts
+        Lowest and highest count of measured traces.
     sha256
         Fingerprint of the pulses used.
     """
@@ -244,6 +246,7 @@ class SideInfo(InfoPart):
     used: int | str | None = None
     rejections: dict[str, int] = {}
     cuts: Annotated[CutWindows | None, Field(strict=False)] = None
+    counts: Annotated[tuple[int, int] | None, Field(strict=False)] = None
     sha256: str | None = None
 
     def reading(self, file: PulseFile) -> PulseFile:
@@ -263,7 +266,7 @@ class InputSet:
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
     simulated detector, if the file contains it; ``baselines`` what noise and pile-up tails need
-    of measured traces.
+    of measured traces; ``counts`` their lowest and highest sample.
     """
 
     prepared: Prepared
@@ -274,6 +277,7 @@ class InputSet:
     read_as: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None
     baselines: Baselines | None = None
+    counts: tuple[int, int] | None = None
 
     def provenance(self) -> SideInfo:
         """File, counts, and a fingerprint of the pulses used."""
@@ -286,6 +290,7 @@ class InputSet:
             used=len(self.prepared),
             rejections=self.prepared.rejections,
             cuts=self.cuts,
+            counts=self.counts,
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
         )
 
@@ -363,6 +368,7 @@ def load_pulses(
     return InputSet(
         prepared, source.dt_ns, file.path, seen.energies_kev, cuts, file.options,
         recorded_detector(source), None if cuts is None else seen.baselines(prepared),
+        seen.counts,
     )  # fmt: skip
 
 

@@ -159,6 +159,7 @@ class Seen:
         self._guess = recorded is None and not insist
         self._kev, self._amplitudes = list[Values](), list[Values]()
         self._first: npt.NDArray[np.float32] | None = None
+        self._ends = list[float]()
         self._baselines = list[Baselines]()
         self._whole, self._rows = list[Pulses](), list[npt.NDArray[np.int64]]()
 
@@ -174,6 +175,8 @@ class Seen:
         self._amplitudes.append(amplitude(block.waveforms))
         if self._side == "simulated":
             return
+        good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
+        self._ends += [float(good.min()), float(good.max())] if len(good) else []
         if sum(map(len, self._baselines)) < TRACES:
             like = self._baselines[:1]
             self._baselines.append(Baselines.of_block(block, self._config, *like))
@@ -185,6 +188,13 @@ class Seen:
         """Baselines, and whole traces of the pulses that are kept."""
         stay = np.isin(np.concatenate(self._rows), kept.index)
         return Baselines.concatenate(self._baselines, Pulses.concatenate(self._whole)[stay])
+
+    @property
+    def counts(self) -> tuple[int, int] | None:
+        """The lowest and the highest count of whole numbers; None of others."""
+        if self._first is None or not self._ends or (self._first != self._first.round()).any():
+            return None
+        return int(min(self._ends)), int(max(self._ends))
 
     @property
     def energies_kev(self) -> Values:
@@ -204,7 +214,8 @@ class Seen:
         known = self.energies_kev
         if len(known):
             none = not selection.select(known).any()
-            return CpunetError(f"{error}{_where_energies_are(known)}") if none else error
+            where = _where_energies_are(known, self._side)
+            return CpunetError(f"{error}{where}") if none else error
         found = suggested_calibration(np.concatenate([np.empty(0), *self._amplitudes]))
         if found is None:
             return error
@@ -241,14 +252,15 @@ class Seen:
             log.warning(f"{self._path}: {found}; cut the traces there, or resample them")
 
 
-def _where_energies_are(energies: Values) -> str:
+def _where_energies_are(energies: Values, side: Kind) -> str:
     """Hint on the range of energies in a file of which none is selected."""
     low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
     there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
-    if high > MAX_KEV:
-        return f"{there}: if these are ADC counts, give `kev_per_adc`"
+    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
+    if high > MAX_KEV and side == "measured":
+        return f"{there}: if these are ADC counts, {give}"
     if 0 < high < MIN_KEV:
-        return f"{there}: if these are MeV, give `kev_per_adc` 1000"
+        return f"{there}: if these are MeV, {give} 1000"
     from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
     n = int((energies >= from_kev).sum())
     if not n:

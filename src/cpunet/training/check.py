@@ -383,7 +383,8 @@ def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Fin
         fine = abs(off) <= OFF_LINE
         text += "" if fine else f", {off:+.1f} keV from where it should be"
         factor = line.energy_kev / found
-        remedy = f"energies times {factor:.5f}, as by `kev_per_adc`, would put it right"
+        how = ", as by `kev_per_adc`," if side == "measured" else " in its file"
+        remedy = f"energies times {factor:.5f}{how} would put it right"
         yield _judged(text, remedy, fine)
 
 
