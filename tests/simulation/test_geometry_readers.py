@@ -293,7 +293,6 @@ def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
         ("inner_taper_length 60", "", "inner_taper_length", 48),
         ("inner_taper_length 60", "", "inner_taper_angle_deg", 6.241112),
         ("hole_bullet_radius 6", "", "inner_taper_length", 44),
-        ("inner_taper_length 48", "", "inner_taper_angle_deg", 5),
         ("hole_length_gap 32", "", "bore_length", 48),
         ("pc_offset_x 0\nhole_offset_y_top 0.0", "", "bore_radius", 5),
         # no ditch: a wrap-around as far as the wall, or further, is none

@@ -104,7 +104,7 @@ def _axis(column: h5py.Dataset, where: str, name: str) -> Values:
     units = units_of(column)
     if (mm_per_unit := factor(units, "mm")) is None:
         raise CpunetError(
-            f"{where}: {name} is in {units!r}; known units are {unit_names('mm')}"
+            f"{where}: {name} is in {units!r}; expected one of {unit_names('mm')}"
         )
     values = np.asarray(column[()], np.float64) * mm_per_unit
     if len(values) < 2 or not (np.isfinite(values).all() and (np.diff(values) > 0).all()):

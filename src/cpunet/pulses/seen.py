@@ -128,7 +128,8 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
 # and from which a warning tells of it; traces in which a second rate is looked for.
 MAX_APART, FEW_APART, RATE_TRACES = 0.2, 0.1, 512
-MIN_ROLLED = 0.05  # share of traces whose counts roll over
+# Shares of traces whose counts roll over: why no pulse is left, and from which all are refused
+FEW_ROLLED, MAX_ROLLED = 0.02, 0.2
 SWAPPED = "are `sim` and `data` swapped?"
 
 
@@ -204,7 +205,7 @@ class Seen:
 
     def explained(self, error: CpunetError, selection: EnergySelection) -> CpunetError:
         """Why no pulse can be used, if what was read tells: polarity, energies, calibration."""
-        if refusal := self._rolled_over():
+        if refusal := self._rolled_over(FEW_ROLLED):
             return refusal
         if self._first is not None and go_down(self._first):
             return CpunetError(
@@ -221,9 +222,9 @@ class Seen:
             return error
         return CpunetError(f"{error}; their amplitudes look like {found}")
 
-    def _rolled_over(self) -> CpunetError | None:
+    def _rolled_over(self, share: float) -> CpunetError | None:
         found = None if self._first is None else rolled_over(self._first)
-        if found is None or found.share < MIN_ROLLED:
+        if found is None or found.share < share:
             return None
         return CpunetError(
             f"{self._path}: {found}",
@@ -235,8 +236,10 @@ class Seen:
         """Refuse counts that roll over, and energies of other pulses; warn of a second rate."""
         if self._insist or self._first is None:
             return
-        if refusal := self._rolled_over():
+        if refusal := self._rolled_over(MAX_ROLLED):
             raise refusal
+        if few := self._rolled_over(0):
+            log.warning(str(few))
         share = apart(np.concatenate(self._kev), np.concatenate(self._amplitudes))
         told = (
             f"{self._path}: {100 * share:.0f} % of amplitudes and energies do not go together"

@@ -139,13 +139,13 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = outer - inner
     for field, places in _MEASURED.items():
-        found = [_number_at(diode, place, f"detector {name}", 0.0) for place in places]
-        if min(found) < 0:
+        numbers = [_number_at(diode, place, f"detector {name}", 0.0) for place in places]
+        if min(numbers) < 0:
             raise CpunetError(
-                f"detector {name}: {places[found.index(min(found))]} is below 0",
-                "correct it; 0 if it is not known",
+                f"detector {name}: {places[numbers.index(min(numbers))]} is below 0",
+                "correct it, or write 0 for none",
             )
-        if at := next(filter(None, found), 0.0):
+        if at := next(filter(None, numbers), 0.0):
             values[field] = at
     return values
 

@@ -1,4 +1,4 @@
-"""Columns that tell the channels or detectors in one table from each other."""
+"""Columns that separate the channels or detectors in one table."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOST, _FEWEST = 512, 2  # channels of an experiment, and rows of each on averag
 
 
 def divides(name: str) -> bool:
-    """Whether a column of this name tells channels or detectors apart.
+    """Whether a column of this name separates channels or detectors.
 
     Examples
     --------
@@ -52,15 +52,15 @@ def dividing(columns: Mapping[str, npt.NDArray[Any]], rows: int) -> list[str]:
     >>> dividing({"card": card, "channel": channel, "rawid": 10 * card + channel}, 8)
     ['rawid']
     """
-    found, groups, parts = list[str](), 1, np.zeros(rows, np.int64)
+    chosen, groups, parts = list[str](), 1, np.zeros(rows, np.int64)
     coded = {name: np.unique(v, return_inverse=True) for name, v in columns.items()}
     for name, (values, code) in sorted(
         coded.items(), key=lambda item: (-len(item[1][0]), item[0])
     ):
         both, joined = np.unique(parts * len(values) + code, return_inverse=True)
         if groups < len(both) <= min(_MOST, rows / _FEWEST):
-            found, groups, parts = [*found, name], len(both), joined
-    return found
+            chosen, groups, parts = [*chosen, name], len(both), joined
+    return chosen
 
 
 def labels(columns: Mapping[str, npt.NDArray[Any]], names: Iterable[str]) -> Texts:

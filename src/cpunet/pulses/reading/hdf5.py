@@ -335,7 +335,7 @@ def _column(item: h5py.Group | h5py.Dataset, table: str, name: str) -> WaveformC
 def columns_of(path: Path, group: h5py.Group, table: str) -> dict[str, Column]:
     """Columns of a group: its numeric datasets of one dimension, and its scalars.
 
-    Text counts where it tells channels apart.
+    Text counts where it separates channels.
     """
     return {
         name: _stored(path, item, f"{table}/{name}")

@@ -26,7 +26,7 @@ from cpunet.tables import shortened
 from cpunet.units import factor
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
-ANY = "*"  # value of a column that does not tell channels apart
+ANY = "*"  # value of a column that separates no channels
 _MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = EVENT_KEYS[:-1]
 
