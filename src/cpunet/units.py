@@ -44,4 +44,4 @@ def factor(unit: str, to: str) -> float | None:
 
 def unit_names(to: str) -> str:
     """The units that `factor` has, for messages."""
-    return ", ".join(_POWERS[to])
+    return ", ".join(sorted(_POWERS[to], key=lambda name: name != to))

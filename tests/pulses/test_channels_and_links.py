@@ -13,8 +13,9 @@ from lgdo import Array, Table
 from lh5.compression import ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.channels import channels_of
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.reading.files import tables_of
+from cpunet.pulses.reading.files import PulseFile, tables_of
 from cpunet.pulses.row_columns import other_columns
 from synthetic import one_line, waveform_table
 
@@ -96,7 +97,9 @@ def test_energies_of_another_file_are_those_of_the_channel(tmp_path, whole):
     rows = slice(None) if whole else HALF == 7
     hits = {"E_cal": Array(KEV[rows] + 1), "eventnumber": Array((np.arange(N) // 2)[rows])}
     lh5.write(Table(col_dict=hits), "hit", tmp_path / "hit.lh5")
-    source = open_pulses(path, table="channel=7", energy=f"{tmp_path}/hit.lh5:hit/E_cal")
+    energy = f"{tmp_path}/hit.lh5:hit/E_cal"
+    assert list(channels_of(PulseFile(path, "all", energy))) == ["channel_3", "channel_7"]
+    source = open_pulses(path, table="channel=7", energy=energy)
     np.testing.assert_array_equal(source.read().energy_kev, KEV[HALF == 7] + 1)
 
 
