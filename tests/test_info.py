@@ -43,7 +43,8 @@ def test_a_file_of_pulses(tmp_path):
         "lines": "2 FEP, 1 SEP",
         "source": "",
         "amplitudes": "",
-        "samples": "values -3 … 19; 2 traces not finite; 1 traces constant",
+        "samples": "values -3 … 19; 2 traces not finite; 1 traces constant; "
+        "1 traces copies of others",
     }
 
 

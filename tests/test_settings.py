@@ -13,7 +13,16 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.recipes import list_recipes, load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.settings import Config, checked, plain, read_json, read_settings, read_values
+from cpunet.settings import (
+    Config,
+    checked,
+    key_values,
+    plain,
+    read_json,
+    read_settings,
+    read_values,
+    yaml_text,
+)
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import (
     Shift,
@@ -28,7 +37,8 @@ TEXTS = {
     "a: [1\nb: 2": "not YAML .* line 2",
     "- 1": "holds no settings",
     "": "holds no settings",
-    "dt_ns: 2020-99-99": "not YAML .*month",
+    "dt_ns: !!int x": "not YAML .*invalid",
+    "a: 1\nb: H\u00f6he": "line 2 is not UTF-8; save it as UTF-8",
     "a: !!python/object/apply:os.system ['true']": "not YAML .*constructor",
     "dt_nz: 3": "dt_nz: no such setting; (did you mean dt_ns|there are )|: missing",
 }
@@ -38,7 +48,7 @@ TEXTS = {
 @pytest.mark.parametrize("text", TEXTS)
 def test_unreadable_files(tmp_path: Path, kind: type[Config], text: str) -> None:
     path = tmp_path / "own.yaml"
-    path.write_text(text)
+    path.write_text(text, "latin-1")
     with pytest.raises(CpunetError, match=f"^{path}: [^\n]*({TEXTS[text]})[^\n]*$"):
         read_settings(kind, path)
     for place in (tmp_path, tmp_path / "none", tmp_path / ("x" * 300)):
@@ -71,6 +81,28 @@ def test_damaged_json(tmp_path: Path, text: str) -> None:
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(CpunetError, match=f"^{path}: damaged \\(.*\\); again$"):
         read_json(path, "again")
+
+
+NUMBERS = {
+    "4.4e3": 4400.0, "9e-1": 0.9, "1e-05": 1e-5, "-.5E+3": -500.0, "1.": 1.0, "010": 10,
+    "0o10": 8, "0x1F": 31, "1_000": 1000, "true": True, "yes": "yes", "1:30": "1:30",
+    "2020-01-01": "2020-01-01", "~": None, "'1e3'": "1e3", "1e": "1e",
+}  # fmt: skip
+
+
+def test_scalars_are_those_of_yaml_1_2_and_come_back_as_written(tmp_path: Path) -> None:
+    (tmp_path / "one.yaml").write_text("".join(f"k{i}: {n}\n" for i, n in enumerate(NUMBERS)))
+    values = read_values(tmp_path / "one.yaml")
+    assert [*values.values()] == [*NUMBERS.values()]
+    assert key_values(["a=4.4e3", "b=[1e3, 2]"]) == {"a": 4400.0, "b": [1000.0, 2]}
+    (tmp_path / "two.yaml").write_text(yaml_text(values), encoding="utf-8")
+    assert read_values(tmp_path / "two.yaml") == values
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_comments_may_be_in_any_encoding(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "one.yaml").write_bytes("a: 1  # H\u00f6he\n# -183 \u00b0C\n".encode(encoding))
+    assert read_values(tmp_path / "one.yaml") == {"a": 1}
 
 
 def test_values_of_numpy_are_plain() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import inspect
+import io
 import logging
 import os
 import re
@@ -33,6 +34,7 @@ from cyclopts import (
 import cpunet
 from cpunet import DISTRIBUTION, other_package
 from cpunet.errors import CpunetError
+from cpunet.processes import STOPPING
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +97,7 @@ def _made() -> App:
     """The application, which loads a command's function when it is called."""
     made = App(
         name="cpunet",
-        help=f"{cpunet.__doc__.splitlines()[0].partition(': ')[2].capitalize()}\n\n"
+        help="Make simulated germanium-detector pulses look measured.\n\n"
         f"{DEBUG} shows the whole traceback if a command fails.",
         version=f"cpunet {cpunet.__version__}",
         # of "a path or an object", the command line takes paths
@@ -190,6 +192,9 @@ def main() -> None:
     with _messages_to_stderr(), _stopped_as_on_an_error():
         try:
             sound_environment()
+            for stream in (sys.stdout, sys.stderr):
+                if isinstance(stream, io.TextIOWrapper):  # of any encoding
+                    stream.reconfigure(errors="replace")
             if clash := other_package():
                 log.warning(clash)
             status = run(words)
@@ -254,7 +259,7 @@ def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> i
     text = " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt | SystemExit):
         status = error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT
-        if status in (128 + signal.SIGINT, 128 + signal.SIGTERM):
+        if status in (128 + number for number in STOPPING):
             _fail("interrupted; nothing half-written was left")
         return status if isinstance(status, int) else BUG
     if isinstance(error, BrokenPipeError):  # nobody reads on, as in "cpunet … | head"
@@ -288,7 +293,8 @@ def _stopped_as_on_an_error() -> Iterator[None]:
     def stop(number: int, _frame: FrameType | None) -> None:
         sys.exit(128 + number)
 
-    before = {n: signal.signal(n, stop) for n in (signal.SIGINT, signal.SIGTERM)}
+    caught = (n for n in STOPPING if signal.getsignal(n) != signal.SIG_IGN)  # as by nohup
+    before = {n: signal.signal(n, stop) for n in caught}
     try:
         yield
     finally:

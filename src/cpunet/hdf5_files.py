@@ -42,8 +42,45 @@ def opened(path: Path) -> Iterator[h5py.File]:
         raise CpunetError(f"{path}: {what}; copy or write it again") from error
 
 
-def lh5_rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> Any:
+def item_at(group: h5py.Group, path: str) -> h5py.Group | h5py.Dataset | None:
+    """What a path leads to, through links within the file and to others; None if nothing.
+
+    Raises
+    ------
+    CpunetError
+        If a link on the way leads nowhere.
+    """
+    here = group
+    for part in filter(None, path.split("/")):
+        link = here.get(part, getlink=True) if isinstance(here, h5py.Group) else None
+        if link is None:
+            return None
+        try:
+            here = here[part]
+        except (KeyError, OSError, RuntimeError) as error:
+            if isinstance(link, h5py.HardLink):
+                raise
+            file = f"{link.filename}:" if isinstance(link, h5py.ExternalLink) else ""
+            why = str(error).strip("'\"").rpartition("(")[2].rstrip(")")
+            raise CpunetError(
+                f"{group.file.filename}: {part} is a link to {file}{link.path}, where nothing "
+                f"can be opened ({why})",
+                "put that in its place, or choose another table",
+            ) from error
+    return here
+
+
+def members(group: h5py.Group) -> dict[str, h5py.Group | h5py.Dataset]:
+    """What a group holds by name, through links; see `item_at`."""
+    return {name: item_at(group, name) for name in group}
+
+
+def lh5_rows(
+    item: h5py.Group | h5py.Dataset, start: int, n: int, rows: npt.NDArray[Any] | None = None
+) -> Any:
     """Rows of an LH5 object through LEGEND's library, which decodes compressed traces.
+
+    They are those from `start` on, or these of given `rows`.
 
     Raises
     ------
@@ -54,7 +91,7 @@ def lh5_rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> Any:
     from lh5.io.exceptions import LH5DecodeError
 
     try:
-        return lh5.read(item.name, item.file, start_row=start, n_rows=n)
+        return lh5.read(item.name, item.file, start_row=start, n_rows=n, idx=rows)
     except LH5DecodeError as error:
         raise ValueError(str(error)) from error
 
@@ -66,9 +103,19 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
+def units_of(item: h5py.Group | h5py.Dataset) -> str:
+    """Units of an item, ``""`` if it names none."""
+    return text_attribute(item, "units") or text_attribute(item, "unit")
+
+
 def is_column(item: object) -> bool:
     """Whether an object of a file is a one-dimensional array of numbers, or one number."""
     return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
+
+
+def is_text(item: object) -> bool:
+    """Whether an object of a file is a one-dimensional array of texts."""
+    return isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
 
 
 @dataclass(frozen=True, eq=False)

@@ -276,12 +276,13 @@ def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
 
 def _traces(source: PulseSource, first: Pulses, recipe: Recipe, quality: bool) -> Lines:
     """Properties of measured traces; on request their quality and the pile-up tails."""
-    from cpunet.pulses.description import left_out, trace_properties
+    from cpunet.pulses.description import left_out, rolled_over, trace_properties
 
     try:
         lines = trace_properties(first, recipe.preparation)
     except CpunetError as error:
         lines = [("", f"cannot be described: {error}")]
+    lines.append(("odd", str(rolled_over(first.waveforms) or "")))
     if not quality:
         return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
     from cpunet.electronics.pile_up_tails import PileUpTails

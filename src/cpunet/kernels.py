@@ -27,6 +27,8 @@ import threadpoolctl
 from numba.core import config, entrypoints
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
+from cpunet.errors import CpunetError
+
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 _MAX_FOLDERS = 8  # one for each state of the sources, some 5 MB
@@ -53,12 +55,38 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     cache = _Cache(function, parallel=bool(options.get("parallel")))
     compiled._cache = cache  # noqa: SLF001  numba has no public way
     compiled._compilation_chain_init_hook = lambda: None  # noqa: SLF001  see `_unextended`
-    return compiled
+    return _in_own_threads(compiled) if options.get("parallel") else compiled
+
+
+def _in_own_threads(loop: Loop) -> Loop:
+    """A parallel loop that is refused in a forked process, which has no threads but this."""
+
+    @functools.wraps(loop)
+    def call(*given: Any) -> Any:
+        if start_threads() != os.getpid():
+            raise CpunetError(
+                "loops of several threads do not work in a forked process; begin processes "
+                'with multiprocessing.get_context("spawn")'
+            )
+        return loop(*given)
+
+    return call  # type: ignore[return-value]
+
+
+def _after_fork() -> None:
+    if "torch" in sys.modules:  # which would wait for threads that its parent had
+        sys.modules["torch"].set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 @functools.cache
-def start_threads() -> None:
-    """Start numba's threads; OpenMP, which torch uses as well, keeps its number of threads.
+def start_threads() -> int:
+    """Start numba's threads, and return the process that they are in.
+
+    OpenMP, which torch uses as well, keeps its number of threads.
 
     numba starts them with the first parallel loop and then sets OpenMP's number for the whole
     process.  From then on torch would use another number of threads than it was told, and the
@@ -71,6 +99,7 @@ def start_threads() -> None:
     asked = os.environ.get("OMP_NUM_THREADS", "")  # which numba does not look at
     if asked.isdecimal() and int(asked) and "NUMBA_NUM_THREADS" not in os.environ:
         numba.set_num_threads(min(int(asked), config.NUMBA_NUM_THREADS))
+    return os.getpid()
 
 
 def use_threads(count: int) -> None:

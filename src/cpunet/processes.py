@@ -24,6 +24,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
 from logging.handlers import QueueHandler
+from pathlib import Path
 from queue import SimpleQueue
 from types import FrameType
 from typing import Any, TypeVar
@@ -31,6 +32,10 @@ from typing import Any, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from cpunet.errors import CpunetError
+
+# Signals by which terminals and batch systems end a job, as far as the system has them
+_NAMES = ("INT", "TERM", "HUP", "QUIT", "USR1", "USR2", "XCPU")
+STOPPING = [getattr(signal, f"SIG{n}") for n in _NAMES if hasattr(signal, f"SIG{n}")]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -66,7 +71,8 @@ def outcomes(
     CpunetError
         If a process is ended from outside.
     """
-    if (jobs := min(jobs, len(tasks))) > 1:
+    alone = multiprocessing.current_process().daemon  # which may have no children
+    if (jobs := min(jobs, len(tasks))) > 1 and not alone:
         yield from _in_processes(make, tasks, jobs, once)
         return
     torch = sys.modules.get("torch")
@@ -92,6 +98,8 @@ def _outcome(result: Callable[[], R]) -> R | CpunetError:
 def _in_processes(
     make: Callable[[], Callable[[T], R]], tasks: Sequence[T], jobs: int, once: bool
 ) -> Generator[tuple[T, R | CpunetError]]:
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise CpunetError(f"a process runs the script that began it; {_GUARD}")
     context = multiprocessing.get_context("spawn")  # threads do not survive a fork
     others = {*multiprocessing.active_children()}
     noted: set[str] = set()
@@ -111,15 +119,26 @@ def _in_processes(
                         noted.add(record.msg)
                     yield left.pop(future), outcome
         except BrokenProcessPool as error:
-            raise CpunetError(
-                "a process was ended, perhaps for lack of memory; use fewer processes "
-                "(OMP_NUM_THREADS, or `jobs`), and continue with `resume`"
-            ) from error
+            raise CpunetError(_why_broken()) from error
         finally:
             if left:
                 for process in {*multiprocessing.active_children()} - others:
                     process.terminate()
                 pool.shutdown(cancel_futures=True)
+
+
+_GUARD = 'put its calls under if __name__ == "__main__":'
+
+
+def _why_broken() -> str:
+    """Why processes were ended: each runs the main script again, which may have no guard."""
+    script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    if script.is_file() and b"__main__" not in script.read_bytes():
+        return f"{script}: processes run this script again; {_GUARD}"
+    return (
+        "a process was ended, perhaps for lack of memory; use fewer processes "
+        "(OMP_NUM_THREADS, or `jobs`), and continue with `resume`"
+    )
 
 
 # in a process of the pool: its work, and the messages that it has for its parent
@@ -129,8 +148,11 @@ _messages: SimpleQueue[logging.LogRecord] = SimpleQueue()
 
 def _begin(make: Callable[[], Callable[[Any], Any]]) -> None:
     """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
+    for number in STOPPING:
+        if number == signal.SIGINT:
+            signal.signal(number, signal.SIG_IGN)
+        elif signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _leave)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     from cpunet.kernels import use_threads  # imported late: numba takes a second
 

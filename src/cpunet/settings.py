@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import json
 import math
+import re
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -23,6 +25,38 @@ Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Samples = Annotated[int, Field(ge=1, le=100_000)]
 Width = Annotated[int, Field(ge=1, le=4096)]
 Fraction = Annotated[float, Field(ge=0, lt=1)]
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2, in which 4.4e3 and 1e-05 are numbers, and 010 is ten."""
+
+    yaml_implicit_resolvers: ClassVar[Any] = {}  # type: ignore[misc]
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that readers of YAML 1.1 or 1.2 would take for something else."""
+
+
+_CORE = {  # scalars of the core schema, with the characters that they begin with
+    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
+    "int": (r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+", [*"-+0123456789"]),
+    "float": (
+        r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)([eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        [*"-+.0123456789"],
+    ),
+    "merge": ("<<", ["<"]),
+}
+for _tag, (_form, _first) in _CORE.items():
+    for _of in (_Loader, _Dumper):
+        _of.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(f"({_form})$"), _first
+        )
+_Loader.add_constructor(
+    "tag:yaml.org,2002:int",
+    lambda _, node: int(node.value, 0 if node.value[:2] in ("0o", "0x") else 10),
+)
 
 Set: TypeAlias = Mapping[str, Any] | Iterable[str]
 
@@ -160,20 +194,33 @@ def read_text(name: str | Path, folder: Path | None = None) -> str:
     known = names(folder) if folder else []
     file = folder / f"{name}.yaml" if folder and str(name) in known else Path(name)
     try:
-        return file.read_text("utf-8")
+        return _decoded(file.read_bytes(), str(name))
     except FileNotFoundError as error:
         wrong = f"neither a file nor one of {', '.join(known)}" if known else "no such file"
         raise CpunetError(f"{name}: {wrong}") from error
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise CpunetError(f"{name}: cannot be read ({reason})") from error
+    except OSError as error:
+        raise CpunetError(f"{name}: cannot be read ({error.strerror}); check it") from error
+
+
+def _decoded(content: bytes, name: str) -> str:
+    """Text in UTF-8 or, with a byte order mark, UTF-16; comments may be in any encoding."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        lines = content.splitlines()
+    for number, line in enumerate(lines, 1):
+        if b"\0" in line or not line.split(b"#")[0].isascii():
+            raise CpunetError(f"{name}: line {number} is not UTF-8; save it as UTF-8")
+    return content.decode("latin-1")
 
 
 def read_values(name: str | Path, folder: Path | None = None) -> dict[str, Any]:
     """Read a mapping from a YAML or JSON file, see `read_text`."""
     text = read_text(name, folder)
     is_json = Path(name).suffix.lower() == ".json"  # may be indented with tabs
-    values = _parsed(text, str(name), json.loads if is_json else yaml.safe_load)
+    values = _parsed(text, str(name), json.loads if is_json else _loaded)
     if not isinstance(values, dict):
         raise CpunetError(f"{name}: holds no settings; write lines such as dt_ns: 16")
     return values
@@ -209,7 +256,16 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _parsed(text: str, source: str, parse: Any = yaml.safe_load) -> Any:
+def yaml_text(values: Any) -> str:
+    """YAML that `read_values` reads as these values."""
+    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+def _loaded(text: str) -> Any:
+    return yaml.load(text, _Loader)
+
+
+def _parsed(text: str, source: str, parse: Any = _loaded) -> Any:
     try:
         return parse(text)
     except (yaml.YAMLError, ValueError) as error:

@@ -138,7 +138,7 @@ def test_too_few_pulses(sides, check, n):
     assert done.code == 1
     told = next(line for line in done.out.splitlines() if line.startswith("stop"))
     assert f"measured pulses of {n} can be used" in told
-    assert "more files, or more energies" in told
+    assert "a file of more events, or more energies" in told
 
 
 def test_tails_of_earlier_pulses(sides, check):

@@ -105,7 +105,7 @@ MISTAKES = {
     ),
     "other sampling": Mistake(
         f"{TRAIN} --sim sim10.lh5",
-        r"sim10.lh5: sampled every 10 ns, but data.lh5 every 16 ns; resample one of them",
+        r"sim10.lh5: sampled every 10 ns, but data.lh5 every 16 ns; resample one of them.*",
     ),
     # selection
     "a negative seed": Mistake(

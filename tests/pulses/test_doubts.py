@@ -12,6 +12,7 @@ from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.description import rolled_over
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
@@ -148,9 +149,9 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
     energy = Array(energies, attrs={"units": "keV"})
     columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform_table(values)}
     lh5.write(Table(col_dict=columns), "sim", path)
-    with pytest.raises(CpunetError, match=r"contacts 1, 2 .*`table` chnid=1"):
+    with pytest.raises(CpunetError, match=r"chnid=1, chnid=2.*`table` chnid=1"):
         open_pulses(path)
-    with pytest.raises(CpunetError, match=r"no contact 3 .*; it holds 1, 2"):
+    with pytest.raises(CpunetError, match=r"no chnid 3; it holds 1, 2"):
         open_pulses(path, table="chnid=3")
     source = open_pulses(path, table=table)
     assert source.n_pulses == N - n_first
@@ -162,8 +163,22 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
         np.testing.assert_array_equal(kev_found, energies[n_first:])
     with h5py.File(path, "a") as file:
         file["sim/chnid"][...] = np.arange(N) % 2
-    with pytest.raises(CpunetError, match="the rows of contacts 0, 1 are mixed"):
-        open_pulses(path, table="chnid=1")
+    mixed = open_pulses(path, table="chnid=1").read()
+    np.testing.assert_array_equal(mixed.waveforms, values[1::2])
+
+
+@pytest.mark.parametrize("bits", [12, 14, 16])
+@pytest.mark.parametrize("signed", [True, False])
+def test_counts_that_roll_over_are_named_and_unwrapped(tmp_path, bits, signed):
+    period, energies = 2**bits, kev()
+    counts = np.round(traces(energies) * (0.8 if signed else 1.2) * period / 12_500)
+    wrapped = (counts + signed * period / 2) % period - signed * period / 2
+    assert rolled_over(wrapped).period == period
+    assert rolled_over(np.unwrap(wrapped, period=period)) is None
+    file = written(tmp_path / "raw.lh5", wrapped, energies)
+    selection = parse_selection("1000-", {})
+    with pytest.raises(CpunetError, match=rf"jump by {period} = 2\^{bits} .*period={period}"):
+        load_pulses(file, "measured", load_recipe("fast"), selection)
 
 
 @pytest.mark.parametrize("suffix", ["h5", "npz"])

@@ -61,7 +61,8 @@ def test_a_single_table_is_found_and_read_in_blocks(file, raw):
 
 
 @pytest.mark.parametrize(
-    ("dt", "units", "dt_ns"), [(16, "ns", 16), (0.016, "us", 16), (1.6e-8, "s", 16)]
+    ("dt", "units", "dt_ns"),
+    [(16, "ns", 16), (0.016, "us", 16), (1.6e-8, "s", 16), (0.016, "\u03bcs", 16)],
 )
 def test_the_units_of_the_sampling_period_count(file, raw, dt, units, dt_ns):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw, dt, units)}), "t", file)
@@ -69,14 +70,15 @@ def test_the_units_of_the_sampling_period_count(file, raw, dt, units, dt_ns):
 
 
 @pytest.mark.parametrize(("units", "factor"), [("keV", 1), ("MeV", 1000), ("eV", 1e-3)])
-def test_the_units_of_the_energy_count(file, raw, units, factor):
+def test_the_units_of_the_energy_count(file, raw, caplog, units, factor):
     energy = Array(np.linspace(1, 2, N), attrs={"units": units})
     lh5.write(Table(col_dict={"waveform": waveform_table(raw), "energy": energy}), "t", file)
     np.testing.assert_allclose(
         open_pulses(file).read().energy_kev, factor * np.linspace(1, 2, N)
     )
-    with pytest.raises(CpunetError, match=rf"in {units} already; drop `kev_per_adc`"):
-        open_pulses(file, kev_per_adc=0.1)
+    corrected = open_pulses(file, kev_per_adc=0.1)  # as where a unit or a factor is wrong
+    np.testing.assert_allclose(corrected.read().energy_kev, 0.1 * factor * np.linspace(1, 2, N))
+    assert f"in {units}; its energies are multiplied by 0.1" in caplog.text
 
 
 def test_a_column_in_adc_is_no_energy_unless_calibrated(file, raw):
@@ -359,8 +361,9 @@ def test_no_column_replaces_another(tmp_path):
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
 
 
-def test_the_users_period_must_agree(file, raw):
+def test_the_users_period_corrects_that_of_the_file(file, raw, caplog):
     lh5.write(Table(col_dict={"waveform": waveform_table(raw)}), "raw", file)
     assert open_pulses(file, dt_ns=16).dt_ns == 16
-    with pytest.raises(CpunetError, match=r"every 16 ns, but `dt_ns` says 10; drop"):
-        open_pulses(file, dt_ns=10)
+    assert not caplog.records
+    assert open_pulses(file, dt_ns=10).read().dt_ns == 10
+    assert "every 16 ns; taken as 10 ns" in caplog.text

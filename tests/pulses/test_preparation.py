@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from cpunet.errors import CpunetError
 from cpunet.pulses import loading
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.description import describe_pulses
 from cpunet.pulses.loading import load_prepared
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import Prepared, Rejection, prepare
@@ -265,6 +267,7 @@ def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> Pulse
     raw = (
         np.nan_to_num(energy_kev, nan=500.0)[:, None] * np.minimum(t / 5, 1) * np.exp(-t / 300)
     )
+    raw *= 1 + 1e-6 * np.arange(len(raw))[:, None]  # else they are copies
     raw[broken or []] = np.nan
     pulses = Pulses.of(raw, dt_ns=16, energy_kev=energy_kev)
     return PulseFile(Path("run7.lh5"), pulses=pulses).open()
@@ -285,6 +288,20 @@ def test_every_pulse_is_kept_or_counted() -> None:
     assert prepared.index.tolist() == [0, 1, 5, 7, 8]
     assert prepared.rejections == {"nan": 1, "energy_unknown": 2, "energy_outside_selection": 2}
     assert prepared.n_read == 10
+
+
+@pytest.mark.parametrize("kind", ["measured", "simulated"])
+@pytest.mark.parametrize("same_events", [True, False])
+def test_rows_written_twice_count_once(kind, same_events) -> None:
+    once = source_of([1000, 1001, 1002, 1003, 1004, 50]).read()
+    again = once if same_events else replace(once, event_number=once.event_number + 6)
+    source = PulseFile(Path("run7.lh5"), pulses=Pulses.concatenate([once, again])).open()
+    prepared = load_prepared(source, SHORT, kind, selection=NEAR_1000)
+    copies = 5 if same_events or kind == "measured" else 0
+    assert prepared.rejections.get("copies", 0) == copies
+    assert prepared.index.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10][: 10 - copies]
+    lines = dict(describe_pulses(source, source.blocks(), {}))
+    assert "6 traces copies of others" in lines["samples"]
 
 
 @settings(max_examples=50, deadline=None)

@@ -223,6 +223,16 @@ def test_what_the_metadata_lack_is_named(
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("value", ["4.4 kV", True, [4400], {"V": 4400}, -4400])
+@pytest.mark.parametrize("place", ["recommended_voltage_in_V", ""])
+def test_a_wrong_value_is_not_passed_over(tmp_path: Path, value: object, place: str) -> None:
+    sites = {"l200_site": {place: value} if place else value, **DIODE["characterization"]}
+    path = metadata(tmp_path, CRYSTAL, DIODE | {"characterization": sites})
+    if place or not isinstance(value, dict):
+        said = refused(path)
+        assert "l200_site.recommended_voltage_in_V" in said
+
+
 def test_an_exponential_that_ends_before_the_detector(tmp_path: Path) -> None:
     crystal = copy.deepcopy(CRYSTAL)
     crystal["impurity_curve"]["parameters"] |= {"l": 200.0, "m": 0.1}
@@ -279,7 +289,10 @@ def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
         ("pc_radius 14", "", "point_contact_radius", 12),
         ("pc_radius 0", "", "point_contact_radius", 12),
         ("hole_bullet_radius 6", "", "bore_bullet_radius", 5),
-        ("inner_taper_length 60", "", "inner_taper_length", 50),
+        # a taper ends where the bottom of the hole is rounded, as wide as it was meant to be
+        ("inner_taper_length 60", "", "inner_taper_length", 48),
+        ("inner_taper_length 60", "", "inner_taper_angle_deg", 6.241112),
+        ("hole_bullet_radius 6", "", "inner_taper_length", 44),
         ("hole_length_gap 32", "", "bore_length", 48),
         ("pc_offset_x 0\nhole_offset_y_top 0.0", "", "bore_radius", 5),
         # no ditch: a wrap-around as far as the wall, or further, is none

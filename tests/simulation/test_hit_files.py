@@ -123,6 +123,43 @@ def test_a_description_has_the_same_events(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    ("columns", "detectors"),
+    [
+        ({"iRep": [0, 0, 4]}, ["0", "4"]),
+        ({"volID": [1, 1, 1], "copyNo": [0, 0, 4]}, ["0", "4"]),
+        (
+            {"volID": [1, 1, 2], "iRep": [0, 5, 0]},
+            ["iRep=0,volID=1", "iRep=0,volID=2", "iRep=5,volID=1"],
+        ),
+        ({"volID": [1, 2, 3], "iRep": [0, 0, 5]}, ["1", "2", "3"]),
+    ],
+)
+def test_volumes_and_replicas(tmp_path, layout, columns, detectors) -> None:
+    of = {name: (np.tile(values, N), "") for name, values in columns.items()}
+    path = written(tmp_path, layout, steps(**of), "germanium")
+    assert sorted(describe_hits(path, {})) == detectors
+    assert sum(len(read_hits(path, HitOptions(one)).edep_kev) for one in detectors) == 3 * N
+
+
+def test_links_to_steps_of_other_files(tmp_path: Path) -> None:
+    for name, factor in (("one", 1.0), ("two", 2.0)):
+        stp(tmp_path / f"{name}.lh5", np.arange(EVENTS))
+        with h5py.File(tmp_path / f"{name}.lh5", "a") as file:
+            table = next(iter(file["stp"]))
+            edep = file[f"stp/{table}/edep"]
+            (edep if isinstance(edep, h5py.Dataset) else edep["flattened_data"])[:] *= factor
+    with h5py.File(tmp_path / "all.h5", "w") as file:
+        for name in ("one", "two"):
+            file[f"stp/{name}"] = h5py.ExternalLink(f"{name}.lh5", f"stp/{table}")
+    one, two = (read_hits(tmp_path / "all.h5", HitOptions(name)) for name in ("one", "two"))
+    np.testing.assert_allclose(two.energy_kev, 2 * one.energy_kev)
+    (tmp_path / "two.lh5").unlink()
+    with pytest.raises(CpunetError, match=r"two is a link to two.lh5:stp/"):
+        read_hits(tmp_path / "all.h5", HitOptions("one"))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
     uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
     path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")

@@ -496,6 +496,32 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
     assert codes == ["accepted", "accepted", "energy_unknown", "constant"] + 2 * ["accepted"]
 
 
+@pytest.mark.parametrize(
+    ("counts", "bits", "ends", "kind"),
+    [
+        ((120, 16_383), None, (0, 16_383), "u2"),
+        ((120, 13_000), None, (0, 16_383), "u2"),
+        ((-200, 7000), None, (-8192, 8191), "i2"),
+        ((0, 70_000), None, (0, 131_071), "u4"),
+        ((120, 16_383), 12, (0, 4095), "u2"),
+        (None, None, (0, 65_535), "u2"),
+    ],
+)
+def test_counts_are_clipped_where_the_digitisers_end(tmp_path, counts, bits, ends, kind):
+    data = DATA | {"counts": counts}
+    run = write_chain(tmp_path / "run", noise_kev=NOISE_KEV, data=data)
+    kev = np.full(6, 1.2 * ends[1] / 4)
+    path = tmp_path / "sim.lh5"
+    write_pulses(path, Pulses.of(charge(6), dt_ns=DT_NS, energy_kev=kev))
+    scale = Adc(adc_per_kev=4.0, baseline=100.0, bits=bits)
+    told = translate(run, path, tmp_path / "out.lh5", adc=True, scale=scale).counts
+    assert told.saturated == 6
+    traces = lh5.read("geds/ren", tmp_path / "out.lh5").waveform.values.nda
+    assert (traces.dtype, traces.max()) == (np.dtype(kind), ends[1])
+    with pytest.raises(CpunetError, match="`bits` is 40; expected 1 to 24"):
+        translate(run, path, tmp_path / "no.lh5", adc=True, scale=Adc(bits=40))
+
+
 def left_in(path, table="geds/ren"):
     return lh5.read(f"{table}/tails_kev", path).nda
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import yaml
 
 import cpunet
 from cpunet.calibration.alternatives import side_by_side
@@ -54,7 +53,7 @@ from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.settings import require_seed
+from cpunet.settings import require_seed, yaml_text
 from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.simulate import simulate
@@ -353,7 +352,7 @@ class _Job:
         detector, settings = calibrated.physics.at(at)
         comment = doubts(free_parameters(calibrated))
         for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
-            text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+            text = yaml_text(config.model_dump(mode="json"))
             (folder / name).write_text(comment + text, encoding="utf-8")
         simulate(
             folder / SIM,

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.optimize
-import yaml
 from scipy.special import log_ndtr, ndtr
 
 import cpunet
@@ -28,7 +27,7 @@ from cpunet.legend.currents import WINDOW, WINDOWS
 from cpunet.legend.library_files import known_detector
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
-from cpunet.settings import plain, read_json
+from cpunet.settings import plain, read_json, yaml_text
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.closed_forms import StepResponse
 from cpunet.training.run import RunLike, as_run
@@ -285,7 +284,7 @@ def export_legend(
     pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}} | ae_pars
     with folder_written_aside(out, LEGEND_PARS, *given, force=force) as folder:
         for kind, content in (pars | {"cpunet": whole}).items():
-            text = yaml.safe_dump(plain({name: content}), sort_keys=False, allow_unicode=True)
+            text = yaml_text(plain({name: content}))
             (folder / f"{kind}.yaml").write_text(text, encoding="utf-8")
     return LegendParameters(out, name, whole)
 

@@ -14,17 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, text_attribute
+from cpunet.hdf5_files import is_column, opened, units_of
 from cpunet.outputs import refuse_existing
 from cpunet.pulses.provenance import recorded_detector
-from cpunet.pulses.reading.energies import TIME_UNITS
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import read_values
 from cpunet.training.run import Run
+from cpunet.units import factor, unit_names
 
 PERIOD_NS = 1.0
-MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 
@@ -72,8 +71,9 @@ class IdealLibrary:
                 f"{where}: no {missing[0]} beside the waveforms; complete the library"
             )
         r_mm, z_mm = (_axis(group[name], where, name) for name in ("r", "z"))
-        dt, units = group["dt"], text_attribute(group["dt"], "units")
-        dt_ns = TIME_UNITS.get(units, np.nan) * dt[()].item() if is_column(dt) else np.nan
+        dt, units = group["dt"], units_of(group["dt"])
+        ns_per_unit = factor(units, "ns") or np.nan
+        dt_ns = ns_per_unit * dt[()].item() if is_column(dt) else np.nan
         if not np.isclose(dt_ns, PERIOD_NS):
             raise CpunetError(
                 f"{where}: sampled every {dt_ns:g} ns (dt in {str(units)!r}), production reads "
@@ -101,12 +101,12 @@ class IdealLibrary:
 def _axis(column: h5py.Dataset, where: str, name: str) -> Values:
     if not is_column(column) or column.ndim != 1:
         raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
-    units = text_attribute(column, "units")
-    if units not in MM_PER_UNIT:
+    units = units_of(column)
+    if (mm_per_unit := factor(units, "mm")) is None:
         raise CpunetError(
-            f"{where}: {name} is in {units!r}; known units are {', '.join(MM_PER_UNIT)}"
+            f"{where}: {name} is in {units!r}; expected one of {unit_names('mm')}"
         )
-    values = np.asarray(column[()], np.float64) * MM_PER_UNIT[units]
+    values = np.asarray(column[()], np.float64) * mm_per_unit
     if len(values) < 2 or not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
         raise CpunetError(
             f"{where}: {name} does not ascend from node to node; write the library again"

@@ -68,9 +68,10 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
             f"`data_table` {ALL} or `table` {ALL}"
         )
     energy = file.energy or ""
-    if ":" in energy and CHANNEL not in energy and len(tables) > 1:
+    places = {replace(file, table=table).place for table in tables}  # rows of one share it
+    if ":" in energy and CHANNEL not in energy and len(places) > 1:
         raise CpunetError(
-            f"{energy}: one column for {len(tables)} channels; put {CHANNEL} into its path, as "
+            f"{energy}: one column for {len(places)} channels; put {CHANNEL} into its path, as "
             f"in hit.lh5:{CHANNEL}/hit/energy"
         )
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from cpunet.tables import counted, span
 MIN_SIGMAS = 5.0  # least height of a pulse in standard deviations of the noise
 MIN_BASELINE = 16  # minimum number of samples to estimate the noise
 MIN_NUMBER = 10  # minimum number of traces
+# Counts that roll over: least period and number of traces, and share of the steep ones
+LEAST_PERIOD, MIN_ROLLED, MOSTLY = 256, 3, 0.9
 
 Words = list[tuple[str, str]]
 
@@ -76,6 +79,45 @@ def _tail_slope(traces: FloatArray, config: PreparationConfig) -> float:
     return float(np.median(slopes)) if len(slopes) >= MIN_NUMBER else 0.0
 
 
+def rolled_over(traces: FloatArray) -> RolledOver | None:
+    """Find counts that jump by a power of two, where nothing else rises within a sample.
+
+    Parameters
+    ----------
+    traces
+        Raw traces, shape (pulses, samples).
+
+    Examples
+    --------
+    >>> ramp = 30_000 + 50.0 * np.arange(200) + np.arange(5)[:, np.newaxis]
+    >>> rolled_over(ramp) is None, rolled_over((ramp + 2**15) % 2**16 - 2**15)
+    (True, RolledOver(period=65536, share=1.0))
+    """
+    jumps = np.abs(np.diff(traces, axis=1)).max(axis=1)
+    steep = (jumps > np.ptp(traces, axis=1) / 2) & (jumps >= LEAST_PERIOD / 2)
+    if steep.sum() < MIN_ROLLED or (traces[steep] != np.round(traces[steep])).any():
+        return None
+    period = 2 ** int(np.round(np.log2(np.median(jumps[steep]))))
+    left = np.abs(np.diff(np.unwrap(traces[steep], period=period), axis=1)).max(axis=1)
+    rolled = (np.abs(jumps[steep] - period) < period / 4) & (left < period / 4)
+    return RolledOver(period, float(steep.mean())) if rolled.mean() > MOSTLY else None
+
+
+@dataclass(frozen=True)
+class RolledOver:
+    """Counts that jump by a period, and the share of traces in which they do."""
+
+    period: int
+    share: float
+
+    def __str__(self) -> str:
+        return (
+            f"{100 * self.share:.0f} % of the traces jump by {self.period} = "
+            f"2^{self.period.bit_length() - 1} counts: unsigned samples stored as signed, or "
+            "counts beyond the range rolled over"
+        )
+
+
 def left_out(whole: Pulses, recipe: Recipe) -> str:
     """What preparation and quality cuts of a recipe leave out of measured traces, and why."""
     # compiled loops, which a look at pulses does not need
@@ -104,7 +146,8 @@ def describe_pulses(
         Gamma lines to count.
     """
     energies, heights, extremes = [], [], [np.empty(0)]
-    n_pulses = n_not_finite = n_constant = 0
+    n_pulses = n_not_finite = n_constant = n_copies = 0
+    seen = set[int]()
     for block in blocks:
         n_pulses += len(block)
         energies.append(known := block.energy_kev[np.isfinite(block.energy_kev)])
@@ -117,6 +160,9 @@ def describe_pulses(
         good = block.waveforms if finite.all() else block.waveforms[finite]
         low, high = good.min(axis=1), good.max(axis=1)
         n_constant += int((low == high).sum())
+        hashes = [hash(trace.tobytes()) for trace in good[low < high]]
+        n_copies += len(hashes) - len({*hashes} - seen)
+        seen.update(hashes)
         extremes += [low, high]
     kev, samples = np.concatenate(energies), np.concatenate(extremes)
     found = suggested_calibration(kev if len(kev) else np.concatenate(heights))
@@ -130,6 +176,7 @@ def describe_pulses(
     else:
         amplitudes = "no lines that stand out" if found is None else f"like {found}"
     lines, odd = label_peaks(kev, peaks), {"not finite": n_not_finite, "constant": n_constant}
+    odd["copies of others"] = n_copies
     odds = "".join(f"; {n} traces {what}" for what, n in odd.items() if n)
     ends = [samples.min(), samples.max()] if len(samples) else None
     return [

@@ -104,11 +104,12 @@ def load_prepared(
         If no pulse is left; the message gives the file, the counts by reason and a remedy.
     """
     sets: list[Prepared] = []
-    n_kept = 0
+    n_kept, seen_before = 0, set[int]()
     rng, drawn = np.random.default_rng(0), list[FloatColumn]()
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
             part = _prepare_selected(block, config, kind, selection)
+            part = part.rejected(_copies(block[part.index], kind, seen_before))
             if seen is not None:
                 seen(block, part)
             n_kept += len(part)
@@ -122,6 +123,20 @@ def load_prepared(
     if max_pulses is not None and n_kept > max_pulses:
         n_kept = _thin(sets, drawn, max_pulses)
     return _joined(sets, n_kept)
+
+
+def _copies(pulses: Pulses, kind: Kind, before: set[int]) -> Codes:
+    """Codes of pulses, in which those read before, as of rows written twice, are copies.
+
+    Simulated pulses without noise can be alike; their events must be the same, too.
+    """
+    codes: Codes = np.zeros(len(pulses), np.uint8)
+    numbers = pulses.event_number if kind == "simulated" else codes
+    for row, (trace, number) in enumerate(zip(pulses.waveforms, numbers, strict=True)):
+        key = hash((int(number), trace.tobytes()))
+        codes[row] = Rejection.COPIES if key in before else Rejection.ACCEPTED
+        before.add(key)
+    return codes
 
 
 def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> int:
@@ -218,6 +233,8 @@ class SideInfo(InfoPart):
         Number of pulses read, of those used (text if unknown), and of others by reason.
     cuts
         Quality cuts of measured pulses.
+    counts
+        Lowest and highest count of measured traces.
     sha256
         Fingerprint of the pulses used.
     """
@@ -229,6 +246,7 @@ class SideInfo(InfoPart):
     used: int | str | None = None
     rejections: dict[str, int] = {}
     cuts: Annotated[CutWindows | None, Field(strict=False)] = None
+    counts: Annotated[tuple[int, int] | None, Field(strict=False)] = None
     sha256: str | None = None
 
     def reading(self, file: PulseFile) -> PulseFile:
@@ -248,7 +266,7 @@ class InputSet:
     ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
     simulated detector, if the file contains it; ``baselines`` what noise and pile-up tails need
-    of measured traces.
+    of measured traces; ``counts`` their lowest and highest sample.
     """
 
     prepared: Prepared
@@ -259,6 +277,7 @@ class InputSet:
     read_as: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None
     baselines: Baselines | None = None
+    counts: tuple[int, int] | None = None
 
     def provenance(self) -> SideInfo:
         """File, counts, and a fingerprint of the pulses used."""
@@ -271,6 +290,7 @@ class InputSet:
             used=len(self.prepared),
             rejections=self.prepared.rejections,
             cuts=self.cuts,
+            counts=self.counts,
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
         )
 
@@ -348,6 +368,7 @@ def load_pulses(
     return InputSet(
         prepared, source.dt_ns, file.path, seen.energies_kev, cuts, file.options,
         recorded_detector(source), None if cuts is None else seen.baselines(prepared),
+        seen.counts,
     )  # fmt: skip
 
 
@@ -393,7 +414,7 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
         raise CpunetError(
             f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
             f"{data.dt_ns:g} ns",
-            "resample one of them",
+            "resample one of them, or give `dt_ns` if one says it wrongly",
         )
 
 

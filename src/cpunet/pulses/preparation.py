@@ -66,6 +66,7 @@ class Rejection(IntEnum):
     ENERGY_UNKNOWN = 16
     ENERGY_OUTSIDE_SELECTION = 17
     NOT_DRAWN = 18
+    COPIES = 19
     TAIL_SLOPE = 32
     CHI2 = 33
     BASELINE = 34

@@ -8,11 +8,13 @@ from typing import Any, TypeAlias
 import h5py
 import lh5
 import numpy as np
+import numpy.typing as npt
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays
 
-from cpunet.hdf5_files import lh5_rows, opened, text_attribute
-from cpunet.pulses.reading.energies import ENERGY_UNITS, Column
+from cpunet.hdf5_files import lh5_rows, members, opened, text_attribute, units_of
+from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.source import PulseSource
+from cpunet.units import factor
 
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
 _NUMBERS = "iufb"
@@ -50,15 +52,14 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
         }, {}
     table, _, chosen = source.layout.table.rpartition("/")
     names, left_out = list[str](), dict[str, str]()
+    rows, size = source.layout.rows, source.layout.n_rows or source.n_pulses or 0
     with opened(source.path) as file:
-        group = file[table or "/"]
-        for name in group:
-            item = group.get(name)  # None for a broken link
+        for name, item in members(file[table or "/"]).items():
             is_plain = isinstance(item, h5py.Dataset)
-            units = text_attribute(item, "units") if is_plain else ""
+            units = units_of(item) if is_plain else ""
             if name == chosen or (is_plain and _is_same(name, units, own)):
                 continue
-            if reason := _unreadable(item, source.n_pulses or 0):
+            if reason := _unreadable(item, size):
                 left_out[name] = reason
             else:
                 names.append(name)
@@ -66,19 +67,23 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
 
     def read(start: int, n: int) -> dict[str, LGDO]:
         with opened(source.path) as file:
-            group = file[table or "/"]
-            return {shown[name]: _rows(group[name], start, n) for name in names}
+            group, some = file[table or "/"], None if rows is None else rows[start : start + n]
+            return {shown[name]: _rows(group[name], start, n, some) for name in names}
 
     return read, left_out
 
 
-def _rows(item: h5py.Group | h5py.Dataset, start: int, n: int) -> LGDO:
+def _rows(
+    item: h5py.Group | h5py.Dataset, start: int, n: int, some: npt.NDArray[Any] | None = None
+) -> LGDO:
+    """Rows from one on, or some of them, which ascend."""
     if text_attribute(item, "datatype"):
-        return lh5_rows(item, start, n)
-    attrs = {"units": units} if (units := text_attribute(item, "units")) else {}
+        return lh5_rows(item, 0 if some is not None else start, n, some)
+    attrs = {"units": units} if (units := units_of(item)) else {}
     if item.ndim == 0:
         return Array(np.full(n, item[()]), attrs=attrs)
-    rows: Any = item[start : start + n]
+    part = slice(start, start + n) if some is None else slice(some[0], some[-1] + 1)
+    rows: Any = item[part] if some is None else item[part][some - some[0]]
     if rows.ndim > 1:
         return ArrayOfEqualSizedArrays(nda=rows, attrs=attrs)
     if rows.dtype.kind == "O":
@@ -93,7 +98,7 @@ def _from_column(column: Column, start: int, n: int) -> Array:
 
 def _is_same(name: str, units: str, own: Collection[str]) -> bool:
     """Whether a column has the same meaning as the output's column of that name."""
-    in_energy_units = name == "energy" and units in ENERGY_UNITS
+    in_energy_units = name == "energy" and factor(units, "keV") is not None
     return name in own and (name == "event_number" or in_energy_units)
 
 

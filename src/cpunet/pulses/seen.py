@@ -14,6 +14,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.description import rolled_over
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.preparation import Kind, Prepared
 from cpunet.pulses.provenance import apparent_side, recorded_side, refuse_other_side
@@ -127,6 +128,8 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
 # and from which a warning tells of it; traces in which a second rate is looked for.
 MAX_APART, FEW_APART, RATE_TRACES = 0.2, 0.1, 512
+# Shares of traces whose counts roll over: why no pulse is left, and from which all are refused
+FEW_ROLLED, MAX_ROLLED = 0.02, 0.2
 SWAPPED = "are `sim` and `data` swapped?"
 
 
@@ -157,6 +160,7 @@ class Seen:
         self._guess = recorded is None and not insist
         self._kev, self._amplitudes = list[Values](), list[Values]()
         self._first: npt.NDArray[np.float32] | None = None
+        self._ends = list[float]()
         self._baselines = list[Baselines]()
         self._whole, self._rows = list[Pulses](), list[npt.NDArray[np.int64]]()
 
@@ -172,6 +176,8 @@ class Seen:
         self._amplitudes.append(amplitude(block.waveforms))
         if self._side == "simulated":
             return
+        good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
+        self._ends += [float(good.min()), float(good.max())] if len(good) else []
         if sum(map(len, self._baselines)) < TRACES:
             like = self._baselines[:1]
             self._baselines.append(Baselines.of_block(block, self._config, *like))
@@ -185,6 +191,13 @@ class Seen:
         return Baselines.concatenate(self._baselines, Pulses.concatenate(self._whole)[stay])
 
     @property
+    def counts(self) -> tuple[int, int] | None:
+        """The lowest and the highest count of whole numbers; None of others."""
+        if self._first is None or not self._ends or (self._first != self._first.round()).any():
+            return None
+        return int(min(self._ends)), int(max(self._ends))
+
+    @property
     def energies_kev(self) -> Values:
         """The known energies."""
         kev: Values = np.concatenate([np.empty(0), *self._kev])
@@ -192,6 +205,8 @@ class Seen:
 
     def explained(self, error: CpunetError, selection: EnergySelection) -> CpunetError:
         """Why no pulse can be used, if what was read tells: polarity, energies, calibration."""
+        if refusal := self._rolled_over(FEW_ROLLED):
+            return refusal
         if self._first is not None and go_down(self._first):
             return CpunetError(
                 f"{self._path}: the traces go down: their polarity is negative",
@@ -200,16 +215,31 @@ class Seen:
         known = self.energies_kev
         if len(known):
             none = not selection.select(known).any()
-            return CpunetError(f"{error}{_where_energies_are(known)}") if none else error
+            where = _where_energies_are(known, self._side)
+            return CpunetError(f"{error}{where}") if none else error
         found = suggested_calibration(np.concatenate([np.empty(0), *self._amplitudes]))
         if found is None:
             return error
         return CpunetError(f"{error}; their amplitudes look like {found}")
 
+    def _rolled_over(self, share: float) -> CpunetError | None:
+        found = None if self._first is None else rolled_over(self._first)
+        if found is None or found.share < share:
+            return None
+        return CpunetError(
+            f"{self._path}: {found}",
+            "write them as unsigned (values.view('uint16') in NumPy), or as "
+            f"numpy.unwrap(values, period={found.period})",
+        )
+
     def require_sense(self) -> None:
-        """Refuse energies that are of other pulses; warn of a second rate."""
+        """Refuse counts that roll over, and energies of other pulses; warn of a second rate."""
         if self._insist or self._first is None:
             return
+        if refusal := self._rolled_over(MAX_ROLLED):
+            raise refusal
+        if few := self._rolled_over(0):
+            log.warning(str(few))
         share = apart(np.concatenate(self._kev), np.concatenate(self._amplitudes))
         told = (
             f"{self._path}: {100 * share:.0f} % of amplitudes and energies do not go together"
@@ -225,14 +255,15 @@ class Seen:
             log.warning(f"{self._path}: {found}; cut the traces there, or resample them")
 
 
-def _where_energies_are(energies: Values) -> str:
+def _where_energies_are(energies: Values, side: Kind) -> str:
     """Hint on the range of energies in a file of which none is selected."""
     low, middle, high = np.quantile(energies, (0.05, 0.5, 0.95))
     there = f". Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
-    if high > MAX_KEV:
-        return f"{there}: if these are ADC counts, give `kev_per_adc`"
+    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
+    if high > MAX_KEV and side == "measured":
+        return f"{there}: if these are ADC counts, {give}"
     if 0 < high < MIN_KEV:
-        return f"{there}: if these are MeV, give `kev_per_adc` 1000"
+        return f"{there}: if these are MeV, {give} 1000"
     from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
     n = int((energies >= from_kev).sum())
     if not n:

@@ -230,16 +230,16 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
         raise CpunetError(
             f"detector {name}: rounded point contacts are not simulated; set bulletize_PC to 0"
         )
+    _widen(values)
     _cut(values, name)
     fields = {
         _SIGGEN_FIELDS[key]: value for key, value in values.items() if key in _SIGGEN_FIELDS
     }
-    # widths count only without an angle
-    if not values.get("taper_angle"):
-        for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
-            width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
-            if length:
-                fields[angle] = math.degrees(math.atan(width / length))
+    for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
+        width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
+        found = math.degrees(math.atan(width / length)) if length else math.nan
+        if length and not math.isclose(found, values.get("taper_angle") or math.nan):
+            fields[angle] = found
     # siggen keeps the radius and the rounding of a hole that does not exist
     if not fields.get("bore_length"):
         fields = {k: v for k, v in fields.items() if not k.startswith("bore_")}
@@ -249,12 +249,21 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     return fields
 
 
+def _widen(values: dict[str, float]) -> None:
+    """Give tapers the width of their angle; without one, their own widths count."""
+    if angle := values.get("taper_angle"):
+        for side in ("outer", "inner"):
+            length = values.get(f"{side}_taper_length", 0.0)
+            values[f"{side}_taper_width"] = length * math.tan(math.radians(angle))
+
+
 def _cut(values: dict[str, float], name: str) -> None:
     """Cut sizes that do not fit in each other, as siggen does, with a word."""
     around, ditch = values.get("wrap_around_radius", 0.0), values.get("ditch_thickness", 0.0)
-    most = {
+    straight = values.get("hole_length", math.inf) - values.get("hole_bullet_radius", 0.0)
+    most = {  # a taper that is cut keeps its width
+        "inner_taper_length": ("hole_length - hole_bullet_radius", max(straight, 0.0)),
         "hole_bullet_radius": ("hole_radius", values.get("hole_radius", math.inf)),
-        "inner_taper_length": ("hole_length", values.get("hole_length", math.inf)),
     }
     if around and ditch and values.get("ditch_depth"):
         inside = around - ditch

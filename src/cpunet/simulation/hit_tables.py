@@ -17,19 +17,18 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened, text_attribute
+from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.division import divides, dividing, labels, texts
 from cpunet.pulses.reading.source import whole_numbers
 from cpunet.simulation.hits import FloatArray, HitOptions, IntArray
+from cpunet.units import factor, unit_names
 
 HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
 NTUPLES, STEPS = "default_ntuples", "stp"
 _G4SIMPLE, _G4SIMPLE_TITLE = "g4sntuple", "steps data"
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
-_MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3, "µm": 1e-3}
-_KEV = {"keV": 1.0, "MeV": 1e3, "eV": 1e-3, "GeV": 1e6}
-_NS = {"ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9, "ps": 1e-3}
 # what a column is, and its names in small letters: the first that is there is read
 _NAMES = {
     "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
@@ -38,7 +37,6 @@ _NAMES = {
     "z": ("zloc", "z"),
     "edep": ("edep", "energydeposit"),
     "time": ("time", "t", "globaltime", "t0"),
-    "detector": ("det_uid", "detector", "detector_id", "detectorid", "volid", "volume"),
 }
 _NEEDED = ("event", "x", "y", "z", "edep")
 _VECTORS = ("cumulative_length", "flattened_data")
@@ -82,12 +80,13 @@ class StepTable:
     file: h5py.File | None = None
 
     @classmethod
-    def of_group(cls, path: Path, group: h5py.Group, name: str) -> StepTable:
+    def of_group(cls, path: Path, group: h5py.Group, name: str, file: h5py.File) -> StepTable:
         """A table in HDF5. g4simple writes one for all detectors."""
         # the values of a column of Geant4's HDF5 are its pages
-        pages = {n: item["pages"] if _has(item, "pages") else item for n, item in group.items()}
+        held = members(group).items()
+        pages = {name: item["pages"] if _has(item, "pages") else item for name, item in held}
         g4simple = name == _G4SIMPLE
-        return cls(path, pages, "" if g4simple else name, g4simple, group.file)
+        return cls(path, pages, "" if g4simple else name, g4simple, file)
 
     @cached_property
     def roles(self) -> dict[str, tuple[str, str]]:
@@ -111,8 +110,6 @@ class StepTable:
             )
         values: dict[str, npt.NDArray[Any]] = {}
         for role, (name, in_name) in self.roles.items():
-            if role == "detector":
-                continue
             read, unit = self._read(name)
             where = f"{self.path}: column {name}"
             if read.ndim != 1 or read.dtype.kind not in "iuf":
@@ -126,16 +123,14 @@ class StepTable:
                 values[role] = read * _unit_factor(options, role, where, unit or in_name)
         position = np.stack([values[axis] for axis in "xyz"], axis=1)
         steps = Steps(values["event"], position, values["edep"], values.get("time"))
-        return steps if label is None else steps[self._labels() == label]
+        return steps if label is None else steps[self._labels == label]
 
     def detectors(self) -> list[str]:
         """Labels of detectors with deposits; those without are the world or a holder."""
-        labels = self._labels()
-        if not len(labels) or "edep" not in self.roles:
+        if not len(self._labels):
             return []
-        edep = self._read(self.roles["edep"][0])[0]
         return sorted(
-            map(str, np.unique(labels[edep > 0])),
+            map(str, np.unique(self._labels[self._deposits])),
             key=lambda label: (len(label), label) if label.isdigit() else (99, label),
         )
 
@@ -146,21 +141,29 @@ class StepTable:
             where = f"detector_origins/{detector}/{axis}loc"
             if self.file is not None and where in self.file:
                 # an origin may lack a unit; all lengths of remage are in m
-                unit = text_attribute(self.file[where], "units") or "m"
+                unit = units_of(self.file[where]) or "m"
                 factor = _unit_factor(HitOptions(), "x", f"{self.path}: column {where}", unit)
                 origin[i] = self.file[where][()].item() * factor
         return origin
 
+    @cached_property
+    def _deposits(self) -> npt.NDArray[np.bool_]:
+        return np.asarray(self._read(self.roles["edep"][0])[0] > 0)
+
+    @cached_property
     def _labels(self) -> npt.NDArray[np.str_]:
-        """Detector of each step as text; empty if no column tells it."""
-        if "detector" not in self.roles:
+        """Detector of each step as text; empty if no column tells it.
+
+        That is a value, or those of several columns, as of a volume and its replicas.
+        """
+        if "edep" not in self.roles:
             return np.empty(0, np.str_)
-        labels = self._read(self.roles["detector"][0])[0]
-        if labels.dtype.kind == "f" and np.array_equal(labels, np.rint(labels)):
-            labels = labels.astype(np.int64)
-        if labels.dtype.kind in "SO":
-            return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in labels])
-        return labels.astype(np.str_)
+        of = {name: self._read(name)[0] for name in self.columns if divides(name)}
+        some = {name: values[self._deposits] for name, values in of.items()}
+        names = dividing(some, int(self._deposits.sum())) or list(of)[:1]
+        if not names:
+            return np.empty(0, np.str_)
+        return texts(of[names[0]]) if len(names) == 1 else labels(of, names)
 
     @cached_property
     def _per_row(self) -> IntArray:
@@ -180,11 +183,11 @@ class StepTable:
         same = np.array_equal(_lengths(item), per_row) if vectors else len(item) == len(per_row)
         if not same:
             raise CpunetError(f"{where}s {name} and edep differ in length; truncated?")
-        unit = text_attribute(item, "units")
+        unit = units_of(item)
         if not vectors:
             return np.repeat(item[()], per_row), unit
         flat = item["flattened_data"]
-        return np.asarray(flat[: per_row.sum()]), text_attribute(flat, "units") or unit
+        return np.asarray(flat[: per_row.sum()]), units_of(flat) or unit
 
 
 def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -218,13 +221,13 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
     CpunetError
         If the unit is unknown, or nobody tells it.
     """
-    known = {"edep": _KEV, "time": _NS}.get(role, _MM)
-    given = [unit for unit in (*re.split(r"[\s,]+", options.units), "ns") if unit in known]
+    to = {"edep": "keV", "time": "ns"}.get(role, "mm")
+    given = [unit for unit in (*re.split(r"[\s,]+", options.units), "ns") if factor(unit, to)]
     if not (unit := named or next(iter(given), "")):
-        raise CpunetError(f"{where} names no unit; give `units`, one of {', '.join(known)}")
-    if unit not in known:
-        raise CpunetError(f"{where} is in {unit!r}; expected one of {', '.join(known)}")
-    return known[unit]
+        raise CpunetError(f"{where} names no unit; give `units`, one of {unit_names(to)}")
+    if (found := factor(unit, to)) is None:
+        raise CpunetError(f"{where} is in {unit!r}; expected one of {unit_names(to)}")
+    return found
 
 
 def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
@@ -261,11 +264,14 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
         yield [_npz_table(path)]
     elif kind:
         with opened(path) as file:
-            groups = [g for folder in (STEPS, NTUPLES) for g in file.get(folder, {}).items()]
+            folders = [item_at(file, folder) for folder in (STEPS, NTUPLES)]
+            groups = [
+                one for held in folders if held is not None for one in members(held).items()
+            ]
             if kind == "stored":
                 groups = [("", file[HIT_TABLE])]
             tables = [
-                StepTable.of_group(path, group, str(name))
+                StepTable.of_group(path, group, str(name), file)
                 for name, group in groups
                 if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys()
             ]

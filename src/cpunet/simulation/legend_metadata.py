@@ -113,7 +113,10 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(diode["geometry"], Mapping):
         raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
     geometry = dict(flat(diode["geometry"]))
-    if _at(diode, "geometry.extra.crack") and geometry.get("extra.crack.width_in_mm") != 0:
+    if (
+        _at(diode, "geometry.extra.crack", f"detector {name}")
+        and geometry.get("extra.crack.width_in_mm") != 0
+    ):
         raise CpunetError(
             f"detector {name}: geometry.extra.crack cuts off a side; only axially symmetric "
             "crystals are simulated; remove it to simulate the crystal without it"
@@ -136,21 +139,31 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = outer - inner
     for field, places in _MEASURED.items():
-        for found in (_at(diode, place) for place in reversed(places)):
-            if isinstance(found, int | float) and found > 0:
-                values[field] = found
+        numbers = [_number_at(diode, place, f"detector {name}", 0.0) for place in places]
+        if min(numbers) < 0:
+            raise CpunetError(
+                f"detector {name}: {places[numbers.index(min(numbers))]} is below 0",
+                "correct it, or write 0 for none",
+            )
+        if at := next(filter(None, numbers), 0.0):
+            values[field] = at
     return values
 
 
 def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
     """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
-    diode_name = str(diode.get("name", name))
-    return diode_name[:-1], str(_at(diode, "production.slice") or diode_name[-1:])
+    diode_name, given = (
+        str(diode.get("name", name)),
+        _at(diode, "production.slice", f"detector {name}"),
+    )
+    return diode_name[:-1], str(diode_name[-1:] if given is None else given)
 
 
-def _at(values: Any, place: str) -> Any:
+def _at(values: Any, place: str, source: str) -> Any:
     for key in place.split("."):
-        values = values.get(key) if isinstance(values, Mapping) else None
+        if not isinstance(values, Mapping | None):
+            raise CpunetError(f"{source}: {place}: {values!r} stands before {key}; {_ANOTHER}")
+        values = values.get(key) if values else None
     return values
 
 
@@ -233,7 +246,8 @@ def _number_at(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
     """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
-    found = default if _at(values, place) is None else _at(values, place)
+    there = _at(values, place, source)
+    found = default if there is None else there
     if found is None:
         raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
     number = isinstance(found, int | float) and not isinstance(found, bool)

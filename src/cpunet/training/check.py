@@ -300,7 +300,7 @@ def _count(one: InputSet, side: str) -> Finding:
     if n >= FEW:
         return Finding(Level.FINE, text)
     level = Level.ERROR if n < MIN_PULSES else Level.WARNING
-    remedy = f"{FEW} or more are better: more files, or more energies (`peak`)"
+    remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
     return Finding(level, text, remedy)
 
 
@@ -323,6 +323,7 @@ REMEDIES = {
     Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
     Rejection.BASELINE_SLOPE: ("baselines are not flat: pile-up tails (cpunet info --quality)"),
     Rejection.CHI2: "tails are no exponentials: pile-up",
+    Rejection.COPIES: "these rows were written twice; write the file anew",
     Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",
 }
 
@@ -363,7 +364,7 @@ def _left_out(one: InputSet, side: str) -> Iterator[Finding]:
         counts.pop(reason.label, None)
     selected = len(one.prepared) + sum(counts.values())
     for label, n in counts.items():
-        if n > LOST * selected:
+        if n > LOST * selected or label == Rejection.COPIES.label:
             text = f"{one.path.name}: {100 * n / selected:.0f} % of the {side} pulses left out"
             remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
             yield Finding(Level.WARNING, f"{text} ({label})", remedy)
@@ -382,7 +383,8 @@ def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Fin
         fine = abs(off) <= OFF_LINE
         text += "" if fine else f", {off:+.1f} keV from where it should be"
         factor = line.energy_kev / found
-        remedy = f"energies times {factor:.5f}, as by `kev_per_adc`, would put it right"
+        how = ", as by `kev_per_adc`," if side == "measured" else " in its file"
+        remedy = f"energies times {factor:.5f}{how} would put it right"
         yield _judged(text, remedy, fine)
 
 

@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
@@ -40,7 +39,7 @@ from cpunet.networks.stored import Array, Stored
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
-from cpunet.settings import checked, read_json, read_values
+from cpunet.settings import checked, read_json, read_values, yaml_text
 from cpunet.tables import aligned
 from cpunet.training.verdict import Verdict
 
@@ -211,7 +210,7 @@ class Run(InfoPart):
     def write(self, folder: Path) -> None:
         """Write weights, recipe and provenance into an existing folder."""
         (folder / WEIGHTS).write_bytes(save(self.weights))
-        settings = yaml.safe_dump(self.recipe.model_dump(mode="json"), sort_keys=False)
+        settings = yaml_text(self.recipe.model_dump(mode="json"))
         (folder / RECIPE).write_text(settings, encoding="utf-8")
         facts = {"format": FORMAT, "recipe": self.recipe.name}
         facts |= self.model_dump(mode="json", exclude_unset=True)

@@ -9,6 +9,7 @@ baseline before them and with the decay fitted to their end after them, both wit
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,10 @@ from cpunet.translation.backends import Drawn, Translated
 from cpunet.translation.options import LEARNED, NONE, Adc, TranslateOptions
 from cpunet.translation.translator import TranslatedPulses, Translator
 
+log = logging.getLogger(__name__)
+
 HIGHEST = int(np.iinfo(np.uint16).max)
+MAX_BITS = 24  # of whole numbers in single precision
 RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
@@ -121,9 +125,11 @@ class AdcTraces(Windows):
         adc: Adc,
         tails: DrawnTails | None = None,
         pile_up: DrawnPileUp | None = None,
+        ends: tuple[int, int] = (0, HIGHEST),
     ) -> None:
         super().__init__(translator, tails, pile_up)
-        self.per_kev, self.baseline = per_kev, baseline
+        self.per_kev, self.baseline, self.ends = per_kev, baseline, ends
+        self.samples = _kind(ends)
         chain = translator.backend.chain
         if pile_up is not None and chain is None:
             raise CpunetError(
@@ -164,8 +170,8 @@ class AdcTraces(Windows):
             windows += heights[:, np.newaxis] * decay
         windows[codes != Rejection.ACCEPTED] = np.nan
         scale = np.where(unknown, 0.0, self.per_kev * pulses.energy_kev)
-        traces, saturated = to_adc(windows, scale, self.baseline)
-        # single precision represents 16-bit integers exactly
+        traces, saturated = to_adc(windows, scale, self.baseline, self.ends)
+        # single precision represents these integers exactly
         whole = replace(pulses, waveforms=traces.astype(np.float32), t0_ns=t0_ns)
         return TranslatedPulses(whole, codes, saturated)
 
@@ -198,13 +204,39 @@ def form_of(run: Run, translator: Translator, options: TranslateOptions) -> Wind
     pile_up = wanted_pile_up(translator, options.pile_up_khz)
     if adc is None:
         return Windows(translator, tails, pile_up)
-    return AdcTraces(translator, *adc_scale(run, translator, adc), adc, tails, pile_up)
+    scale = adc_scale(run, translator, adc)
+    return AdcTraces(translator, *scale, adc, tails, pile_up, adc_ends(run, adc))
+
+
+def adc_ends(run: Run, adc: Adc) -> tuple[int, int]:
+    """Lowest and highest count of a digitiser: of `bits`, or of those that the data need.
+
+    Data that leave out saturated pulses end at their highest count.
+
+    Raises
+    ------
+    CpunetError
+        If there are no such digitisers.
+    """
+    if adc.bits is not None and not 1 <= adc.bits <= MAX_BITS:
+        raise CpunetError(f"`bits` is {adc.bits}; expected 1 to {MAX_BITS}")
+    low, high = run.data.counts or (0, HIGHEST)
+    signed = low < 0
+    bits = adc.bits or max(high.bit_length(), (-low - 1).bit_length()) + signed
+    first, last = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+    if adc.bits is None and run.data.rejections.get(Rejection.SATURATED.label):
+        last = high
+    log.info(f"counts from {first} to {last}, beyond which they are clipped (`bits`)")
+    return first, last
 
 
 def to_adc(
-    windows: FloatArray, scale: npt.ArrayLike, baseline: npt.ArrayLike
-) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.bool_]]:
-    """Invert ``prepared = (raw - baseline) / scale``, round, and clip to 16 bits.
+    windows: FloatArray,
+    scale: npt.ArrayLike,
+    baseline: npt.ArrayLike,
+    ends: tuple[int, int] = (0, HIGHEST),
+) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.bool_]]:
+    """Invert ``prepared = (raw - baseline) / scale``, round, and clip.
 
     Parameters
     ----------
@@ -212,6 +244,8 @@ def to_adc(
         Prepared pulses, shape (n, samples); a row with NaN becomes a row of 0.
     scale, baseline
         Scale and baseline in ADC counts, per row or common.
+    ends
+        The lowest and the highest count.
 
     Returns
     -------
@@ -230,8 +264,14 @@ def to_adc(
     counts = np.rint(windows * factor + np.asarray(baseline, float).reshape(-1, 1))
     missing = ~np.isfinite(counts).all(axis=1)
     counts[missing] = 0
-    saturated = ((counts < 0) | (counts > HIGHEST)).any(axis=1)
-    return counts.clip(0, HIGHEST).astype(np.uint16), saturated
+    saturated = ((counts < ends[0]) | (counts > ends[1])).any(axis=1)
+    return counts.clip(*ends).astype(_kind(ends)), saturated
+
+
+def _kind(ends: tuple[int, int]) -> npt.DTypeLike:
+    """The smallest type of integers, of 16 bits or more, that has both ends."""
+    kinds = [np.iinfo(kind) for kind in ("u2", "i2", "u4", "i4")]
+    return next(kind.dtype for kind in kinds if kind.min <= ends[0] and ends[1] <= kind.max)
 
 
 def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]:

@@ -23,12 +23,16 @@ class Adc:
         Samples of a trace; those of a window by default.
     n_pre
         Samples before 99.9 % of the maximum; those of a window by default.
+    bits
+        Bits of the counts, beyond which they are clipped; by default as many as those of the
+        run's data need.
     """
 
     adc_per_kev: float | None = None
     baseline: float | None = None
     length: int | None = None
     n_pre: int | None = None
+    bits: int | None = None
 
 
 @dataclass(frozen=True)

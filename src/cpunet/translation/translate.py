@@ -111,8 +111,8 @@ def translate(
     """
     if scale != Adc() and not adc:
         raise CpunetError(
-            "`adc_per_kev`, `baseline`, `length` and `n_pre` belong to traces in ADC counts; "
-            "add `adc`"
+            "`adc_per_kev`, `baseline`, `length`, `n_pre` and `bits` belong to traces in ADC "
+            "counts; add `adc`"
         )
     if jobs < 1:
         raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")

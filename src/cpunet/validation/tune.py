@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import yaml
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs, written_aside
@@ -32,7 +31,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
-from cpunet.settings import Set, flat, read_settings
+from cpunet.settings import Set, flat, read_settings, yaml_text
 from cpunet.training.job import TrainingJob
 from cpunet.training.networks import differences
 from cpunet.training.run import resolve_device
@@ -174,7 +173,7 @@ def _write(out: Path, study: Study, recipe: Recipe, space: Mapping[str, SearchCo
         update={"name": f"{recipe.name}-tuned", "description": description}
     )
     with written_aside(out / BEST) as aside:
-        aside.write_text(yaml.safe_dump(tuned.model_dump(mode="json"), sort_keys=False))
+        aside.write_text(yaml_text(tuned.model_dump(mode="json")), encoding="utf-8")
 
 
 def search_space(recipe: Recipe) -> dict[str, SearchConfig]:

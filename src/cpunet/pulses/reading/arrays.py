@@ -104,7 +104,7 @@ def open_arrays(options: PulseFile) -> ArraySource:
             f"{options.path}: no waveforms in it; it holds {shortened(arrays)}; "
             "give an array of two dimensions (event, sample)"
         )
-    usual = [name for name in _WAVEFORMS if name in matrices and options.table is None]
+    usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
     name = choose_table(options, usual or matrices, "array", "arrays of two dimensions")
     if (kind := arrays[name].dtype).kind not in "iuf":
         raise CpunetError(

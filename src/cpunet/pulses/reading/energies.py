@@ -14,17 +14,13 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.tables import shortened
+from cpunet.units import factor, unit_names
 
 if TYPE_CHECKING:
     from cpunet.pulses.reading.files import PulseFile
     from cpunet.pulses.reading.source import Layout
 
 log = logging.getLogger(__name__)
-
-# Factors to keV and ns.  A dictionary rather than a units library: only these units occur
-# beside waveforms, and any other must be refused, not converted.
-ENERGY_UNITS = {"eV": 1e-3, "keV": 1.0, "MeV": 1e3}
-TIME_UNITS = {"ps": 1e-3, "ns": 1.0, "us": 1e3, "µs": 1e3, "ms": 1e6, "s": 1e9}
 
 
 @dataclass(frozen=True)
@@ -58,12 +54,18 @@ class Column:
     def __len__(self) -> int:
         return self.size
 
-    def part(self, first: int, size: int) -> Self:
-        """The rows of some events."""
-        if self.constant:
+    def at(self, rows: npt.NDArray[np.int64]) -> Self:
+        """The values of some rows, which ascend; one value for all stays."""
+        if self.constant or len(self) == 1:
             return self
-        read = lambda start, stop: self.read(first + start, first + stop)  # noqa: E731
-        return replace(self, read=read, size=size)
+
+        def read(start: int, stop: int) -> npt.NDArray[Any]:
+            some = rows[start:stop]
+            if not len(some):
+                return self.read(0, 0)
+            return np.asarray(self.read(int(some[0]), int(some[-1]) + 1)[some - some[0]])
+
+        return replace(self, read=read, size=len(rows))
 
 
 def require_length(path: Path, name: str, column: Column, n_pulses: int | None) -> None:
@@ -139,18 +141,18 @@ def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
     Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
     is in energy units or ``kev_per_adc`` is given.  Otherwise the energy is the amplitude
     times ``kev_per_adc``, or unknown without it.  ``energy`` names another column, or
-    ``FILE:path/to/column``.
+    ``FILE:path/to/column``.  Energies in units that are wrong or a little off are multiplied by
+    ``kev_per_adc`` as well, with a warning.
 
     Raises
     ------
     CpunetError
-        If the column is missing, differs in length from the waveforms, was requested but is
-        neither in energy units nor calibrated, or is in energy units although ``kev_per_adc``
-        is given.
+        If the column is missing, differs in length from the waveforms, or was requested but is
+        neither in energy units nor calibrated.
     """
     path, kev_per_adc, columns = options.path, options.kev_per_adc, layout.columns
     name = options.energy or next((name for name in _USUAL if name in columns), "")
-    column = _named_column(path, columns, name) if name else None
+    column = _named_column(path, layout, name) if name else None
     if column is not None:
         rule = _calibrated(path, name, column, kev_per_adc)
         if rule is not None:
@@ -171,18 +173,23 @@ def _calibrated(
     path: Path, name: str, column: Column, kev_per_adc: float | None
 ) -> Energies | None:
     units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
-    if units in ENERGY_UNITS:
-        if kev_per_adc is not None:
-            raise CpunetError(
-                f"{path}: column {name} is in {units} already; drop `kev_per_adc`"
-            )
-        return Energies(f"column {name} [{units}]", ENERGY_UNITS[units], column)
+    kev_per_unit = factor(units, "keV")
+    if kev_per_unit is not None and kev_per_adc is None:
+        return Energies(f"column {name} [{units}]", kev_per_unit, column)
+    if kev_per_unit is not None and kev_per_adc is not None:
+        log.warning(
+            f"{path.name}: column {name} is in {units}; its energies are multiplied by "
+            f"{kev_per_adc:g}, as given (`kev_per_adc`)"
+        )
+        rule = f"column {name} [{units}] x {kev_per_adc:g}"
+        return Energies(rule, kev_per_unit * kev_per_adc, column)
     if kev_per_adc is not None:
         return Energies(f"column {name} x {kev_per_adc:g} keV/ADC", kev_per_adc, column)
     return None
 
 
-def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Column:
+def _named_column(path: Path, layout: Layout, energy: str) -> Column:
+    columns = layout.columns
     if energy in columns:
         return columns[energy]
     file, colon, inner = energy.rpartition(":")
@@ -193,7 +200,11 @@ def _named_column(path: Path, columns: Mapping[str, Column], energy: str) -> Col
     # Imported late: the LH5 library takes seconds to load, and most files do not need it.
     from cpunet.pulses.reading.hdf5 import column_of
 
-    return _joined(path, columns, energy, *column_of(Path(file), inner))
+    column, others = column_of(Path(file), inner)
+    if (rows := layout.rows) is not None and len(column) == layout.n_rows:
+        others = {n: c.at(rows) for n, c in others.items() if len(c) == len(column)}
+        column = column.at(rows)
+    return _joined(path, columns, energy, column, others)
 
 
 def _joined(
@@ -256,16 +267,22 @@ def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
     """Take the period from the column of the file or from the user's ``dt_ns``.
 
     A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
-    and ``dt_ns`` is required; the error message contains the hint of the format.
+    and ``dt_ns`` is required; the error message contains the hint of the format.  A file that
+    says another period than the user is corrected, with a warning.
 
     Raises
     ------
     CpunetError
-        If neither gives the period, if they disagree, or if it is not a positive number.
+        If neither gives the period, or if it is not a positive number.
     """
     path, dt_ns = options.path, options.dt_ns
     name, column, hint = layout.period_name, layout.period, layout.period_hint
-    ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
+    try:
+        ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
+    except CpunetError:
+        if dt_ns is None:
+            raise
+        ns_per_unit = None
     if column is None or ns_per_unit is None:
         if dt_ns is None:
             why = "is not in the file" if column is None else f"({name}) has no units"
@@ -276,14 +293,18 @@ def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
     if len(column) != 1:
         require_length(path, name, column, layout.n_pulses)
     found = float(column.read(0, 1)[0]) * ns_per_unit
+    if dt_ns is not None and not np.isclose(found, dt_ns, rtol=_TOLERANCE, atol=0):
+        log.warning(
+            f"{path.name}: says that it is sampled every {found:g} ns; taken as {dt_ns:g} ns, "
+            "as given (`dt_ns`)"
+        )
+        if not (np.isfinite(found) and found > 0):
+            return Sampling(path, dt_ns)
+        ns_per_unit *= dt_ns / found
+        found = dt_ns
     if not (np.isfinite(found) and found > 0):
         raise CpunetError(
-            f"{path}: event 0: the sampling period is {found:g} ns; "
-            f"correct column {name} of the file"
-        )
-    if dt_ns is not None and not np.isclose(found, dt_ns, rtol=_TOLERANCE, atol=0):
-        raise CpunetError(
-            f"{path}: sampled every {found:g} ns, but `dt_ns` says {dt_ns:g}; drop `dt_ns`"
+            f"{path}: event 0: the sampling period ({name}) is {found:g} ns", "give `dt_ns`"
         )
     # A single value, a scalar or an array of length 1, applies to all events.
     varying = None if len(column) == 1 else column
@@ -294,9 +315,9 @@ def _ns_per_unit(path: Path, name: str, column: Column) -> float | None:
     units = column.units or ("ns" if name.endswith("_ns") else "")
     if not units:
         return None
-    if units not in TIME_UNITS:
+    if (ns_per_unit := factor(units, "ns")) is None:
         raise CpunetError(
-            f"{path}: the sampling period ({name}) is in {units!r}; "
-            f"known are {', '.join(TIME_UNITS)}"
+            f"{path}: the sampling period ({name}) is in {units!r}; expected one of "
+            f"{unit_names('ns')}"
         )
-    return TIME_UNITS[units]
+    return ns_per_unit

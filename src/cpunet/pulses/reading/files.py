@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 
 ALL = "all"  # in place of the name of a table
+_ROWS = re.compile(r"(?:(.+)/)?(\w+=[^,/=]+(?:,\w+=[^,/=]+)*)")  # as raw/channel=3
 _TOLD = ("table", "energy", "kev_per_adc", "dt_ns")  # what a run keeps
 
 
@@ -28,7 +30,8 @@ class FileOptions:
     Parameters
     ----------
     table
-        Table of the pulses, if the file has several; ``all``: each for itself.
+        Table of the pulses, if the file has several, or rows in it, as ``raw/channel=3``;
+        ``all``: each for itself.
     energy
         Energy column, or ``FILE:path/to/column``, as of a hit tier.
     kev_per_adc
@@ -50,7 +53,8 @@ class ReadOptions:
     Parameters
     ----------
     data_table
-        Table of the measured pulses, if the file has several; ``all``: each for itself.
+        Table of the measured pulses, if the file has several, or rows in it, as
+        ``raw/channel=3``; ``all``: each for itself.
     data_energy
         Energy column of the data, or ``FILE:path/to/column``, as of a hit tier.
     kev_per_adc
@@ -107,6 +111,19 @@ class PulseFile:
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise CpunetError(f"{self.path}: {name} is {value}; expected more than 0")
+
+    @property
+    def place(self) -> str | None:
+        """The table alone, without what chooses rows of it."""
+        found = _ROWS.fullmatch(self.table or "")
+        return self.table if found is None else found[1]
+
+    @property
+    def rows(self) -> dict[str, str]:
+        """Values of the columns by which rows of the table are chosen."""
+        found = _ROWS.fullmatch(self.table or "")
+        pairs = [] if found is None else [one.split("=") for one in found[2].split(",")]
+        return dict(pairs)
 
     @property
     def files(self) -> tuple[Path | str | None, ...]:
@@ -196,7 +213,8 @@ def open_pulses(
     table
         Location of the waveforms, needed only if there are several: a table or waveform
         column of an LH5 file, a group or dataset of an HDF5 file, an array of an ``.npz``, a
-        channel of an ``.fcio``, a detector of the Majorana release.
+        channel of an ``.fcio``, a detector of the Majorana release.  Rows of a table that
+        holds several channels are chosen by a column, as ``raw/channel=3``.
     energy
         Column of the energies, or ``FILE:path/to/column`` for a column of another
         HDF5 file of the same events, such as LEGEND's hit tier.
@@ -265,11 +283,12 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
     if found is not HDF5:
         return {}
     from cpunet.hdf5_files import opened
-    from cpunet.pulses.reading.hdf5 import waveform_tables
+    from cpunet.pulses.reading.hdf5 import channel_tables
     from cpunet.pulses.reading.published import detectors, is_majorana
 
     with opened(path) as file:
-        return dict.fromkeys(detectors(file) if is_majorana(file) else waveform_tables(file))
+        tables = detectors(file) if is_majorana(file) else channel_tables(path, file)
+        return dict.fromkeys(tables)
 
 
 def recognise(path: Path) -> Format:

@@ -13,8 +13,19 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import StoredRows, is_column, lh5_rows, opened, text_attribute
+from cpunet.hdf5_files import (
+    StoredRows,
+    is_column,
+    is_text,
+    item_at,
+    lh5_rows,
+    members,
+    opened,
+    text_attribute,
+    units_of,
+)
 from cpunet.pulses.reading.arrays import ArraySource
+from cpunet.pulses.reading.division import divides, dividing, labels
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.published import is_majorana, open_majorana
@@ -25,7 +36,6 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
-_CONTACT = "chnid"  # contact of each pulse in tables of SolidStateDetectors
 _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
@@ -34,30 +44,23 @@ def open_hdf5(options: PulseFile) -> PulseSource:
     with opened(options.path) as file:
         if is_majorana(file):
             return open_majorana(options, file)
-        table, _, contact = (options.table or "").partition(f"{_CONTACT}=")
-        chosen = choose_waveforms(options.path, file, table)
+        chosen = choose_waveforms(options.path, file, options.place)
         if chosen.is_lh5:
-            return Lh5Source(options, chosen, contact)
+            return Lh5Source(options, chosen)
         values = StoredRows(options.path, chosen.path, file[chosen.path].shape)
-        columns = columns_of(options.path, file[chosen.table or "/"])
+        columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
     return ArraySource(options, "HDF5", chosen.path, values, columns)
 
 
 class Lh5Source(PulseSource):
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
 
-    def __init__(self, options: PulseFile, chosen: WaveformColumn, contact: str = "") -> None:
+    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
         self._values = f"{chosen.path}/values"
         with opened(options.path) as file:
-            columns = columns_of(options.path, file[chosen.table or "/"])
-            rows = _rows_of_contact(options.path, columns, contact)
-            self._first, n_pulses = rows or (0, _n_rows(file[self._values]))
-            own = columns_of(options.path, file[chosen.path])
-            if rows is not None:
-                columns, own = (
-                    {name: column.part(*rows) for name, column in of.items()}
-                    for of in (columns, own)
-                )
+            columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
+            own = columns_of(options.path, file[chosen.path], chosen.path)
+            self._size = n_pulses = _n_rows(file[self._values])
             first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
             shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
             if shortest < longest and first.dtype.kind == "f":
@@ -79,15 +82,14 @@ class Lh5Source(PulseSource):
 
     def _traces(self, size: int) -> Iterator[Traces]:
         with opened(self.path) as file:
-            n_pulses = self.n_pulses or 0
-            for start in range(0, n_pulses, size):
-                n = min(size, n_pulses - start)
+            for start in range(0, self._size, size):
+                n = min(size, self._size - start)
                 yield Traces(self._rows(file, start, n, self.length))
 
     def _rows(
         self, file: h5py.File, start: int, size: int, length: int | None
     ) -> npt.NDArray[Any]:
-        item, start = file[self._values], self._first + start
+        item = file[self._values]
         plain = isinstance(item, h5py.Dataset)
         values = item[start : start + size] if plain else lh5_rows(item, start, size)
         if not hasattr(values, "cumulative_length"):
@@ -121,32 +123,6 @@ def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
         return None
     lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
     return (int(lengths.min()), int(lengths.max())) if len(lengths) else None
-
-
-def _rows_of_contact(
-    path: Path, columns: dict[str, Column], contact: str
-) -> tuple[int, int] | None:
-    """First row and number of rows of a contact, where a table holds several one by one."""
-    column = columns.get(_CONTACT)
-    values = column.read(0, len(column)) if column is not None else np.empty(0)
-    contacts = [str(one) for one in np.unique(values)]
-    if contact and contact not in contacts:
-        held = ", ".join(contacts) or "none"
-        raise CpunetError(f"{path}: no contact {contact} (column {_CONTACT}); it holds {held}")
-    if len(contacts) < 2:
-        return None
-    if not contact:
-        raise CpunetError(
-            f"{path}: holds the pulses of contacts {', '.join(contacts)} (column {_CONTACT})",
-            f"choose the one that is read out with `table` chnid={contacts[0]}",
-        )
-    rows = np.flatnonzero(values == type(values[0])(contact))
-    if len(rows) <= rows[-1] - rows[0]:
-        raise CpunetError(
-            f"{path}: the rows of contacts {', '.join(contacts)} are mixed",
-            "write those of a contact one after another",
-        )
-    return int(rows[0]), len(rows)
 
 
 def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
@@ -189,40 +165,45 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
     CpunetError
         If there is no such table, or not exactly one choice; the message lists the choices.
     """
-    if table is None or not table.strip("/"):
-        found = list(_walk(file, set()))
-        if not found:
-            raise _no_waveforms(path, file)
-        return _only(path, found)
-    item = file.get(table)
+    place = (table or "").strip("/")
+    item = item_at(file, place)
     if item is None:
-        known = sorted({c.table for c in _walk(file, set())}) or _tables(file)
-        raise CpunetError(f"{path}: no table {table}; there are {shortened(known)}")
-    column = _column(file, table)
+        there = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
+        raise CpunetError(f"{path}: no table {place}; there are {shortened(there)}")
+    above, _, name = place.rpartition("/")
+    column = _column(item, above, name)
     if column is not None:
         return column
-    found = list(_walk(item, set())) if isinstance(item, h5py.Group) else []
-    if not found:
-        raise CpunetError(
-            f"{path}: no waveforms in {table}; "
-            f"they are in {shortened(sorted({c.table for c in _walk(file, set())}))}"
-        )
-    return _only(path, found)
+    folders = _folders(item, place) if isinstance(item, h5py.Group) else ()
+    found = [column for folder in folders for column in folder.waveforms()]
+    if broken := next((column.table for column in found if not column.name), None):
+        item_at(file, broken)  # which says what is wrong
+    if found:
+        return _only(path, found)
+    raise _no_waveforms(path, file, place)
 
 
-def _no_waveforms(path: Path, file: h5py.File) -> CpunetError:
+def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     """Error that names the arrays which could be traces, if there are any."""
-    arrays: list[str] = []
-
-    def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        traces = isinstance(item, h5py.Dataset) and item.ndim == 2 and item.shape[1] > 3
-        if traces and item.dtype.kind in "iuf":  # of three columns are positions
-            arrays.append(name)
-
-    file.visititems(look)
+    if place and (tables := waveform_tables(file)):
+        return CpunetError(f"{path}: no waveforms in {place}; they are in {shortened(tables)}")
+    arrays, others, tables = list[str](), list[str](), list[str]()
+    for folder in _folders(file):
+        tables += [folder.path] if folder.is_table else []
+        for name, item in folder.members.items():
+            where = f"{folder.path}/{name}".strip("/")
+            if kind := _no_array(item):
+                others.append(f"{where} is {kind}")
+            elif _is_array(item) and item.shape[1] > 3:  # of three columns are positions
+                arrays.append(where)
+    if others and not arrays:
+        return CpunetError(
+            f"{path}: {others[0]}",
+            "if it holds the traces, write them as an array of two dimensions (event, sample)",
+        )
     if not arrays:
         return CpunetError(
-            f"{path}: no waveforms in it; it holds {shortened(_tables(file))}",
+            f"{path}: no waveforms in it; it holds {shortened(tables or list(file))}",
             "give a file of traces (their energies may be here: `data_energy` FILE:COLUMN)",
         )
     many = "an array" if len(arrays) == 1 else f"{len(arrays)} arrays"
@@ -233,9 +214,49 @@ def _no_waveforms(path: Path, file: h5py.File) -> CpunetError:
     )
 
 
+def _is_array(item: object) -> bool:
+    return isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
+
+
+def _no_array(item: object) -> str:
+    """What a dataset of traces is in place of an array of two dimensions; empty if none."""
+    if not isinstance(item, h5py.Dataset):
+        return ""
+    kind, fields = item.dtype, item.dtype.names or ()
+    if any(kind[name].shape for name in fields):
+        return f"a compound table of fields {shortened(fields)}"
+    if kind.subdtype or (item.ndim > 2 and kind.kind in "iuf"):
+        return f"an array of shape {item.shape + kind.shape}, as of several segments"
+    inner = h5py.check_vlen_dtype(kind)
+    if inner is not None and np.dtype(inner).kind in "iuf":
+        return f"an array of rows of free length ({inner})"
+    return ""
+
+
 def waveform_tables(file: h5py.File) -> list[str]:
-    """Paths of the tables that contain waveforms, sorted."""
-    return sorted({column.table for column in _walk(file, set())})
+    """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
+    return sorted({one.table for folder in _folders(file) for one in folder.waveforms()})
+
+
+def channel_tables(path: Path, file: h5py.File) -> list[str]:
+    """The same, with the rows of each channel where one table holds several."""
+    found: list[str] = []
+    for table in waveform_tables(file):
+        try:
+            group = item_at(file, table) or file
+            columns = columns_of(path, group, table) if isinstance(group, h5py.Group) else {}
+        except CpunetError:  # said where the table is opened
+            columns = {}
+        rows = max(map(len, columns.values()), default=0)
+        of = {
+            name: column.read(0, rows)
+            for name, column in columns.items()
+            if divides(name) and len(column) == rows
+        }
+        names = dividing(of, rows)
+        parts = np.unique(labels(of, names)) if names else [""]
+        found += [f"{table}/{part}".strip("/") for part in parts]
+    return found
 
 
 def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
@@ -259,54 +280,68 @@ def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
     )
 
 
-def _walk(group: h5py.Group, seen: set[tuple[int, int]]) -> Iterator[WaveformColumn]:
+@dataclass(frozen=True)
+class _Folder:
+    """A group of a file: its path, what it holds, and links in it that lead nowhere."""
+
+    path: str
+    members: dict[str, h5py.Group | h5py.Dataset]
+    broken: list[str]
+    is_table: bool
+
+    def waveforms(self) -> list[WaveformColumn]:
+        """Waveforms in it, those of LH5 before others; of broken links, with no name."""
+        if self.is_table and {"dt", "values"} <= self.members.keys():
+            return []  # the inside of waveforms
+        columns = [_column(item, self.path, name) for name, item in self.members.items()]
+        there = [column for column in columns if column is not None]
+        plain = [column for name in _PLAIN for column in there if column.name == name]
+        found = [column for column in there if column.is_lh5] or plain[:1]
+        if found or self.is_table:
+            return found
+        return [WaveformColumn(f"{self.path}/{n}".strip("/"), "", False) for n in self.broken]
+
+
+def _folders(
+    group: h5py.Group, path: str = "", seen: set[tuple[int, int]] | None = None
+) -> Iterator[_Folder]:
+    """A group and those in it, except in tables, through links."""
     # links can give an object several names or form cycles: visit each object once
-    info = h5py.h5o.get_info(group.id)
+    seen, info = set() if seen is None else seen, h5py.h5o.get_info(group.id)
     if (info.fileno, info.addr) in seen:
         return
     seen.add((info.fileno, info.addr))
-    columns = [_column(group, name) for name in group]
-    found = [column for column in columns if column is not None]
-    lh5_found = [column for column in found if column.is_lh5]
-    plain = [column for name in _PLAIN for column in found if column.name == name]
-    yield from lh5_found or plain[:1]
-    # other columns of a table can be groups of many datasets, but contain no waveforms
-    if text_attribute(group, "datatype").startswith("table"):
-        return
-    names = {column.name for column in found}
+    found, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
     for name in group:
-        # None for a broken link
-        inner = group.get(name)
-        if name not in names and isinstance(inner, h5py.Group):
-            yield from _walk(inner, seen)
+        try:
+            found[name] = item_at(group, name)
+        except CpunetError:
+            broken.append(name)
+    is_table = text_attribute(group, "datatype").startswith("table")
+    yield _Folder(path, found, broken, is_table)
+    for name, item in found.items():
+        # columns of a table can be groups of many datasets, but contain no waveforms
+        if isinstance(item, h5py.Group) and not is_table:
+            yield from _folders(item, f"{path}/{name}".strip("/"), seen)
 
 
-def _column(group: h5py.Group, name: str) -> WaveformColumn | None:
-    """Return what has this name (or path) in a group as waveforms; None if it is none."""
-    item = group.get(name)  # None for a broken link
+def _column(item: h5py.Group | h5py.Dataset, table: str, name: str) -> WaveformColumn | None:
+    """Return an item of a table as waveforms; None if it is none."""
     is_lh5 = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
     is_lh5 = is_lh5 and text_attribute(item, "datatype").startswith("table")
-    plain = isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
-    table, _, own = f"{group.name}/{name.strip('/')}".rpartition("/")
-    return WaveformColumn(table.strip("/"), own, is_lh5) if is_lh5 or plain else None
+    return WaveformColumn(table, name, is_lh5) if is_lh5 or _is_array(item) else None
 
 
-def _tables(group: h5py.Group) -> list[str]:
-    """LH5 tables, or the top-level groups if there are none; for messages."""
-    tables: list[str] = []
+def columns_of(path: Path, group: h5py.Group, table: str) -> dict[str, Column]:
+    """Columns of a group: its numeric datasets of one dimension, and its scalars.
 
-    def note(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if text_attribute(item, "datatype").startswith("table"):
-            tables.append(name)
-
-    group.visititems(note)
-    return tables or list(group)
-
-
-def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
-    """Columns of a group: its numeric datasets of one dimension, and its scalars."""
-    members = {name: group.get(name) for name in group}
-    return {name: _stored(path, m) for name, m in members.items() if is_column(m)}
+    Text counts where it separates channels.
+    """
+    return {
+        name: _stored(path, item, f"{table}/{name}")
+        for name, item in members(group).items()
+        if is_column(item) or (divides(name) and is_text(item))
+    }
 
 
 def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
@@ -318,17 +353,18 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
         If there is no such file or column; the message lists the other columns of the group.
     """
     with opened(path) as file:
-        found = file.get(name)
+        place = name.strip("/").rpartition("/")[0]
+        parent, found = item_at(file, place), item_at(file, name)
+        others = columns_of(path, parent, place) if isinstance(parent, h5py.Group) else {}
         if is_column(found):
-            return _stored(path, found), columns_of(path, found.parent)
-        parent = file.get(name.strip("/").rpartition("/")[0] or "/")
-        known = list(columns_of(path, parent)) if isinstance(parent, h5py.Group) else list(file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(known)}")
+            return _stored(path, found, name), others
+        there = list(others or file)
+    raise CpunetError(f"{path}: no column {name}; there are {shortened(there)}")
 
 
-def _stored(path: Path, dataset: h5py.Dataset) -> Column:
-    """A dataset as a column; the file is open only while reading."""
-    name, is_constant = dataset.name, dataset.ndim == 0
+def _stored(path: Path, dataset: h5py.Dataset, name: str) -> Column:
+    """A dataset as a column, by its name in this file; the file is open only while reading."""
+    is_constant = dataset.ndim == 0
 
     def read(start: int, stop: int) -> npt.NDArray[Any]:
         with opened(path) as file:
@@ -336,4 +372,4 @@ def _stored(path: Path, dataset: h5py.Dataset) -> Column:
                 return np.full(stop - start, file[name][()])
             return np.asarray(file[name][start:stop])
 
-    return Column(read, dataset.size, text_attribute(dataset, "units"), is_constant)
+    return Column(read, dataset.size, units_of(dataset), is_constant)

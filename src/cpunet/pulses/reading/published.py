@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from cpunet.hdf5_files import StoredRows, is_column
 from cpunet.pulses.reading.arrays import ArraySource
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import choose_table
+from cpunet.pulses.reading.source import ANY, choose_table
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
@@ -56,7 +57,9 @@ def open_majorana(options: PulseFile, file: h5py.File) -> ArraySource:
     """Open the traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
     number, length = file[WAVEFORMS].shape
     rows = np.arange(number)
-    if options.table != WAVEFORMS:
+    if options.table == WAVEFORMS:
+        options = replace(options, table=f"{WAVEFORMS}/{DETECTOR}={ANY}")
+    else:
         remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
         chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
         rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
@@ -68,7 +71,7 @@ def open_majorana(options: PulseFile, file: h5py.File) -> ArraySource:
             columns[shown] = Column.of(item[()][rows], units)
     values = StoredRows(options.path, WAVEFORMS, (len(rows), length), rows)
     hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
-    table = options.table or WAVEFORMS
+    table = options.place or WAVEFORMS
     return ArraySource(options, "Majorana release", table, values, columns, hint)
 
 

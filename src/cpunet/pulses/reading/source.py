@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.division import divides, dividing, labels, texts
 from cpunet.pulses.reading.energies import (
     EVENT_KEYS,
-    TIME_UNITS,
     Column,
     require_length,
     resolve_energies,
@@ -23,8 +23,10 @@ from cpunet.pulses.reading.energies import (
 )
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.tables import shortened
+from cpunet.units import factor
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
+ANY = "*"  # value of a column that separates no channels
 _MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = EVENT_KEYS[:-1]
 
@@ -53,6 +55,8 @@ class Layout:
         Hint for the error message if the sampling period is not in the file.
     t0
         Times of the first samples, if they are in the file.
+    rows, n_rows
+        Rows of the table that are read, and how many it has; None if all are.
     """
 
     format: str
@@ -64,6 +68,8 @@ class Layout:
     period: Column | None = None
     period_hint: str = ""
     t0: Column | None = None
+    rows: npt.NDArray[np.int64] | None = None
+    n_rows: int | None = None
 
     @classmethod
     def of_array(
@@ -93,6 +99,48 @@ class Layout:
         period = columns.get(period_name)
         return cls(format, name, shape[0], shape[1], columns, period_name, period)
 
+    def of_rows(self, path: Path, chosen: Mapping[str, str]) -> Layout:
+        """Rows with the chosen values of some columns, or all if they are of one channel.
+
+        Raises
+        ------
+        CpunetError
+            If there are none, or they are of several channels.
+        """
+        if self.n_pulses is None:
+            return self
+        whole = {n: c for n, c in self.columns.items() if len(c) == self.n_pulses}
+        rows = np.arange(self.n_pulses)
+        for name, value in chosen.items():
+            if value == ANY:
+                continue
+            if name not in whole:
+                raise CpunetError(f"{path}: no column {name}; there are {shortened(whole)}")
+            there = texts(whole[name].read(0, self.n_pulses))
+            rows = rows[there[rows] == value]
+            if not len(rows):
+                raise CpunetError(
+                    f"{path}: no {name} {value}; it holds {shortened(np.unique(there))}"
+                )
+        of = {n: c.read(0, self.n_pulses)[rows] for n, c in whole.items() if divides(n)}
+        of = {name: values for name, values in of.items() if name not in chosen}
+        if names := dividing(of, len(rows)):
+            held = list(np.unique(labels(of, names)))
+            also = ", or all for each" if self.format in ("LH5", "HDF5") else ""
+            raise CpunetError(
+                f"{path}: one table of {len(held)} channels or detectors ({shortened(held)})",
+                f"choose one with `table` {held[0]} (`sim_table`, `data_table`){also}; "
+                f"{','.join(f'{name}={ANY}' for name in names)} takes them as one",
+            )
+        if len(rows) == self.n_pulses:
+            return self
+        period, t0 = (c and c.at(rows) for c in (self.period, self.t0))
+        columns = {n: c.at(rows) for n, c in self.columns.items()}
+        return replace(
+            self, n_pulses=len(rows), columns=columns, period=period, t0=t0, rows=rows,
+            n_rows=self.n_pulses,
+        )  # fmt: skip
+
 
 def choose_table(
     options: PulseFile,
@@ -119,15 +167,15 @@ def choose_table(
     CpunetError
         If there is no such table, or there are several and none was chosen.
     """
-    if options.table is None:
+    if options.place is None:
         if len(known) == 1:
             return known[0]
         raise CpunetError(f"{options.path}: {len(known)} {many} ({shortened(known)}); {remedy}")
-    if options.table not in known:
+    if options.place not in known:
         raise CpunetError(
-            f"{options.path}: no {one} {options.table}; there are {shortened(known)}"
+            f"{options.path}: no {one} {options.place}; there are {shortened(known)}"
         )
-    return options.table
+    return options.place
 
 
 @dataclass(frozen=True)
@@ -167,6 +215,7 @@ class PulseSource(ABC):
                 f"{options.path}: {layout.table or layout.format} holds no pulses; "
                 "give a file with events"
             )
+        layout = layout.of_rows(options.path, options.rows)
         self.path = options.path
         self.n_pulses = layout.n_pulses
         self.length = layout.length
@@ -194,10 +243,15 @@ class PulseSource(ABC):
             If the file is damaged or contains no pulses, or if its events differ in length or
             sampling period.
         """
-        start = 0
+        start = row = 0
         for traces in self._traces(min(size, max(1, BLOCK_BYTES // (4 * self.length)))):
-            yield self._pulses(start, traces)
-            start += len(traces.waveforms)
+            begin, row = row, row + len(traces.waveforms)
+            if (rows := self.layout.rows) is not None:
+                here = rows[slice(*np.searchsorted(rows, (begin, row)))] - begin
+                traces = Traces(traces.waveforms[here])
+            if len(traces.waveforms):
+                yield self._pulses(start, traces)
+                start += len(traces.waveforms)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
         column = self.energies.column
@@ -234,8 +288,8 @@ class PulseSource(ABC):
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         self._sampling.check(start, event_number)
         t0, t0_ns = self.layout.t0, np.zeros(len(waveforms))
-        if t0 is not None and t0.units in TIME_UNITS:
-            t0_ns = TIME_UNITS[t0.units] * np.asarray(t0.read(start, stop), np.float64)
+        if t0 is not None and (ns_per_unit := factor(t0.units, "ns")) is not None:
+            t0_ns = ns_per_unit * np.asarray(t0.read(start, stop), np.float64)
         return Pulses.of(
             waveforms,
             dt_ns=self.dt_ns,

@@ -1,0 +1,94 @@
+"""Environments of containers, batch systems and scripts."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import numba
+import numpy as np
+import pytest
+
+import cpunet
+from cpunet.kernels import kernel
+
+
+def python(*words: object, status: int = 0, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], capture_output=True, check=False,
+        env=os.environ | environment,
+    )  # fmt: skip
+    said = (done.stdout + done.stderr).decode("utf-8", "surrogateescape")
+    assert done.returncode == status, said
+    return said
+
+
+@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["info", "FILE"]])
+def test_without_docstrings(stand, words):
+    given = [str(stand.sim) if word == "FILE" else word for word in words]
+    assert "Traceback" not in python("-m", "cpunet", *given, PYTHONOPTIMIZE="2")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_characters_that_a_terminal_lacks_are_replaced(stand, encoding):
+    said = python("-m", "cpunet", "info", stand.data, PYTHONIOENCODING=encoding)
+    assert f"{len(stand.data_kev)} of 1200 samples" in said
+    name = stand.folder / "caf\udce9.lh5"
+    if not name.exists():
+        os.link(stand.sim, name)
+    python("-m", "cpunet", "info", name, PYTHONIOENCODING=encoding)
+    python("-m", "cpunet", "info", name / "\u03bc", PYTHONIOENCODING=encoding, status=2)
+
+
+def test_a_script_without_a_guard_is_named(stand, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from cpunet.processes import outcomes, usable_cores\n"
+        "print([*outcomes(usable_cores, [1, 2], 2)])\n"
+    )
+    said = python(script, status=1).splitlines()[-1]
+    assert f"{script}: processes run this script again; put its calls under if __name__" in said
+
+
+def loop(values):
+    for i in numba.prange(len(values)):
+        values[i] += 1
+
+
+def test_a_parallel_loop_in_a_forked_process_names_spawn():
+    parallel, values = kernel(parallel=True)(loop), np.zeros(3)
+    parallel(values)
+    read, write = os.pipe()
+    if not (child := os.fork()):
+        try:
+            parallel(values)
+        except cpunet.errors.CpunetError as error:
+            os.write(write, str(error).encode())
+        os._exit(0)
+    os.close(write)
+    os.waitpid(child, 0)
+    assert b'get_context("spawn")' in os.read(read, 1000)
+    os.close(read)
+
+
+@pytest.mark.parametrize("name", ["HUP", "QUIT", "USR1", "USR2", "XCPU"])
+def test_signals_of_batch_systems_leave_nothing(command, stand, tmp_path, monkeypatch, name):
+    number = getattr(signal, f"SIG{name}")
+    arrive = lambda *_given, **_options: signal.raise_signal(number)  # noqa: E731
+    words = ["simulate", "--detector", "ppc", "--events", "FEP=3", "--out", tmp_path / "o.lh5"]
+    with monkeypatch.context() as patched:
+        patched.setattr("pathlib.Path.replace", arrive)
+        outcome = command(*words)
+    assert outcome.code == 128 + number
+    assert "interrupted" in outcome.err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+    signal.signal(number, before := signal.SIG_IGN)  # as by nohup
+    try:
+        with monkeypatch.context() as patched:
+            patched.setattr("cpunet.inspection._look", arrive)
+            command("info", stand.sim)
+        assert signal.getsignal(number) == before
+    finally:
+        signal.signal(number, signal.SIG_DFL)

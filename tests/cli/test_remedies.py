@@ -1,0 +1,245 @@
+"""What a message advises is done, word by word, and gets on: no remedy is refused by another.
+
+Advice that needs data of its own is followed where that is tested: longer windows in
+``test_check.py``, other energies of a training in ``test_mistakes.py``, impurities and voltages
+that metadata lack in ``test_geometry_readers.py``, `resume` in ``test_resume.py``.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from typing import NamedTuple
+
+import h5py
+import lh5
+import numpy as np
+import pytest
+from lgdo import Array, Table
+
+from cpunet.pulses.reading import open_pulses
+from cpunet.pulses.writing import PulseWriter
+from synthetic import write_chain
+
+CHECK = "check --sim sim.lh5 --data data.lh5"
+TRANSLATE = "translate run sim.lh5 --out out.lh5 --force"
+SIMULATE = "simulate --detector ppc --out hit.lh5 --force"
+USED = r"24 measured pulses of 90 can be used"
+
+
+class Remedy(NamedTuple):
+    """Words of a command, what it advises, the words that follow from it, and what comes then.
+
+    Parts of the advice in parentheses are put into the words that follow, where braces stand.
+    """
+
+    words: str
+    advice: str
+    follow: str
+    then: str = USED
+
+
+REMEDIES = {
+    "one of two tables": Remedy(
+        f"{CHECK} --data two.lh5", r"tables of waveforms \((\S+), .*choose one with --table",
+        "--data-table {}",
+    ),
+    "one of two channels": Remedy(
+        f"{CHECK} --data channels.lh5",
+        r"choose one with --table (channel=1) .*or all for each", "--data-table {}",
+        "12 measured pulses of 45 can be used",
+    ),
+    "each of two channels": Remedy(
+        f"{CHECK} --data channels.lh5", "--data-table.*or (all) for each", "--data-table {}",
+        r"channel_1:\n(.*\n)+channel_2:",
+    ),
+    "channels as one": Remedy(
+        f"{CHECK} --data channels.lh5", r"(channel=\*) takes them as one", "--data-table {}"
+    ),
+    "tables of a file": Remedy(
+        "info two.lh5", "one of them: --table NAME; each in full: --table (all)", "--table {}",
+        "geds:\nfile",
+    ),
+    "energies in MeV": Remedy(
+        f"{CHECK} --data mev.lh5", "if these are MeV, give (--kev-per-adc 1000)", "{}"
+    ),
+    "counts called keV": Remedy(
+        f"{CHECK} --data counts.lh5", "if these are ADC counts, give (--kev-per-adc)",
+        "{} 0.0666667",
+    ),
+    "energies in ADC": Remedy(
+        f"{CHECK} --data adc.lh5", "or give (--kev-per-adc)", "{} 1"
+    ),
+    "a column without units": Remedy(
+        f"{CHECK} --data adc.lh5 --data-energy energy",
+        "add (--kev-per-adc) .1 if it is in keV", "{} 1",
+    ),
+    "energies that are NaN": Remedy(
+        f"{CHECK} --data nan.lh5", "name the column .*(--data-energy)",
+        "{} geds_hit.lh5:geds/hit/E_cal",
+    ),
+    "energies of another file": Remedy(
+        "info geds_hit.lh5", "their energies may be here: (--data-energy) FILE:COLUMN",
+        f"& {CHECK} --data adc.lh5 {{}} geds_hit.lh5:geds/hit/E_cal",
+    ),
+    "energies elsewhere": Remedy(
+        f"{CHECK} --peak 5000-", r"(--peak \d+-) takes (?:\d+) pulses", "{}",
+        "90 measured pulses of 90",
+    ),
+    "no period": Remedy("info plain.h5", "give (--dt-ns)", "{} 16", "every 16 ns"),
+    "a period of zero": Remedy("info zero.lh5", "give (--dt-ns)", "{} 16", "every 16 ns"),
+    "another period": Remedy(
+        f"{CHECK} --sim sim10.lh5", "or give (--dt-ns) if one says it wrongly", "{} 16"
+    ),
+    "an array": Remedy(
+        "info array.h5", r"\((\w+)\); if it holds traces, name it by (--table) .*give --dt-ns",
+        "{1} {0} --dt-ns 16", "90 of 1200 samples",
+    ),
+    "sides": Remedy(
+        f"{CHECK} --data sim.lh5", "(?i)if they are measured, say so with (--insist)", "{}",
+        r"(ok|look|stop) ",
+    ),
+    "cuts that leave nothing": Remedy(
+        f"{CHECK} --set cuts.decay_sigmas=1e-9", r"widen (cuts\.)\*_sigmas",
+        "--set {}decay_sigmas=5", r"2\d measured pulses of 90 can be used",
+    ),
+    "a setting that is misspelt": Remedy(
+        f"{CHECK} --set preparation.after=9600", "did you mean (after_ns)",
+        f"& {CHECK} --set preparation.{{}}=6400",
+    ),
+    "an output that exists": Remedy(
+        "translate run sim.lh5 --out data.lh5.out", "or give (--force)", "{}", "90 of 90"
+    ),
+    "settings of traces": Remedy(
+        f"{TRANSLATE} --adc-per-kev 4 --baseline 100", "add (--adc)", "{}", "90 of 90"
+    ),
+    "a gain": Remedy(
+        f"{TRANSLATE} --adc --baseline 100", "give (--adc-per-kev)", "{} 4", "90 of 90"
+    ),
+    "a baseline": Remedy(
+        f"{TRANSLATE} --adc --adc-per-kev 4", "give (--baseline)", "{} 100", "90 of 90"
+    ),
+    "samples before": Remedy(
+        f"{TRANSLATE} --adc --adc-per-kev 4 --baseline 9 --n-pre 900",
+        "or a longer (--length)", "{} 2000", "90 of 90",
+    ),
+    "a detector of hits": Remedy(
+        f"{SIMULATE} --hits hits.h5",
+        r"holds detectors (\d), .*choose one with (--hits-detector)", "{1} {0}",
+        "3 pulses|3 events",
+    ),
+    "units of hits": Remedy(
+        f"{SIMULATE} --hits plain.csv", "give (--units), one of", "{} mm,keV",
+        "3 pulses|3 events",
+    ),
+    "no detector": Remedy(
+        f"{SIMULATE} --hits hits.npz --hits-detector V1", "leave out (--hits-detector)",
+        f"& {SIMULATE} --hits hits.npz", "3 pulses|3 events",
+    ),
+    "hits outside": Remedy(
+        f"{SIMULATE} --hits far.npz", "move them with (--origin)", "{} 0 0 500",
+        "3 pulses|3 events",
+    ),
+    "no source of hits": Remedy(
+        SIMULATE, "give (--hits) of a file", "{} hits.npz", "3 pulses|3 events"
+    ),
+    "settings of no detector": Remedy(
+        "info sim.lh5 --set bias_V=3", "leave out --set", "& info sim.lh5", "90 of 225 samples"
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def home(stand, tmp_path_factory):
+    """The files that the commands are given."""
+    folder = tmp_path_factory.mktemp("remedies")
+    waves, kev, n = stand.data_waveforms, stand.data_kev, len(stand.data_kev)
+    for name, energies in {
+        "data": kev, "two": kev, "channels": kev, "mev": kev / 1000, "counts": 15 * kev,
+        "adc": kev, "nan": kev * np.nan, "zero": kev,
+    }.items():  # fmt: skip
+        stand.write(folder / f"{name}.lh5", "geds/raw", waves, energies)
+    sim = (stand.sim_waveforms, stand.sim_kev)
+    stand.write(folder / "sim.lh5", "geds/sim", *sim, units="")
+    stand.write(folder / "sim10.lh5", "geds/sim", *sim, units="", dt_ns=10)
+    with h5py.File(folder / "two.lh5", "r+") as file:
+        file.copy("geds", "more")
+    with h5py.File(folder / "adc.lh5", "r+") as file:
+        file["geds/raw/energy"].attrs["units"] = "ADC"
+    with h5py.File(folder / "zero.lh5", "r+") as file:
+        file["geds/raw/waveform/dt"][:] = 0
+    channel = Table(col_dict={"channel": Array(np.arange(n) // (n // 2) + 1)})
+    lh5.write(channel["channel"], "channel", folder / "channels.lh5", group="geds/raw")
+    hit = Table(col_dict={"E_cal": Array(kev)})
+    lh5.write(hit, "hit", folder / "geds_hit.lh5", group="geds")
+    for name, array in (("plain", "waveform"), ("array", "curves")):
+        with h5py.File(folder / f"{name}.h5", "w") as file:
+            file[array] = waves
+    x = np.array([5.0, 6.0, 9.0])
+    hits = {
+        "x_mm": x,
+        "y_mm": 0 * x,
+        "z_mm": x,
+        "offsets": np.arange(4),
+        "edep_keV": 0 * x + 900,
+    }
+    np.savez(folder / "hits.npz", **hits)
+    np.savez(folder / "far.npz", **(hits | {"z_mm": x + 500}))
+    columns = {"event": [0, 1, 2] * 2, "x": [*x, *x], "y": [0.0] * 6, "z": [*x, *x]}
+    columns |= {"edep": [0.9] * 6, "volID": [1, 1, 1, 2, 2, 2]}
+    with h5py.File(folder / "hits.h5", "w") as file:
+        for name, values in columns.items():
+            file[f"default_ntuples/g4sntuple/{name}/pages"] = values
+    names = "".join(f"#column double {name}\n" for name in ("event", "x", "y", "z", "edep"))
+    rows = "".join(f"{i},{v},0,{v},900\n" for i, v in enumerate(x))
+    (folder / "plain.csv").write_text(
+        f"#class tools::wcsv::ntuple\n#separator 44\n{names}{rows}"
+    )
+    write_chain(folder / "run", noise_kev=1.0)
+    (folder / "data.lh5.out").write_bytes((folder / "sim.lh5").read_bytes())
+    return folder
+
+
+def last_of_each(text: str) -> list[str]:
+    """Words of a command; an option that comes again takes the place of the first."""
+    words = shlex.split(text)
+    for option in {word for word in words if word.startswith("--")}:
+        while words.count(option) > 1:
+            at = words.index(option)
+            del words[at : at + 2]
+    return words
+
+
+@pytest.mark.parametrize("name", REMEDIES)
+def test_what_is_advised_is_taken(command, home, own_cache, monkeypatch, name):
+    monkeypatch.chdir(home)
+    remedy = REMEDIES[name]
+    first = command(*last_of_each(remedy.words))
+    advice = re.search(remedy.advice, first.out + first.err)
+    assert advice, first.out + first.err
+    follow = remedy.follow.format(*advice.groups())
+    whole = follow.removeprefix("& ") if follow[0] == "&" else f"{remedy.words} {follow}"
+    again = command(*last_of_each(whole))
+    said = again.out + again.err
+    assert re.search(remedy.then, said), said
+    assert not re.search(remedy.advice, said) or name == "tables of a file", said
+
+
+def test_traces_are_turned_round_and_unwrapped_as_advised(command, home, stand, monkeypatch):
+    monkeypatch.chdir(home)
+    waves, kev = stand.data_waveforms, stand.data_kev
+    for name, traces, advice in (
+        ("down", 60_000 - waves, r"turn them round, as by pulses\.with_waveforms\(-pulses"),
+        ("rolled", waves.view(np.int16), r"values\.view\('uint16'\).*, period=65536"),
+    ):
+        stand.write(home / f"{name}.lh5", "geds/raw", traces, kev)
+        words = ["check", "--sim", "sim.lh5", "--data"]
+        assert re.search(advice, command(*words, f"{name}.lh5").out)
+        pulses = open_pulses(home / f"{name}.lh5").read()
+        turned = -pulses.waveforms
+        if name == "rolled":
+            turned = np.unwrap(pulses.waveforms, period=65536)
+            np.testing.assert_array_equal(turned, waves)
+        with PulseWriter(home / f"{name}2.lh5", force=True) as writer:
+            writer.append(pulses.with_waveforms(turned))
+        assert re.search(USED, command(*words, f"{name}2.lh5").out)
