@@ -26,7 +26,7 @@ from torch.nn.functional import pad, softplus
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.recipes import schema
-from cpunet.training.judging import Judge, judged
+from cpunet.training.judging import JUDGED, Judge, judged
 from cpunet.training.optimisers import Optimisers
 from cpunet.training.run import Record
 from cpunet.training.sides import Sides
@@ -279,7 +279,7 @@ def train(
             records.append({"iteration": done - 1, "rate": game.rate, "losses": losses})
             stop = interruption.signal if done < c.iterations else 0
             keep = stop or done == c.iterations or done % c.checkpoint_interval == 0
-            if done % c.log_interval == 0:
+            if done % JUDGED == 0:
                 records[-1]["accuracy"] = judged(game)
             of_weights = [float(p.sum()) for p in game.average.parameters()] if keep else []
             if not all(map(math.isfinite, (*losses.values(), *of_weights))):
@@ -292,9 +292,9 @@ def train(
             if keep:
                 save(state_of(game))
             if stop:
-                interruption.act(f"stopped after {done} of {c.iterations} iterations")
-        if records:
-            listener(records)
+                told = f"stopped after {done} of {c.iterations} iterations"
+                interruption.act(f"{told}; resume goes on from there")
+        listener(records)
     if game.judge.over.get("data") == "won":
         game.average.load_state_dict(game.good.state_dict())
     return game

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RECENT = 20  # values that are averaged
+JUDGED, RECENT = 5, 20  # iterations from one value to the next, and values that are averaged
 WON = 0.97
 EARLY, HALF = 0.25, 0.5  # part of a training before which none is at chance, and none has won
 

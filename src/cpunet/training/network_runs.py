@@ -172,7 +172,8 @@ def _played(
 
         def listen(records: list[Record]) -> None:
             run.log(records)
-            bar.update(len(records))
+            if records:
+                bar.update(len(records))
 
         def begin() -> Game:
             pair = make()
