@@ -274,7 +274,7 @@ def train(
         game, records = make(), list[Record]()
         restore(game, start)
         c = game.config
-        while game.iteration < c.iterations and game.judge.over.get("data") != "won":
+        while game.iteration < c.iterations and not game.judge.ended:
             losses, done = game.step(), game.iteration
             records.append({"iteration": done - 1, "rate": game.rate, "losses": losses})
             stop = interruption.signal if done < c.iterations else 0

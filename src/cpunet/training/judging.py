@@ -58,6 +58,11 @@ class Judge:
                 "not seen, as by guessing; its game ends here"
             )
 
+    @property
+    def ended(self) -> bool:
+        """Whether nothing is left to be played for."""
+        return self.over.get("data") == "won" or len(self.over) == len(self.values)
+
     def good(self, side: str) -> bool:
         """Whether a critic has not won lately."""
         return bool(self.values[side]) and float(np.mean(self.values[side])) <= WON

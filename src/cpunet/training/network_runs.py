@@ -43,6 +43,7 @@ ENOUGH, MANY = 600, 4000  # pulses of a side that a critic needs, and that a lar
 SMALL = {"convolutional": {"channels": 8, "hidden": 32, "components": 32}}
 SCALES = 0.0, 0.5, 1.0  # of what a U-Net adds
 SURE, MOST = 2.0, 2000  # standard errors of a gain, and held-out pulses that decide
+LEAST = 0.02  # part of the mean square of a cycle that a gain must be
 # settings of logs and checkpoints, which do not affect the weights
 _LOGS: Any = {"log_interval", "checkpoint_interval"}
 
@@ -318,4 +319,5 @@ def _iren_scale(game: Game) -> Scale:
     gains = squares[0] - squares[best]
     rms = [float(one.mean().sqrt()) for one in squares]
     told = f"RMS of held-out cycles {rms[0]:.2e} → {rms[-1]:.2e}"
-    return Scale.of(best, float(gains.mean()), float(gains.std()) / len(rows) ** 0.5, told)
+    error = max(float(gains.std()) / len(rows) ** 0.5, LEAST * float(squares[0].mean()) / SURE)
+    return Scale.of(best, float(gains.mean()), error, told)
