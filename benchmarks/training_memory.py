@@ -26,11 +26,7 @@ DT_NS = 16.0
 PEAK_KEV = 2614.5
 RUNS: dict[str, list[str]] = {
     # two iterations: the memory of a step is allocated after one
-    "paper": [
-        "training.iterations=2",
-        "training.decay_start=1",
-        "training.statistics_batches=1",
-    ],
+    "paper": ["training.iterations=2", "training.cycle_interval=1"],
     "fast": [],
 }
 

@@ -19,6 +19,7 @@ from cpunet.kernels import use_threads
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes import load_recipe
+from cpunet.training.adversarial import Generator
 from cpunet.translation.backends import Drawn, NetworkBackend, ResponseBackend
 
 REPEATS = 3
@@ -64,8 +65,8 @@ def main() -> None:
             response(pulses[rows], drawn)
 
     def unet(width: int, n: int) -> float:
-        recipe = load_recipe("paper", [f"generator.width={width}"]).at(16)
-        network = PositionalUNet(recipe.cyclegan.generator, 800).to(given.device)
+        recipe = load_recipe("published", [f"generator.width={width}"]).at(16)
+        network = Generator(PositionalUNet(recipe.cyclegan.generator, 800)).to(given.device)
         return rate(partial(NetworkBackend(network, fast.preparation), pulses[:n], Drawn()), n)
 
     rates = {

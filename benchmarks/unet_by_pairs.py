@@ -2,10 +2,8 @@
 
 Run with ``python benchmarks/unet_by_pairs.py STAND --width 8 --steps 4000``; a stand is a
 folder with sim.lh5, data.lh5 and truth.npz.  The U-Net learns the true noise-free response of
-each simulated full-energy pulse by the weighted L1 loss of recipe ``paper``.  No unpaired
+each simulated full-energy pulse by the weighted L1 loss of recipe ``published``.  No unpaired
 training can tell it more.  Escape peaks are only scored, with noise from the baselines.
-
-With ``--out RUN`` IREN learns, too, and the run is kept, for ``cpunet train --init RUN``.
 """
 
 from __future__ import annotations
@@ -19,16 +17,18 @@ from torch.optim import AdamW
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import trace_noise
+from cpunet.networks.generators import KeptNoise
 from cpunet.processes import keep_freed_memory
 from cpunet.pulses.loading import InputSet, SideInfo, load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
-from cpunet.training.cyclegan import CycleGan, weighted_l1, window_weights
-from cpunet.training.loop import EpochSampler, refresh_batch_statistics
-from cpunet.training.networks import outside_noise
+from cpunet.training.adversarial import weighted_l1, window_weights
+from cpunet.training.network_runs import generators, settle
 from cpunet.training.run import Run, versions
+from cpunet.training.sides import Side
 from cpunet.validation.evaluation import evaluate
 from cpunet.validation.methods import true_responses
 
@@ -41,51 +41,40 @@ def taught(
 ) -> Run:
     """Return a run whose REN has learned the true response of the simulated pulses."""
     torch.manual_seed(0)
-    outside, _ = outside_noise(sim, data, recipe)
-    assert outside is not None
-    model, prepared = CycleGan(recipe, outside).train(), sim.prepared.pulses
+    noise, _ = trace_noise(data, recipe.preparation)
     wanted = finish(true_responses(truth, sim), recipe.preparation, dt_ns=sim.dt_ns).clean
-    pulses, targets = (
-        torch.from_numpy(side)[:, None] for side in (prepared.waveforms, wanted)
-    )  # (n, 1, samples)
-    config, steps = recipe.cyclegan.training, given.steps
-    weights = window_weights(config.losses, recipe.preparation.length)
-    sampler = EpochSampler(pulses, config.batch_size, seed=0)
-    networks = [model.ren, model.iren] if given.out else [model.ren]
-    optimiser = AdamW([p for network in networks for p in network.parameters()], given.rate)
+    side = Side.of(sim.prepared.pulses, 0.0, seed=0)
+    targets = Side.of(sim.prepared.pulses.with_waveforms(wanted), 0.0, seed=0).pulses
+    config, steps, made = recipe.training, given.steps, generators(recipe)
+    ren, weights = made["ren"].train(), window_weights(config.losses, recipe.preparation.length)
+    optimiser = AdamW(ren.parameters(), given.rate)
     schedule = CosineAnnealingLR(optimiser, steps)
     start = time.perf_counter()
     for step in range(1, steps + 1):
-        batch, rows = sampler.next_batch(), sampler.last_rows
-        loss = weighted_l1(model.ren(batch), targets[rows], weights)
-        total = loss
-        if given.out:
-            measured = outside.noisy_windows(targets[rows], rows)
-            total = loss + weighted_l1(model.iren(measured), batch, weights)
+        rows = side.draw(config.batch_size)
+        loss = weighted_l1(ren(side.pulses[rows]) - targets[rows], weights)
         optimiser.zero_grad()
-        total.backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
         if step % (steps // REPORTS) == 0:
             seconds = time.perf_counter() - start
-            print(
-                f"{step:6d} steps, {seconds:5.0f} s: L1 {float(loss.detach()):.4f}", flush=True
-            )
-    refresh_batch_statistics(model.ren, sampler, config.statistics_batches)
-    del model.discriminator_data, model.discriminator_sim  # a training begins with new ones
-    run = Run.of(
-        dict(model.eval().named_children()),
+            print(f"{step:6d} steps, {seconds:5.0f} s: L1 {float(loss.detach()):.4f}")
+    settle(ren, side, config)
+    kept = KeptNoise(sim.dt_ns)
+    kept.set_noise(noise.noise)
+    return Run.of(
+        {"ren": ren.unet.eval(), "noise": kept},
         recipe,
         peak=PEAK,
         seed=0,
         dt_ns=sim.dt_ns,
         seconds=time.perf_counter() - start,
         device="cpu",
-        sim=SideInfo(file=str(sim.path), used=str(len(prepared))),
+        sim=SideInfo(file=str(sim.path), used=str(len(side.pulses))),
         data=SideInfo(file=str(data.path), used=str(len(data.prepared.pulses))),
         versions=versions(),
     )
-    return run.save(given.out) if given.out else run
 
 
 def main() -> None:
@@ -95,11 +84,10 @@ def main() -> None:
     parser.add_argument("--dropout", type=float, default=0.1)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--rate", type=float, default=2e-3)
-    parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     keep_freed_memory()
     settings = {"generator.width": given.width, "generator.dropout": given.dropout}
-    recipe = load_recipe("paper", settings | {"training.noise": "baselines"}).at(16)
+    recipe = load_recipe("published", settings | {"training.noise": "baselines"}).at(16)
     files = PulseFile(given.stand / "sim.lh5"), PulseFile(given.stand / "data.lh5")
     chosen, truth = parse_selection(PEAK, recipe.peaks), given.stand / "truth.npz"
     sim, data = (

@@ -66,7 +66,7 @@ LANES: list[dict[str, list[str]]] = [
             "library translate matched library.lh5 --detector ppc --out behind.lh5",
         ],
         "network": [
-            f"train --recipe paper {STAND.format('stand')} --out network"
+            f"train --recipe published {STAND.format('stand')} --out network"
             " --set training.noise=baselines"
             " --set generator.width=4 --set training.iterations=20"
             " --set training.decay_start=10 --set training.log_interval=1"

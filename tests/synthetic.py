@@ -36,7 +36,7 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import Columns, PulseWriter
 from cpunet.recipes.schema import PreparationConfig, Recipe
-from cpunet.training.cyclegan import Step
+from cpunet.training.adversarial import Game
 from cpunet.training.run import Run
 from cpunet.validation.methods import (
     PairedScores,
@@ -343,15 +343,15 @@ def status_of(*words: object) -> Any:
 @contextmanager
 def interrupted_in(iteration: int) -> Iterator[None]:
     """Ctrl-C in an iteration of a training of networks."""
-    call = Step.__call__
+    step = Game.step
 
-    def interrupted(self: Step, number: int, *given: Any) -> Any:
-        if number + 1 == iteration:
+    def interrupted(self: Game) -> dict[str, float]:
+        if self.iteration + 1 == iteration:
             signal.raise_signal(signal.SIGINT)
-        return call(self, number, *given)
+        return step(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Step, "__call__", interrupted)
+        patch.setattr(Game, "step", interrupted)
         yield
 
 

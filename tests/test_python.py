@@ -74,13 +74,13 @@ def test_a_run(home, run):
 
 
 def test_a_run_of_a_network(tmp_path):
-    from cpunet.training.cyclegan import CycleGan
+    from games import untrained
 
     tiny = ("generator.width=2", "discriminator.embedding_dim=2", "discriminator.hidden=2")
-    recipe = load_recipe("paper", tiny).at(16)
-    write_run(tmp_path, dict(CycleGan(recipe).named_children()), recipe, FACTS)
+    recipe = load_recipe("published", tiny).at(16)
+    write_run(tmp_path, untrained(recipe), recipe, FACTS)
     run = cpunet.Run.load(tmp_path)
-    assert repr(run) == f"<Run {tmp_path}: paper, FEP>"
+    assert repr(run) == f"<Run {tmp_path}: published, FEP>"
     assert "<img" not in run._repr_html_()
     with pytest.raises(cpunet.CpunetError, match="which has no response in closed form"):
         _ = run.parameters

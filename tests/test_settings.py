@@ -147,7 +147,7 @@ def test_parts_of_different_trainings_are_not_mixed(room, said):
 
 
 def test_the_papers_numbers():
-    recipe = load_recipe("paper")
+    recipe = load_recipe("published")
     training, losses = recipe.training, recipe.training.losses
     assert (training.iterations, training.decay_start, training.batch_size) == (7000, 1000, 32)
     assert (training.rate_generators, training.rate_discriminators) == (1e-3, 1e-3)
@@ -167,7 +167,7 @@ def test_the_papers_numbers():
 
 def test_values_are_overridden_in_turn():
     recipe = load_recipe(
-        "paper",
+        "published",
         [
             "training.batch_size=16",
             "discriminator.value_range=[-0.1, 1.2]",
@@ -178,7 +178,7 @@ def test_values_are_overridden_in_turn():
     assert recipe.training.batch_size == 8
     assert recipe.discriminator.value_range == (-0.1, 1.2)
     assert recipe.generator.width == 8
-    assert load_recipe("paper").training.batch_size == 32
+    assert load_recipe("published").training.batch_size == 32
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_values_are_overridden_in_turn():
     ],
 )
 def test_wrong_settings_are_named(override, part):
-    one_line(lambda: load_recipe("paper", [override]), part)
+    one_line(lambda: load_recipe("published", [override]), part)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_wrong_settings_of_a_matching_are_named(override, part):
 
 @pytest.mark.parametrize("dt_ns", [1, 2, 4, 8, 10, 12.5, 16])
 def test_windows_of_networks_are_halved_four_times_at_any_period(dt_ns):
-    window = load_recipe("paper").at(dt_ns).preparation
+    window = load_recipe("published").at(dt_ns).preparation
     assert window.length % 16 == 0
     assert window.length * dt_ns == pytest.approx(12_800, abs=16 * dt_ns)
 

@@ -36,7 +36,7 @@ TINY = [
     "training.log_interval=3",
     "scores.bootstraps=20",
 ]
-TINY_OPTIONS = ["--recipe", "paper", *(word for value in TINY for word in ("--set", value))]
+TINY_OPTIONS = ["--recipe", "published", *(word for value in TINY for word in ("--set", value))]
 
 Waveforms = npt.NDArray[Any]
 

@@ -111,7 +111,7 @@ def test_the_run_folder(trained, stand):
         "weights.safetensors",
     ]
     info = json.loads((trained / "run.json").read_text())
-    assert (info["recipe"], info["peak"], info["seed"]) == ("paper", "FEP", 3)
+    assert (info["recipe"], info["peak"], info["seed"]) == ("published", "FEP", 3)
     assert info["dt_ns"] == 16
     assert info["seconds"] > 0
     for side, kev in (("sim", stand.sim_kev), ("data", stand.data_kev)):

@@ -16,10 +16,10 @@ import torch
 
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
-from cpunet.training import networks
-from cpunet.training.networks import CHECKPOINT, UnfinishedRun
+from cpunet.training import unfinished
 from cpunet.training.run import LOSSES
 from cpunet.training.train import train
+from cpunet.training.unfinished import CHECKPOINT, UnfinishedRun
 from synthetic import digests
 
 KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]
@@ -88,7 +88,7 @@ PROCESS = "a training that is killed"  # the name of this module in its process
 
 def die_at(moment: str, iteration: int) -> None:
     """Have this process killed by force at a moment of its training."""
-    log, save, put = UnfinishedRun.log, UnfinishedRun.save, networks.copy_own
+    log, save, put = UnfinishedRun.log, UnfinishedRun.save, unfinished.copy_own
     replace, logged = Path.replace, [0]
 
     def is_now(name: str) -> bool:
@@ -121,7 +121,7 @@ def die_at(moment: str, iteration: int) -> None:
         put(*given, **options)
 
     UnfinishedRun.log, UnfinishedRun.save = watched_log, watched_save
-    networks.copy_own, Path.replace = watched_put, watched_replace
+    unfinished.copy_own, Path.replace = watched_put, watched_replace
 
 
 def forked(given: dict[str, Any]) -> Any:
@@ -139,7 +139,7 @@ def forked(given: dict[str, Any]) -> Any:
 def test_killed_at_any_moment(stand, tiny, tmp_path):
     """Killed by force again and again and resumed: the weights of a training in one go."""
     overrides = [*tiny[3::2], "training.iterations=6", *KEPT[1::2]]
-    recipe = load_recipe("paper", overrides)
+    recipe = load_recipe("published", overrides)
     files = PulseFile(stand.sim), PulseFile(stand.data)
     train(*files, tmp_path / "whole", recipe=recipe, seed=5, device="cpu")
     for moment in MOMENTS:

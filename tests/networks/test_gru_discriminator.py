@@ -19,17 +19,18 @@ pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 def config(**changes: Any) -> GruConfig:
     values = {"embedding_rows": 1000, "embedding_dim": 4, "hidden": 5, "samples_per_step": 1}
+    values |= {"view": "window", "components": 1, "batch_norm": True}
     return GruConfig.model_validate({"name": "gru", **values, "value_range": None, **changes})
 
 
 def pulses(n: int = 4, length: int = 48) -> Tensor:
     edge = torch.linspace(0.3, 0.6, n)[:, None] * length
     time = torch.arange(length)
-    return torch.sigmoid((time - edge) / 2)[:, None] * (1 - 0.2 * time / length)
+    return torch.sigmoid((time - edge) / 2) * (1 - 0.2 * time / length)
 
 
 def test_the_paper_network_has_the_published_number_of_parameters():
-    network = GruDiscriminator(load_recipe("paper").discriminator)
+    network = GruDiscriminator(load_recipe("published").discriminator)
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == 130_817
 
 

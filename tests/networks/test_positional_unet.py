@@ -15,11 +15,11 @@ pytestmark = pytest.mark.usefixtures("same_random_numbers")
 
 
 def narrow(width: int = 4, dropout: float = 0.0) -> PunetConfig:
-    return PunetConfig(name="punet", width=width, dropout=dropout)
+    return PunetConfig(name="punet", width=width, dropout=dropout, linear="none")
 
 
 def test_the_paper_network_has_the_published_number_of_parameters():
-    recipe = load_recipe("paper")
+    recipe = load_recipe("published")
     network = PositionalUNet(recipe.generator, recipe.preparation.length)
     assert sum(p.numel() for p in network.parameters() if p.requires_grad) == 7_213_781
 

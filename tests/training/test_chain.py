@@ -9,12 +9,9 @@ import pytest
 
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.loading import load_pulses
-from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.fitter import GOOD_FIT
-from cpunet.training.networks import outside_noise
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.file_translation import Counts
@@ -138,17 +135,6 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     # without tails the noise is that of empty baselines
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
-    # networks with noise outside are prepared alike
-    aligned = "preparation.align_at=half_height"  # as these windows are
-    paper = load_recipe("paper", ["training.noise=baselines", "generator.width=2", aligned])
-    chosen = parse_selection("FEP", paper.peaks)
-    sim = load_pulses(files.sim, "simulated", paper, chosen)
-    measured = load_pulses(data, "measured", paper, chosen)
-    outside, entry = outside_noise(sim, measured, paper)
-    assert outside is not None
-    assert outside.noise.tails is not None
-    assert outside.noise.tails.law.rate_khz == told["rate_khz"]
-    assert entry.tails.rate_khz == told["rate_khz"]
 
 
 def test_data_without_tails_are_given_none(run: Run) -> None:

@@ -286,10 +286,10 @@ def test_runs_that_cannot_be_described(run, tmp_path):
 
 
 def test_a_network_has_no_closed_form(tmp_path):
-    write_run(tmp_path, {}, load_recipe("paper"), FACTS)
+    write_run(tmp_path, {}, load_recipe("published"), FACTS)
     one_line(
         lambda: response(tmp_path),
-        f"{tmp_path}: recipe paper trains a network",
+        f"{tmp_path}: recipe published trains a network",
         "cpunet validate",
     )
 

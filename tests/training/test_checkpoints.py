@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,58 +13,25 @@ import torch
 
 from cpunet import outputs
 from cpunet.errors import CpunetError
-from cpunet.training.loop import train
-from cpunet.training.networks import CHECKPOINT, MARKER, UnfinishedRun, unfinished_folder
+from cpunet.training.adversarial import Game, train
 from cpunet.training.run import LOSSES, WEIGHTS
-from synthetic import interrupted_in, nearly_full_disk
+from cpunet.training.unfinished import CHECKPOINT, MARKER, UnfinishedRun, unfinished_folder
+from games import game_of
+from synthetic import nearly_full_disk
 
 N = 5
-
-# Everything random, and everything that has a state.
-VARIANTS = {
-    "paper": (),
-    "everything": (
-        "generator.dropout=0.0",
-        "training.discriminator_interval=1",
-        "training.precision=bf16",
-    ),
-    "fast-step": ("generator.width=16", "training.discriminator_interval=2"),
-}
 
 
 def recipe_of(tiny, *overrides: str):
     return tiny(f"training.iterations={N}", "training.checkpoint_interval=2", *overrides)
 
 
-def weights(model) -> dict[str, bytes]:
-    return {name: value.numpy().tobytes() for name, value in model.state_dict().items()}
+def weights(game: Game) -> dict[str, bytes]:
+    return {name: v.numpy().tobytes() for name, v in game.average.state_dict().items()}
 
 
 def unfinished(folder: Path, **facts: object) -> UnfinishedRun:
     return UnfinishedRun(folder, facts, {"device": "cpu"})
-
-
-@pytest.mark.parametrize(
-    ("variant", "stop"),
-    [
-        pytest.param("paper", 1, marks=pytest.mark.thorough),
-        pytest.param("everything", 2, marks=pytest.mark.slow),
-        ("fast-step", 2),
-    ],
-)
-def test_a_resumed_training_ends_with_the_same_bits(tiny, sets, tmp_path, variant, stop):
-    recipe = recipe_of(tiny, *VARIANTS[variant])
-    expected_records, records, run = [], [], unfinished(tmp_path)
-    expected = weights(train(*sets, recipe, seed=3, listener=expected_records.extend))
-    run.begin(resume=False)
-    with interrupted_in(stop), pytest.raises(KeyboardInterrupt):
-        train(*sets, recipe, seed=3, listener=records.extend, save=run.save)
-    state = unfinished(tmp_path).begin(resume=True)
-    assert state["iteration"] == stop == len(records)
-    torch.manual_seed(99)  # what happened in between does not matter
-    model = train(*sets, recipe, seed=3, listener=records.extend, start=state)
-    assert weights(model) == expected
-    assert records == expected_records
 
 
 def state(value: float = 0.0) -> dict:
@@ -132,7 +100,7 @@ class Interrupted(BaseException):
     """As if the process had died there."""
 
 
-def work(sets, recipe, out: Path, *, resume=False, die=None, disk=None, seed=3):
+def work(recipe, out: Path, *, resume=False, die=None, disk=None, seed=3):
     """Train in a folder, as the job does; `die` after so many records."""
     with unfinished_folder(out, resume=resume) as folder:
         run = unfinished(folder, recipe=recipe.model_dump(mode="json"), seed=seed)
@@ -147,9 +115,10 @@ def work(sets, recipe, out: Path, *, resume=False, die=None, disk=None, seed=3):
             with nearly_full_disk(disk if state["iteration"] == 4 and disk else 2**40):
                 run.save(state)
 
-        model = train(*sets, recipe, seed=seed, listener=listen, save=save, start=start)
+        how = {"listener": listen, "save": save, "start": start}
+        game = train(partial(game_of, recipe), seed, **how)
         run.finish()
-        (folder / WEIGHTS).write_bytes(b"".join(weights(model).values()))
+        (folder / WEIGHTS).write_bytes(b"".join(weights(game).values()))
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -168,20 +137,20 @@ def made(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def whole(sets, recipe, made) -> dict[str, bytes]:
+def whole(recipe, made) -> dict[str, bytes]:
     """What a training in one go leaves."""
     if not (made / "whole").exists():
-        work(sets, recipe, made / "whole")
+        work(recipe, made / "whole")
         assert not (made / "whole.unfinished").exists()
     return content(made / "whole")
 
 
 @pytest.fixture
-def out(sets, recipe, made, tmp_path) -> Path:
+def out(recipe, made, tmp_path) -> Path:
     """Of a training that died in its last iteration, after checkpoints at 2 and 4."""
     if not beside(made / "died").exists():
         with pytest.raises(Interrupted):
-            work(sets, recipe, made / "died", die=4)
+            work(recipe, made / "died", die=4)
     shutil.copytree(beside(made / "died"), beside(tmp_path / "run"))
     return tmp_path / "run"
 
@@ -190,41 +159,41 @@ def beside(out: Path) -> Path:
     return out.with_name(f"{out.name}.unfinished")
 
 
-def test_a_training_that_died_is_finished(sets, recipe, out, whole, caplog):
+def test_a_training_that_died_is_finished(recipe, out, whole, caplog):
     caplog.set_level("INFO", "cpunet")
     files = {CHECKPOINT, LOSSES, MARKER, outputs.MARKER}
     assert files == content(beside(out)).keys()
     assert not out.exists()
     # the log is ahead of the checkpoint, and is cut
     assert len((beside(out) / LOSSES).read_text().splitlines()) == 5
-    work(sets, recipe, out, resume=True)
+    work(recipe, out, resume=True)
     assert caplog.messages == ["going on after 4 iterations"]
     assert content(out) == whole
     assert not beside(out).exists()
 
 
-def test_without_resume_nothing_is_lost(sets, recipe, out):
+def test_without_resume_nothing_is_lost(recipe, out):
     before = content(beside(out))
     with pytest.raises(CpunetError, match=r"run\.unfinished: an unfinished training; continue"):
-        work(sets, recipe, out)
+        work(recipe, out)
     assert content(beside(out)) == before
 
 
-def test_another_recipe_or_seed(sets, recipe, tiny, out):
+def test_another_recipe_or_seed(recipe, tiny, out):
     before = content(beside(out)).keys()
     other = recipe_of(tiny, "training.log_interval=1", "training.batch_size=5")
     with pytest.raises(
         CpunetError, match=r"^resumed with another recipe: training\.batch_size 4 → 5; give"
     ):
-        work(sets, other, out, resume=True)
+        work(other, out, resume=True)
     with pytest.raises(CpunetError, match=r"^resumed with another seed: 3 → 4; give"):
-        work(sets, recipe, out, resume=True, seed=4)
+        work(recipe, out, resume=True, seed=4)
     assert content(beside(out)).keys() == before
 
 
-def test_a_full_disk_does_not_stop_the_training(sets, recipe, tmp_path, whole, caplog):
+def test_a_full_disk_does_not_stop_the_training(recipe, tmp_path, whole, caplog):
     out = tmp_path / "run"
-    work(sets, recipe, out, disk=3000)
+    work(recipe, out, disk=3000)
     (note,) = caplog.messages
     assert note.startswith(f"{beside(out)}: no checkpoint after 4 iterations (")
     assert note.endswith("; the one before is kept")
@@ -246,7 +215,7 @@ def test_a_training_that_cannot_be_put_in_place_is_kept(tmp_path):
     assert (folder / CHECKPOINT).is_file()
 
 
-def test_what_never_had_a_checkpoint_leaves_nothing(sets, recipe, tmp_path):
+def test_what_never_had_a_checkpoint_leaves_nothing(recipe, tmp_path):
     with pytest.raises(Interrupted):
-        work(sets, recipe, tmp_path / "run", die=0)
+        work(recipe, tmp_path / "run", die=0)
     assert list(tmp_path.iterdir()) == []

@@ -38,7 +38,7 @@ SHORT = (
 )
 FAST = load_recipe("fast", SHORT)
 TINY = load_recipe(
-    "paper",
+    "published",
     [
         *SMALL_NETWORK,
         "discriminator.embedding_rows=20",
@@ -177,7 +177,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
         train(files["sim"], files["one"], tmp_path / "a", recipe=FAST, init=network)
     with pytest.raises(CpunetError, match="from which no network can start"):
         train(files["sim"], files["one"], tmp_path / "a", recipe=TINY, init=chain)
-    wider = load_recipe("paper", ["generator.width=4"])
+    wider = load_recipe("published", ["generator.width=4"])
     with pytest.raises(CpunetError, match="weights of another network"):
         train(files["sim"], files["one"], tmp_path / "b", recipe=wider, init=network)
     with pytest.raises(CpunetError, match="no finished run"):
@@ -190,7 +190,7 @@ def test_runs_of_another_kind_are_refused(files, chain, network, tmp_path) -> No
 
 def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> None:
     shorter = load_recipe(
-        "paper",
+        "published",
         ["generator.width=2", "preparation.after_ns=6144", "training.losses.tail_ns=5344"],
     )
     one_line(
@@ -202,7 +202,7 @@ def test_networks_of_other_windows_are_no_start(files, network, tmp_path) -> Non
 
 def test_noise_needs_baselines(tmp_path) -> None:
     recipe = load_recipe(
-        "paper", ["training.noise=baselines", "generator.width=2", "training.iterations=1"]
+        "published", ["training.noise=baselines", "generator.width=2", "training.iterations=1"]
     )
     few = [write(tmp_path / f"{k}.lh5", k, p, n=20) for k, p in ((1, None), (2, 4.0))]
     parts = ("2.lh5: no baselines to draw noise from", "training.noise=none")

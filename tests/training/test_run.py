@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run import FORMAT, WEIGHTS, Run, append_losses, read_losses, used_run
+from games import untrained
 from synthetic import one_line, write_run
 
-INFO = {"recipe": "paper", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
+INFO = {"recipe": "published", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
 INFO |= {"seconds": 1.5, "device": "cpu"}
 
 
@@ -26,13 +27,13 @@ def recipe(tiny):
 
 
 @pytest.fixture
-def model(recipe) -> CycleGan:
-    return CycleGan(recipe)
+def model(recipe) -> dict[str, nn.Module]:
+    return untrained(recipe)
 
 
 @pytest.fixture
 def run(tmp_path: Path, model, recipe) -> Path:
-    write_run(tmp_path, dict(model.named_children()), recipe, INFO)
+    write_run(tmp_path, model, recipe, INFO)
     return tmp_path
 
 
@@ -45,10 +46,10 @@ def test_everything_comes_back(run, model, recipe):
     assert json.loads((run / "run.json").read_text()) == {"format": FORMAT} | INFO
     assert (found.recipe, found.folder, found.seed, found.fit) == (recipe, run, 1, None)
     for name in ("ren", "iren", "discriminator_data", "discriminator_sim"):
-        fresh = getattr(CycleGan(recipe), name)
+        fresh = untrained(recipe)[name]
         loaded = found.fill(name, fresh.train())
         assert not loaded.training
-        saved = getattr(model, name).state_dict()
+        saved = model[name].state_dict()
         assert all(torch.equal(saved[k], v) for k, v in loaded.state_dict().items())
 
 
@@ -126,7 +127,7 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
     digest = hashlib.sha256((run / WEIGHTS).read_bytes()).hexdigest()
     assert known.weights_sha256 == digest
     made = Run.of(
-        dict(model.named_children()),
+        model,
         recipe,
         peak="FEP",
         seed=1,
@@ -135,7 +136,7 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
         device="cpu",
     )
     assert (made.weights_sha256, made.records) == (digest, [])
-    assert repr(made) == "<Run run in memory: paper, FEP>"
+    assert repr(made) == "<Run run in memory: published, FEP>"
 
 
 def test_who_uses_a_run_whose_own_verdict_is_bad_is_told(run, caplog):

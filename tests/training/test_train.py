@@ -12,13 +12,13 @@ import torch
 from cpunet.errors import CpunetError
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import parse_selection
-from cpunet.training.cyclegan import CycleGan
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
+from games import untrained
 from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files, write_run
 
 RECIPE = load_recipe(
-    "paper",
+    "published",
     [
         *SMALL_NETWORK,
         "discriminator.samples_per_step=16",
@@ -41,10 +41,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        info = {"recipe": "paper", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+        info = {"recipe": "published", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
         write_run(
             folder,
-            dict(CycleGan(RECIPE).named_children()),
+            untrained(RECIPE),
             RECIPE,
             info | {"seconds": 1, "device": "cpu"},
         )

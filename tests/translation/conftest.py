@@ -11,7 +11,9 @@ import pytest
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
-from cpunet.training.loop import train
+from cpunet.training.adversarial import Game, train
+from cpunet.training.network_runs import generators
+from cpunet.training.sides import Side, Sides
 from synthetic import SMALL_NETWORK, decaying_traces, edges, load_recipe, write_run
 
 DT_NS = 16.0
@@ -31,7 +33,7 @@ def measured(n: int, seed: int) -> npt.NDArray[np.float32]:
 @pytest.fixture(scope="session")
 def recipe() -> Recipe:
     return load_recipe(
-        "paper",
+        "published",
         [
             *SMALL_NETWORK,
             "discriminator.samples_per_step=16",
@@ -48,11 +50,16 @@ def run(tmp_path_factory: pytest.TempPathFactory, recipe: Recipe) -> Path:
         Pulses.of(simulated(12, seed=1), dt_ns=DT_NS), recipe.preparation, "simulated"
     )
     data = prepare(Pulses.of(measured(12, seed=2), dt_ns=DT_NS), recipe.preparation, "measured")
-    model = train(sim.pulses.waveforms, data.pulses.waveforms, recipe, seed=0)
+    pair = (Side.of(prepared.pulses, 0.0, seed=0) for prepared in (sim, data))
+    sides, made = Sides(*pair, recipe.preparation, None, scaled=False), generators(recipe)
+    game = train(lambda: Game(made["ren"], made["iren"], sides, recipe.cyclegan), 0)
     folder = tmp_path_factory.mktemp("run")
     info = {"recipe": recipe.name, "peak": "FEP", "seed": 0, "dt_ns": DT_NS}
     write_run(
-        folder, dict(model.named_children()), recipe, info | {"seconds": 1.0, "device": "cpu"}
+        folder,
+        {part: game.averaged(part).unet for part in ("ren", "iren")},
+        recipe,
+        info | {"seconds": 1.0, "device": "cpu"},
     )
     return folder
 

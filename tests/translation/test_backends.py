@@ -9,16 +9,17 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp, TraceNoise
+from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
+from cpunet.networks.generators import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
-from cpunet.training.cyclegan import CycleGan, Outside
 from cpunet.training.inverse import fit_inverse
 from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
+from games import untrained
 from synthetic import (
     FACTS,
     NOISE_BINS,
@@ -214,7 +215,7 @@ def test_weights_of_the_other_half_are_missed(tmp_path: Path) -> None:
         IREN.load(tmp_path)
 
 
-NOISY = load_recipe("paper", ["training.noise=baselines", "generator.width=2"])
+NOISY = load_recipe("published", ["training.noise=baselines", "generator.width=2"])
 DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)
 DT_NS, RMS_KEV = 16.0, 6.0
 
@@ -223,13 +224,13 @@ DT_NS, RMS_KEV = 16.0, 6.0
 def noisy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network that was not trained."""
     noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), NOISE_SAMPLES, DT_NS, 100)
-    outside = Outside(TraceNoise(noise), np.ones(1), NOISY.preparation)
+    kept = KeptNoise(DT_NS)
+    kept.set_noise(noise)
     torch.manual_seed(0)
-    model = CycleGan(NOISY, outside)
     folder = tmp_path_factory.mktemp("run")
     drawn = DrawnTails(TailsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
     fit = {"tails": {"rate_khz": 2.0, "drawn": drawn.describe()}}
-    parts = dict(model.named_children()) | {"noise": model.noise}
+    parts = untrained(NOISY) | {"noise": kept}
     write_run(folder, parts, NOISY, FACTS | {"fit": fit})
     return folder
 

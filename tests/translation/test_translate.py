@@ -94,7 +94,7 @@ def busy(tmp_path_factory):
 @pytest.fixture(scope="module")
 def network(tmp_path_factory):
     """A narrow network that was not trained."""
-    recipe = load_recipe("paper", ["generator.width=2"])
+    recipe = load_recipe("published", ["generator.width=2"])
     torch.manual_seed(0)
     model = {"ren": PositionalUNet(recipe.cyclegan.generator, 800)}
     folder = tmp_path_factory.mktemp("networks") / "run"

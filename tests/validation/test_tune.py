@@ -38,7 +38,7 @@ TINY = [
 
 
 def tiny(*more: str) -> Recipe:
-    return load_recipe("paper", [*TINY, *more])
+    return load_recipe("published", [*TINY, *more])
 
 
 @pytest.fixture(scope="module")
@@ -241,6 +241,6 @@ def test_networks_are_searched(files, tmp_path, monkeypatch):
         return pulses + 0.01 * forward(network, pulses, **options)
 
     monkeypatch.setattr(PositionalUNet, "forward", near_the_input)
-    study = tune(*files, tmp_path / "tune", recipe="paper", settings=TINY, trials=2)
+    study = tune(*files, tmp_path / "tune", recipe="published", settings=TINY, trials=2)
     assert states(study) == ["COMPLETE"] * 2
     assert (tmp_path / "tune" / "best.yaml").is_file()

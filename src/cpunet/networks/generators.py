@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.networks.response_layer import ElectronicsResponse, Floats, Values
 from cpunet.networks.stored import Stored
 from cpunet.recipes.schema import MatchingConfig, ResponseConfig
+
+Residual = Callable[[Floats], npt.NDArray[np.float32]]
 
 
 class KeptNoise(Stored):
@@ -95,6 +98,9 @@ class LinearInverse(Stored):
         First sample and stop, from the half maximum, of the parts that are scaled to 0 and 1.
     """
 
+    residual: Residual | None = None
+    """What a network adds to the pulses."""
+
     def __init__(self, length: int, config: MatchingConfig) -> None:
         self.length = length
         self.before, stop = config.baseline
@@ -126,7 +132,8 @@ class LinearInverse(Stored):
         # 0 before the region and 1 after it: one sample on either side stands for the rest
         pulses = np.pad(pulses, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
         start = 1 + self.before - sample
-        return stretch(pulses, start, 0, self.length).astype(windows.dtype)
+        whole = stretch(pulses, start, 0, self.length).astype(windows.dtype)
+        return whole if self.residual is None else whole + self.residual(whole)
 
     def half_sample(self, windows: Floats) -> npt.NDArray[np.intp]:
         """Last sample below half of the maximum before the maximum, shape (n,)."""
@@ -188,10 +195,14 @@ class ResponseGenerator(KeptNoise):
     tails: DrawnTails | None = None
     """Pile-up tails, which are added to records with the noise."""
 
+    residual: Residual | None = None
+    """What a network adds to records."""
+
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         super().__init__(dt_ns)
         self.response = ElectronicsResponse(config, dt_ns)
 
     def __call__(self, windows: Floats) -> npt.NDArray[np.float32]:
         """Noise-free records of prepared simulated windows, as from `ElectronicsResponse`."""
-        return self.response(windows)
+        records = self.response(windows)
+        return records if self.residual is None else records + self.residual(records)

@@ -26,16 +26,21 @@ from cpunet.recipes.schema import GruConfig, PunetConfig
 FIRST_KERNEL, SECOND_KERNEL, SLOPE = 11, 7, 0.01
 
 
-def double_convolution(channels_in: int, channels_out: int, channels_mid: int) -> nn.Sequential:
-    """Two convolutions, each with batch norm and a leaky rectifier."""
-    return nn.Sequential(
-        nn.Conv1d(channels_in, channels_mid, FIRST_KERNEL, padding="same", bias=False),
-        nn.BatchNorm1d(channels_mid),
-        nn.LeakyReLU(SLOPE, inplace=True),
-        nn.Conv1d(channels_mid, channels_out, SECOND_KERNEL, padding="same", bias=False),
-        nn.BatchNorm1d(channels_out),
-        nn.LeakyReLU(SLOPE, inplace=True),
-    )
+def double_convolution(
+    channels_in: int, channels_out: int, channels_mid: int, residual: bool = False
+) -> nn.Sequential:
+    """Two convolutions, each with a leaky rectifier and, if not in a residual, batch norm."""
+    layers: list[nn.Module] = []
+    for i, o, kernel in (
+        (channels_in, channels_mid, FIRST_KERNEL),
+        (channels_mid, channels_out, SECOND_KERNEL),
+    ):
+        layers += [
+            nn.Conv1d(i, o, kernel, padding="same", bias=residual),
+            nn.Identity() if residual else nn.BatchNorm1d(o),
+            nn.LeakyReLU(SLOPE, inplace=True),
+        ]
+    return nn.Sequential(*layers)
 
 
 def positional_map(channels: int, samples: int, offset: int) -> Tensor:
@@ -77,6 +82,9 @@ class PositionalUNet(nn.Module):
         Width of the first layer (40 in the paper) and the dropout fraction.
     length
         Samples of a pulse; a multiple of 16, since the network halves it four times.
+    residual
+        For what is added to a pulse: of charge and current, without batch norm, dropout or
+        draw, and 0 at first.
 
     Raises
     ------
@@ -84,38 +92,45 @@ class PositionalUNet(nn.Module):
         If the length is not a multiple of 16.
     """
 
-    def __init__(self, config: PunetConfig, length: int) -> None:
+    def __init__(self, config: PunetConfig, length: int, *, residual: bool = False) -> None:
         super().__init__()
-        self.width = m = config.width
+        self.width, self.residual = config.width, residual
+        m = config.width
         if length % 16:
             raise ValueError(f"the pulse length {length} is no multiple of 16")
         self.length = length
 
         def block(channels_in: int, channels_out: int) -> nn.Sequential:
-            return double_convolution(channels_in, channels_out, channels_out)
+            return double_convolution(channels_in, channels_out, channels_out, residual)
 
-        self.inlet = block(1, m)
+        self.inlet = block(2 if residual else 1, m)
         self.down = nn.ModuleList(
             [block(m, 2 * m), block(2 * m, 4 * m), block(4 * m, 8 * m), block(8 * m, 8 * m)]
         )
         self.latent_mean = nn.Conv1d(8 * m, 8 * m, 1)
-        self.latent_log_variance = nn.Conv1d(8 * m, 8 * m, 1)
+        if not residual:
+            self.latent_log_variance = nn.Conv1d(8 * m, 8 * m, 1)
         self.up = nn.ModuleList(
             [
-                double_convolution(2 * c, o, c)
+                double_convolution(2 * c, o, c, residual)
                 for c, o in ((8 * m, 4 * m), (4 * m, 2 * m), (2 * m, m), (m, m // 2))
             ]
         )
         self.outlet = nn.Conv1d(m // 2, 1, 1)
+        if residual:
+            nn.init.zeros_(self.outlet.weight)
+            nn.init.zeros_(self.outlet.bias)  # type: ignore[arg-type]
+
+        dropout = 0.0 if residual else config.dropout
 
         def maps(*levels: tuple[int, int, int]) -> nn.ModuleList:
             return nn.ModuleList(
-                PositionalMap(channels, length // factor, offset, config.dropout)
+                PositionalMap(channels, length // factor, offset, dropout)
                 for channels, factor, offset in levels
             )
 
         self.maps_down = maps((m, 1, 0), (2 * m, 2, 0), (4 * m, 4, 0), (8 * m, 8, 0))
-        self.map_latent = PositionalMap(8 * m, length // 16, 0, config.dropout)
+        self.map_latent = PositionalMap(8 * m, length // 16, 0, dropout)
         # no map after the last step up
         self.maps_up = maps((4 * m, 8, 4 * m), (2 * m, 4, 2 * m), (m, 2, 2 * m))
 
@@ -127,7 +142,7 @@ class PositionalUNet(nn.Module):
         Parameters
         ----------
         pulses
-            Shape (batch, 1, samples).
+            Shape (batch, 1, samples); (batch, 2, samples) of a residual.
         generator
             Source of the latent noise, for reproducible draws.
         mean
@@ -155,7 +170,7 @@ class PositionalUNet(nn.Module):
     def _latent(self, x: Tensor, generator: torch.Generator | None, mean: bool) -> Tensor:
         """Draw from the latent normal distribution (reparameterised: gradients flow)."""
         centre: Tensor = self.latent_mean(x)
-        if mean:
+        if mean or self.residual:
             return centre
         spread = torch.exp(0.5 * self.latent_log_variance(x))
         noise = torch.empty_like(centre).normal_(generator=generator)
@@ -223,12 +238,12 @@ class GruDiscriminator(nn.Module):
             bidirectional=True,
         )
         self.attention = nn.Linear(both, both, bias=False)
-        self.norm = nn.BatchNorm1d(both)
+        self.norm = nn.BatchNorm1d(both) if config.batch_norm else nn.Identity()
         self.outlet = nn.Linear(2 * both, 1)
 
     def forward(self, pulses: Tensor) -> Tensor:
-        """Logits, shape (batch,), of pulses of shape (batch, 1, samples)."""
-        vectors = self.embedding(self._fraction(pulses[:, 0]))  # (batch, samples, dim)
+        """Logits, shape (batch,), of pulses or views of shape (batch, samples)."""
+        vectors = self.embedding(self._fraction(pulses))  # (batch, samples, dim)
         steps = vectors.unflatten(1, (-1, self.samples_per_step)).flatten(2)
         outputs, final = self.gru(steps)  # (batch, steps, both), (2, batch, hidden)
         final = torch.cat([final[0], final[1]], dim=1)  # (batch, both)

@@ -34,7 +34,7 @@ def load_recipe(recipe: str | Path | Recipe, settings: Set = ()) -> Recipe:
 
     Examples
     --------
-    >>> recipe = load_recipe("paper", {"training.batch_size": 16})
+    >>> recipe = load_recipe("published", {"training.batch_size": 16})
     >>> recipe.generator.width, recipe.training.batch_size
     (40, 16)
     """

@@ -52,11 +52,16 @@ _RangeKev = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 
 
 class PunetConfig(Config):
-    """The Positional U-Net (paper, section 2.2.1)."""
+    """The Positional U-Net (paper, section 2.2.1).
+
+    As published, it is all of a generator.  Behind a ``linear`` part, ``learned`` with it or
+    ``solved``, it adds to pulses, nothing at first, and has no batch norm, draw or dropout.
+    """
 
     name: Literal["punet"]
     width: Annotated[int, Field(ge=2, le=1024, multiple_of=2)]
     dropout: Fraction
+    linear: Literal["none", "learned", "solved"]
 
 
 class ResponseConfig(Config):
@@ -98,7 +103,10 @@ class GruConfig(Config):
     The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more samples
     make it that many times faster, on the same embedded samples.  The table of
     vectors spans ``value_range``, or each pulse's own minimum to maximum (the
-    paper's choice, blind to the pulse height) if that is null.
+    paper's choice, blind to the pulse height) if that is null.  It reads the ``window`` or, in
+    units of the ``spread`` of the real pulses, charge and current in turn, and then
+    ``components``; see `cpunet.training.views`.  A batch norm of its context, as published,
+    is one more difference between training and use.
     """
 
     name: Literal["gru"]
@@ -107,6 +115,22 @@ class GruConfig(Config):
     hidden: Width
     samples_per_step: Samples
     value_range: Annotated[tuple[float, float], AfterValidator(_rising)] | None
+    view: Literal["window", "spread"]
+    components: Samples
+    batch_norm: bool
+
+
+class ConvolutionalConfig(Config):
+    """A critic that reads charge and current about the half maximum by convolutions.
+
+    It has ``channels`` in its first layer, and ``hidden`` numbers join what it reads with
+    means of the pulse, the highest currents and ``components``; see `cpunet.training.views`.
+    """
+
+    name: Literal["convolutional"]
+    channels: Width
+    hidden: Width
+    components: Samples
 
 
 class PeakConfig(Config):
@@ -221,34 +245,44 @@ class LossConfig(Timed):
 
 
 class TrainingConfig(Config):
-    """Settings of the training loop.
+    """Settings of the game of generators and critics, see `cpunet.training.adversarial`.
 
-    Batch-norm statistics of the final generators are computed again over
-    ``statistics_batches``.
-    After a start from another run, the rates rise from zero over ``warmup`` iterations.
-    After every ``checkpoint_interval`` iterations all that is needed to resume the training
-    is saved.
-    ``precision`` is that of the generators' passes; ``compiled`` fuses them by torch.compile.
-    With ``noise`` from ``baselines``, the generators do not make noise: noise drawn from the
-    data's own baselines is added to all that a discriminator or a score sees.
+    Rates rise over ``warmup`` iterations, and fall from ``decay_start`` on as the part that is
+    left, to ``decay_power``; those of critics to no less than the part ``least_rate``.
+    Critics learn every ``discriminator_interval`` iterations; cycles, identities and the
+    simulated side are visited every ``cycle_interval`` with ``cycle_size`` pulses.
+    With ``paired``, the adversarial loss compares pairs of real and translated pulses
+    (relativistic), and the squared slope of critics costs ``penalty``; else it is the
+    published cross-entropy.  What counts in the end is the moving ``average`` of the weights.
+    The part ``held_out`` of both sides is not trained on.
+    Batch-norm statistics of the final generators, if any, are computed again over
+    ``statistics_batches``.  With ``noise`` from ``baselines``, noise drawn from the data's own
+    baselines is added to all translations that a critic or a score sees.
     """
 
     method: Literal["cyclegan"]
     iterations: Count
     decay_start: Annotated[int, Field(ge=0, le=100_000_000)]
+    decay_power: Positive
     warmup: Annotated[int, Field(ge=0, le=100_000_000)]
     batch_size: Annotated[int, Field(ge=2, le=100_000)]
     rate_generators: Positive
+    rate_linear: Positive
     rate_discriminators: Positive
+    least_rate: Fraction
     betas: tuple[Fraction, Fraction]
     weight_decay: NonNegative
     max_grad_norm: Positive
     discriminator_interval: Count
+    cycle_interval: Count
+    cycle_size: Annotated[int, Field(ge=2, le=100_000)]
+    paired: bool
+    penalty: NonNegative
+    average: Fraction
+    held_out: Fraction
     statistics_batches: Count
     log_interval: Count
     checkpoint_interval: Count
-    precision: Literal["float32", "bf16"]
-    compiled: bool
     noise: Literal["none", "baselines"]
     losses: LossConfig
 
@@ -382,11 +416,22 @@ class SearchConfig(Config):
         return self
 
 
+Critics = Annotated[GruConfig | ConvolutionalConfig, Field(discriminator="name")]
+
+
+class ResidualConfig(Config):
+    """Networks behind a matched response, and its inverse, which learn what these do not do."""
+
+    generator: PunetConfig
+    discriminator: Critics
+    training: TrainingConfig
+
+
 class CycleGanSettings(NamedTuple):
     """The parts of a recipe that make a CycleGAN."""
 
     generator: PunetConfig
-    discriminator: GruConfig
+    discriminator: Critics
     training: TrainingConfig
 
 
@@ -406,7 +451,8 @@ class Recipe(Config):
     preparation: PreparationConfig
     cuts: CutConfig
     generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
-    discriminator: GruConfig | None
+    discriminator: Critics | None
+    residual: ResidualConfig | None = None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
@@ -414,31 +460,46 @@ class Recipe(Config):
     def at(self, dt_ns: float) -> Self:
         """The same recipe for pulses with a sampling period in ns.
 
-        Networks halve their windows four times, and a GRU takes several samples a step: of
-        them, either side of the alignment has the nearest multiple of so many samples.
+        As published, networks halve their windows four times, and a GRU takes several samples
+        a step: either side of the alignment has the nearest multiple of so many samples.
 
         Examples
         --------
         >>> from cpunet.recipes import load_recipe
-        >>> [load_recipe("paper").at(dt).preparation.length for dt in (16, 10, 4)]
+        >>> [load_recipe("published").at(dt).preparation.length for dt in (16, 10, 4)]
         [800, 1280, 3200]
         """
-        preparation, training = self.preparation.at(dt_ns), self.training
+        preparation, training, residual = (
+            self.preparation.at(dt_ns),
+            self.training,
+            self.residual,
+        )
+        if residual is not None:
+            game = residual.training
+            game = game.model_copy(update={"losses": game.losses.at(dt_ns)})
+            residual = residual.model_copy(update={"training": game})
         if isinstance(training, MatchingConfig):
             training = training.at(dt_ns)
         else:
-            step = dt_ns * math.lcm(8, self.cyclegan.discriminator.samples_per_step)
+            training = training.model_copy(update={"losses": training.losses.at(dt_ns)})
+        if isinstance(self.generator, PunetConfig) and self.generator.linear == "none":
+            step = dt_ns * math.lcm(8, getattr(self.discriminator, "samples_per_step", 1))
             sides = ("before_ns", "after_ns")
             whole = {side: round(getattr(preparation, side) / step) * step for side in sides}
             preparation = preparation.model_copy(update=whole)
-            training = training.model_copy(update={"losses": training.losses.at(dt_ns)})
         return self.model_copy(
             update={
                 "preparation": preparation,
                 "training": training,
+                "residual": residual,
                 "scores": self.scores.at(dt_ns),
             }
         )
+
+    @property
+    def networks(self) -> bool:
+        """Whether networks are trained."""
+        return self.residual is not None or isinstance(self.training, TrainingConfig)
 
     @property
     def cyclegan(self) -> CycleGanSettings:
@@ -449,9 +510,14 @@ class Recipe(Config):
         CpunetError
             If the recipe does not train a CycleGAN.
         """
-        match self.generator, self.discriminator, self.training:
-            case PunetConfig() as generator, GruConfig() as other, TrainingConfig() as training:
-                return CycleGanSettings(generator, other, training)
+        of = self if self.residual is None else self.residual
+        match of.generator, of.discriminator, of.training:
+            case (
+                PunetConfig() as generator,
+                GruConfig() | ConvolutionalConfig() as critic,
+                TrainingConfig() as training,
+            ):
+                return CycleGanSettings(generator, critic, training)
         raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
 
     @property
@@ -479,8 +545,12 @@ class Recipe(Config):
             raise ValueError("preparation.align_at must be half_height for a matched response")
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")
-        if not network:
+        if network and self.residual is not None:
+            raise ValueError("a residual goes with a response, not with punet")
+        if not network and self.residual is None:
             return self
+        if (self.cyclegan.generator.linear == "solved") == network:
+            raise ValueError("generator.linear must be solved in a residual, and there alone")
         losses, window = self.cyclegan.training.losses, self.preparation
         covered = losses.baseline_ns + losses.rising_edge_ns + losses.tail_ns
         length = window.before_ns + window.after_ns

@@ -95,7 +95,7 @@ class TrainingJob:
         keep_freed_memory()
         train: Callable[[TrainingJob], Run] = train_chain
         if self.recipe.training.method == "cyclegan":
-            from cpunet.training.networks import train_networks  # torch takes seconds
+            from cpunet.training.network_runs import train_networks  # torch takes seconds
 
             train = train_networks
         with one_thread_for_matrices():
@@ -178,13 +178,12 @@ class Training:
     def run(self, pair: Pair, out: Path | None, start: Run | None) -> Run:
         """Read, train and write a run."""
         files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
-        networks = self.recipe.training.method == "cyclegan"
         place: AbstractContextManager[Path | str]
         if out is None:
             place = TemporaryDirectory()
-        elif networks:
+        elif self.recipe.networks:
             require_torch()
-            from cpunet.training.networks import unfinished_folder
+            from cpunet.training.unfinished import unfinished_folder
 
             place = unfinished_folder(out, *files, resume=self.resume, force=self.force)
         else:
@@ -339,7 +338,8 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
         def listen(step: int, chi_square: float) -> None:
             losses = {"chi_square": chi_square}
             record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
-            append_losses(job.folder, [record])
+            if job.recipe.residual is None:  # else the log is that of the networks
+                append_losses(job.folder, [record])
             bar.update(1)
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
@@ -348,6 +348,17 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
     recipe = job.recipe.model_copy(update={"generator": chain.response.config})
     sim = job.sim.prepared.pulses
     iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)
-    parts = {"ren": chain, "iren": iren}
+    parts: dict[str, Any] = {"ren": chain, "iren": iren}
+    if recipe.residual is not None:
+        from cpunet.training.network_runs import learned_residuals
+
+        learned = learned_residuals(job, recipe, chain, iren)
+        info = info.model_copy(update={"gains": info.gains | learned.gains})
+        for part, gain in learned.gains.items():
+            log.info(f"{part}: {gain}")
+        if learned.parts:
+            parts |= learned.parts
+        else:  # the readout alone
+            recipe = recipe.model_copy(update={"residual": None})
     took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
     return job.run(parts, recipe, began, took, fit=info)

@@ -81,7 +81,7 @@ def import_weights(
         refuse_existing(Path(out), *files.values(), force=force)
     if not (np.isfinite(dt_ns) and dt_ns > 0):
         raise CpunetError(f"the sampling period is {dt_ns} ns; expected more than 0")
-    published = load_recipe("paper").at(PUBLISHED_DT_NS)
+    published = load_recipe("published").at(PUBLISHED_DT_NS)
     length = published.preparation.length
     networks = {part: _generator(path, length) for part, path in files.items()}
     widths = {network.width for network in networks.values()}
@@ -99,7 +99,7 @@ def import_weights(
         for name, value in config.model_dump().items():
             if name.endswith("_ns"):
                 settings[f"{part}.{name}"] = value * dt_ns / PUBLISHED_DT_NS
-    recipe = load_recipe("paper", settings)
+    recipe = load_recipe("published", settings)
     run = Run.of(
         networks,
         recipe,
@@ -167,7 +167,7 @@ def _generator(path: Path, length: int) -> PositionalUNet:
             f"{path}: no Positional U-Net (inc.double_conv.0.weight is missing or has an odd "
             "number of channels); give a file such as fep_REN.pt"
         )
-    config = PunetConfig(name="punet", width=width, dropout=0.1)
+    config = PunetConfig(name="punet", width=width, dropout=0.1, linear="none")
     network = PositionalUNet(config, length)
     named: State = {}
     for name, value in state.items():

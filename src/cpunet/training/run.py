@@ -423,7 +423,7 @@ def resolve_device(device: str, recipe: Recipe) -> str:
     known = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
     if known is None:
         raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
-    if device == "cpu" or recipe.training.method == "matching":
+    if device == "cpu" or not recipe.networks:
         return "cpu"
     require_torch()
     import torch

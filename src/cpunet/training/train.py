@@ -49,7 +49,8 @@ def train(
         Run folder to make; it appears when it is complete. Networks are trained in
         ``OUT.unfinished`` until then.
     recipe
-        ``fast`` (a readout chain), ``cpunet``, ``paper`` (networks), or a YAML file.
+        ``fast`` (a readout), ``cpunet`` (and networks), ``paper``, ``published`` (networks
+        alone), or a YAML file.
     settings
         Override a value of the recipe, as ``training.batch_size=64`` (repeatable).
     peak

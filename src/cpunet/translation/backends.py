@@ -13,16 +13,22 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.electronics.finishing import finish, padding, with_room
 from cpunet.networks import require_torch
-from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
+from cpunet.networks.generators import (
+    KeptNoise,
+    LinearInverse,
+    Residual,
+    ResponseGenerator,
+)
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig, PunetConfig
 from cpunet.training.run import Run
 
 if TYPE_CHECKING:
-    from cpunet.networks.positional_unet import PositionalUNet
+    from cpunet.training.adversarial import Generator
 
 Energies = npt.NDArray[np.float64]
+Inverse = LinearInverse | Residual  # arrays of windows → pulses
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 
 
@@ -104,7 +110,7 @@ class Backend(ABC):
         Distribution of the pile-up tails under the data, if known.
     """
 
-    network: PositionalUNet | ResponseGenerator | LinearInverse
+    network: Generator | ResponseGenerator | Inverse
     config: PreparationConfig
     dt_ns: float
     needs_energies: bool = False
@@ -166,19 +172,18 @@ class NetworkBackend(Backend):
         Distribution of the pile-up tails under the data, if known.
     """
 
-    network: PositionalUNet
+    network: Generator
 
     def __init__(
         self,
-        network: PositionalUNet,
+        network: Generator,
         config: PreparationConfig,
         kept: KeptNoise | None = None,
         tails: DrawnTails | None = None,
     ) -> None:
-        self.network, self.config = network.eval(), config
+        self.network, self.config, self.dt_ns = network.eval(), config, config.sampled_ns
         if kept is not None:
-            self.dt_ns, self.noise, self.tails = kept.noise_dt_ns, kept.noise, tails
-            self.needs_energies = True
+            self.noise, self.tails, self.needs_energies = kept.noise, tails, True
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Run the network; add noise in proportion to 1/energy, and prepare like data."""
@@ -187,9 +192,17 @@ class NetworkBackend(Backend):
         device = next(self.network.parameters()).device
         generator = torch.Generator(device).manual_seed(int(drawn.generator.integers(2**62)))
         with torch.inference_mode():
-            batch = torch.from_numpy(windows).to(device)[:, None]
-            out = self.network(batch, generator=generator, mean=not drawn.noise)
-        clean: FloatArray = out[:, 0].cpu().numpy()
+            batch = torch.from_numpy(windows).to(device)
+            if self.network.linear is None:
+                out = self.network.unet(
+                    batch[:, None], generator=generator, mean=not drawn.noise
+                )[:, 0]
+            else:
+                out = self.network(batch)
+        clean: FloatArray = out.cpu().numpy()
+        if (n := windows.shape[1]) < clean.shape[1]:  # records
+            first = padding(self.dt_ns)[0]
+            return self.finished(clean[:, first : first + n], clean, drawn)
         if self.noise is None or not drawn.noise:
             n = len(windows)
             return Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
@@ -247,11 +260,11 @@ class ResponseBackend(Backend):
 
 
 class InverseBackend(Backend):
-    """A linear inverse, followed by the preparation of simulated pulses."""
+    """An inverse, followed by the preparation of simulated pulses."""
 
-    network: LinearInverse
+    network: Inverse
 
-    def __init__(self, inverse: LinearInverse, config: PreparationConfig, dt_ns: float) -> None:
+    def __init__(self, inverse: Inverse, config: PreparationConfig, dt_ns: float) -> None:
         self.network = inverse
         self.config = config
         self.dt_ns = dt_ns
@@ -278,16 +291,34 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
     generator, preparation = recipe.generator, recipe.preparation
     if isinstance(generator, PunetConfig):
         require_torch()
-        from cpunet.networks.positional_unet import PositionalUNet
+        from cpunet.training.network_runs import applied, fill_generator, generators
 
-        network = run.fill(part, PositionalUNet(generator, preparation.length), device)
+        made = generators(recipe)
+        if generator.linear == "learned":  # the inverse is that of the response
+            fill_generator(run, "ren", made["ren"], device)
+        network = fill_generator(run, part, made[part], device)
+        if not forward and generator.linear == "learned":
+            return InverseBackend(applied(network), preparation, run.dt_ns)
         if not forward or recipe.cyclegan.training.noise == "none":
             return NetworkBackend(network, preparation)
         kept = run.fill(NOISE, KeptNoise(run.dt_ns))
         return NetworkBackend(network, preparation, kept, run.tails)
     if forward:
         response = run.fill(part, ResponseGenerator(generator, run.dt_ns))
-        response.tails = run.tails
+        response.tails, response.residual = run.tails, _residual(run, part, device)
         return ResponseBackend(response, preparation)
-    inverse = LinearInverse(preparation.length, recipe.matching.training)
-    return InverseBackend(run.fill(part, inverse), preparation, run.dt_ns)
+    inverse = run.fill(part, LinearInverse(preparation.length, recipe.matching.training))
+    inverse.residual = _residual(run, part, device)
+    return InverseBackend(inverse, preparation, run.dt_ns)
+
+
+def _residual(run: Run, part: str, device: str) -> Residual | None:
+    """What a network adds to the pulses of a part, if there is one."""
+    name = f"{part}_residual"
+    if not any(key.startswith(f"{name}.") for key in run.weights):
+        return None
+    require_torch()
+    from cpunet.training import adversarial, network_runs
+
+    network = adversarial.Residual(run.recipe.cyclegan.generator, run.dt_ns)
+    return network_runs.applied(run.fill(name, network, device))

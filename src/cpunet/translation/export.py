@@ -136,6 +136,12 @@ def graph_of(network: Any, length: int) -> Graph:
     def windows(n: int) -> Inputs:
         return {"windows": example_windows(length, n)}
 
+    behind = getattr(network, "linear", None) or getattr(network, "residual", None)
+    if behind is not None:
+        raise CpunetError(
+            "ONNX graphs have a readout or a network, this run has both in series; export one "
+            "of the recipe fast"
+        )
     if isinstance(network, ResponseGenerator):
         model = chain_model(network.response, length)
         return Graph(model, windows, lambda given: network(given["windows"]))
@@ -145,7 +151,7 @@ def graph_of(network: Any, length: int) -> Graph:
     needed("onnxscript")
     from cpunet.translation.onnx_network import NetworkGraph
 
-    graph = NetworkGraph(network)
+    graph = NetworkGraph(network.unet)
 
     def with_epsilon(n: int) -> Inputs:
         drawn = np.random.default_rng(n).normal(size=(n, *graph.latent)).astype(np.float32)

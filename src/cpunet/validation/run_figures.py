@@ -45,7 +45,10 @@ ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
 
 @styled
 def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
-    """Losses during the training, each kind in a panel: records faint, moving averages on top.
+    """Losses during the training, and how often critics were right, each kind in a panel.
+
+    Records are faint, moving averages on top of them; dashed lines are of pulses that critics
+    have not seen.
 
     Parameters
     ----------
@@ -60,22 +63,32 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     """
     if not records:
         raise CpunetError("the training log is empty: there are no losses to draw; train first")
-    names = list(dict.fromkeys(name for record in records for name in record["losses"]))
-    kinds = list(dict.fromkeys(name.partition("_")[0] for name in names))
-    figure, (grid,) = panels((1.4 + 3.2 * len(kinds), 3.6), 1, len(kinds))
-    for name in names:
-        axes = grid[kinds.index(name.partition("_")[0])]
-        # discriminators are not updated in every iteration
-        there = [record for record in records if name in record["losses"]]
+    drawn = [
+        (part, name)
+        for part in ("losses", "accuracy")
+        for name in dict.fromkeys(name for record in records for name in record.get(part, ()))
+    ]
+    kinds = [name.partition("_")[0] if part == "losses" else part for part, name in drawn]
+    shown = list(dict.fromkeys(kinds))
+    figure, (grid,) = panels((1.4 + 3.2 * len(shown), 3.6), 1, len(shown))
+    for (part, name), kind in zip(drawn, kinds, strict=True):
+        axes = grid[shown.index(kind)]
+        # critics are not updated, and cycles not visited, in every iteration
+        there = [record for record in records if name in record.get(part, ())]
         at = [record["iteration"] for record in there]
-        series = [record["losses"][name] for record in there]
+        series = [record[part][name] for record in there]
         width = max(1, len(series) // AVERAGES)
         average = np.convolve(series, np.full(width, 1 / width), mode="valid")
-        (line,) = axes.plot(at[width - 1 :], average, label=name.replace("_", " "))
+        style = "--" if name.endswith("unseen") else "-"
+        (line,) = axes.plot(at[width - 1 :], average, style, label=name.replace("_", " "))
         axes.plot(at, series, color=line.get_color(), alpha=0.25, linewidth=0.7)
-        axes.set(xlabel="Iteration (lines: moving averages)", yscale="log")
+        axes.set(xlabel="Iteration (lines: moving averages)")
+        axes.set_yscale("log" if part == "losses" else "linear")
         axes.legend()
     grid[0].set_ylabel("Loss")
+    if shown[-1] == "accuracy":
+        grid[-1].set(ylabel="Part of pairs ordered rightly", ylim=(0.4, 1.02))
+        grid[-1].axhline(0.5, color="black", linewidth=0.8)
     return figure
 
 

@@ -33,8 +33,8 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe, SearchConfig
 from cpunet.settings import Set, flat, read_settings, yaml_text
 from cpunet.training.job import TrainingJob
-from cpunet.training.networks import differences
 from cpunet.training.run import resolve_device
+from cpunet.training.unfinished import differences
 from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import null_distances, resampled_twice, wasserstein
 from cpunet.validation.methods import like_data

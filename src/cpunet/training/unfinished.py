@@ -17,17 +17,19 @@ import json
 import logging
 import os
 import pickle
+import signal
+import threading
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import Any, Self
 
 import torch
 
-from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.outputs import (
     FolderKind,
@@ -42,16 +44,8 @@ from cpunet.outputs import (
     require_kind,
     require_replaceable,
 )
-from cpunet.progress import stage
-from cpunet.pulses.loading import InputSet
-from cpunet.recipes.schema import Recipe
 from cpunet.settings import flat
-from cpunet.training.cyclegan import CycleGan, Outside
-from cpunet.training.loop import State, discriminators_noted, train
-from cpunet.training.run import LOSSES, RUN, FitInfo, Record, Run, read_losses
-
-if TYPE_CHECKING:
-    from cpunet.training.job import TrainingJob
+from cpunet.training.run import LOSSES, RUN, Record
 
 log = logging.getLogger(__name__)
 
@@ -62,116 +56,7 @@ UNFINISHED = FolderKind(
     command="cpunet train",
     own=rf"{RUN.own}|unfinished\.json|checkpoint\.pt|\.[^/]*\.partial.*",
 )
-# settings of logs and checkpoints, which do not affect the weights
-_CHANGES_NOTHING = {"log_interval", "checkpoint_interval"}
-
-
-def train_networks(job: TrainingJob) -> Run:
-    """Train the networks of a CycleGAN, or resume their training."""
-    recipe = job.recipe
-    threads = torch.get_num_threads()  # as device and version, it changes the last bits
-    environment = {"device": job.device, "threads": threads, "torch": torch.__version__}
-    settings = recipe.model_dump(
-        mode="json", exclude={"search": True, "training": _CHANGES_NOTHING}
-    )
-    run = UnfinishedRun(
-        job.folder,
-        {
-            "recipe": settings,
-            "peak": job.peak,
-            "seed": job.seed,
-            "init": None if job.init is None else job.init.weights_sha256,
-            "simulation": job.sim.fingerprint(),
-            "data": job.data.fingerprint(),
-        },
-        environment,
-    )
-    state = run.begin(resume=job.resume)
-    outside, fit = outside_noise(job.sim, job.data, recipe)
-    left = recipe.cyclegan.training.iterations - (state["iteration"] if state else 0)
-    with stage("Training", left) as bar:
-
-        def listen(records: list[Record]) -> None:
-            run.log(records)
-            bar.update(len(records))
-
-        model = train(
-            job.sim.prepared.pulses.waveforms,
-            job.data.prepared.pulses.waveforms,
-            recipe,
-            seed=job.seed,
-            device=job.device,
-            init=None if job.init is None else weights_of(job.init, recipe),
-            outside=outside,
-            listener=listen,
-            save=run.save,
-            start=state,
-        )
-    run.finish()
-    for line in discriminators_noted(read_losses(job.folder)):
-        log.warning(line)
-    resumed = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-    more: dict[str, Any] = resumed | ({} if fit is None else {"fit": fit})
-    parts = dict(model.named_children()) | (
-        {} if model.noise is None else {"noise": model.noise}
-    )
-    return job.run(parts, recipe, run.started, run.seconds, **more)
-
-
-def outside_noise(
-    sim: InputSet, data: InputSet, recipe: Recipe
-) -> tuple[Outside | None, FitInfo | None]:
-    """Noise for the translations of the simulated pulses, and what was found of tails.
-
-    Raises
-    ------
-    CpunetError
-        If the recipe requires noise, and there are no baselines to draw it from.
-    """
-    if recipe.cyclegan.training.noise == "none":
-        return None, None
-    try:
-        noise, tails = trace_noise(data, recipe.preparation)
-    except CpunetError as error:
-        raise CpunetError(
-            f"{data.path}: no baselines to draw noise from ({error}); or train "
-            "without it (training.noise=none in `settings`)"
-        ) from error
-    outside = Outside(noise, sim.prepared.pulses.energy_kev, recipe.preparation)
-    return outside, FitInfo(tails=tails)
-
-
-def weights_of(init: Run, recipe: Recipe) -> Callable[[CycleGan], None]:
-    """Function that fills networks for which another run has weights, at least REN and IREN.
-
-    Raises
-    ------
-    CpunetError
-        If that run has no networks, or they were trained on other windows.
-    """
-    other = init.recipe
-    if other.generator.name != "punet":
-        raise CpunetError(
-            f"{init.name}: a readout chain ({other.name}), from which no network can start; "
-            "give a run of networks"
-        )
-    theirs, own = other.preparation, recipe.preparation
-    if (theirs.length, theirs.samples_before) != (own.length, own.samples_before):
-        raise CpunetError(
-            f"{init.name}: its networks know windows of {theirs.samples_before} + "
-            f"{theirs.samples_after} samples, this recipe has {own.samples_before} + "
-            f"{own.samples_after}; start from a run of the same windows"
-        )
-
-    def fill(model: CycleGan) -> None:
-        there = {"ren", "iren"} | {name.partition(".")[0] for name in init.weights}
-        device = str(next(model.parameters()).device)
-        for name, network in model.named_children():
-            if name in there:
-                was_training = network.training
-                init.fill(name, network, device).train(was_training)
-
-    return fill
+State = dict[str, Any]  # of a training: tensors, numbers and text, with its "iteration"
 
 
 def unfinished_name(out: Path) -> Path:
@@ -377,3 +262,54 @@ def differences(then: Any, now: Any) -> Iterator[str]:
 def _short(value: Any) -> str:
     text = " ".join(str(value).split())
     return text if len(text) <= 24 else f"{text[:12]}…"
+
+
+class Interruption:
+    """Ctrl-C and SIGTERM wait for the end of an iteration; a second one acts at once."""
+
+    def __init__(self) -> None:
+        self.signal = 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # others get no signals
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, _frame: FrameType | None) -> None:
+        self.__exit__()
+        self.signal = number
+        log.info("stopping after this iteration; once more to stop at once")
+
+    def act(self, told: str) -> None:
+        """Act now, if there was a signal and all is stored."""
+        if self.signal:
+            log.info(told)
+            signal.raise_signal(self.signal)
+
+
+def state_of(game: Any) -> State:
+    """All that the next iterations of a training depend on, except pulses and settings."""
+    return {
+        "iteration": game.iteration,
+        "right": dict(game.right),
+        "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
+        "parts": {name: part.state_dict() for name, part in game.parts.items()},
+    }
+
+
+def restore(game: Any, state: State | None) -> None:
+    """Continue a training of the same pulses and settings from a state, if there is one."""
+    if state is None:
+        return
+    game.iteration, game.right = state["iteration"], dict(state["right"])
+    for name, part in game.parts.items():
+        part.load_state_dict(state["parts"][name])
+    torch.set_rng_state(state["random"][0])
+    if torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(state["random"][1:])

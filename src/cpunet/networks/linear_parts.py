@@ -1,0 +1,189 @@
+"""Linear parts of generators, with gradients: solved, or learned with the networks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from cpunet.electronics.finishing import padding, record_length
+from cpunet.networks.generators import LinearInverse
+from cpunet.networks.response_layer import ElectronicsResponse, padded_length
+from cpunet.recipes.schema import PreparationConfig
+
+# Of a learned step response: lags, up to which every sample is free, and the last knot.
+FIRST_NS, DENSE_NS, LAST_NS, KNOTS = -256.0, 768.0, 7040.0, 20
+RISE_NS, MODES = 48.0, 28  # of the two poles it begins with; its free smooth modes
+# Size of deviations (edge, rise, tail), their reach, and how smooth they are in asinh(t / T)
+SIZES, REACH_NS, CURVED_NS, SMOOTH, WHITE = (
+    (0.12, 0.024, 0.006),
+    (192.0, 1920.0),
+    96.0,
+    0.35,
+    3e-4,
+)
+NOISE = 3e-3  # of an inverse at first, over the height of a pulse
+
+
+class Linear(nn.Module):
+    """Charge (n, samples) → records (n, samples with room), behind a step response."""
+
+    def __init__(self, config: PreparationConfig) -> None:
+        super().__init__()
+        self.config, self.before = config, padding(config.sampled_ns)[0]
+        self.length = record_length(config.length, config.sampled_ns)
+        self.padded = padded_length(self.length)
+
+    def spectrum(self) -> Tensor:
+        """Spectrum of the response to a step at sample 0."""
+        raise NotImplementedError
+
+    def current(self, charge: Tensor) -> Tensor:
+        """Spectra of the current of windows, within records."""
+        current = charge.diff(dim=1, prepend=torch.zeros_like(charge[:, :1]))
+        spectra: Tensor = torch.fft.rfft(pad(current, (self.before, 0)), self.padded)
+        return spectra
+
+    def forward(self, charge: Tensor) -> Tensor:
+        record: Tensor = torch.fft.irfft(self.current(charge) * self.spectrum(), self.padded)
+        stop, c = self.before + self.config.length, self.config  # of the nominal window
+        level = record[:, stop - c.tail_samples : stop].mean(dim=1, keepdim=True)
+        return record[:, : self.length] * (c.tail_level / level.clamp_min(0.1))
+
+
+class SolvedResponse(Linear):
+    """A fitted response; where it stretches the drift, gradients are those without."""
+
+    solved: Tensor
+
+    def __init__(self, response: ElectronicsResponse, config: PreparationConfig) -> None:
+        super().__init__(config)
+        spectrum = torch.from_numpy(response.transfer(self.padded)).to(torch.complex64)
+        self.register_buffer("solved", spectrum, persistent=False)
+        self.drifted = response.drifted
+
+    def spectrum(self) -> Tensor:
+        return self.solved
+
+    def forward(self, charge: Tensor) -> Tensor:
+        moved = torch.from_numpy(self.drifted(charge.detach().cpu().numpy())).to(charge)
+        return super().forward(charge + (moved - charge).detach())
+
+
+class SolvedInverse(nn.Module):
+    """`LinearInverse`, with gradients."""
+
+    mean_in: Tensor
+    mean_out: Tensor
+    weights: Tensor
+
+    def __init__(self, inverse: LinearInverse) -> None:
+        super().__init__()
+        self.inverse = inverse
+        for name in ("mean_in", "mean_out", "weights"):
+            values = torch.from_numpy(getattr(inverse, name)).float()
+            self.register_buffer(name, values, persistent=False)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        f, index = self.inverse, torch.arange(windows.shape[1], device=windows.device)
+        with torch.no_grad():  # as `LinearInverse.half_sample`
+            below = (windows < float(f.half_height)) & (index < windows.argmax(1, keepdim=True))
+            at = ((below * (index + 1)).amax(dim=1, keepdim=True) - 1).clamp_min(0)
+
+        def span(first: int, stop: int) -> Tensor:
+            there = at + torch.arange(first, stop, device=windows.device)
+            return windows.gather(1, there.clamp(0, len(index) - 1))
+
+        base = span(*f.baseline).mean(dim=1, keepdim=True)
+        level = span(*f.level).mean(dim=1, keepdim=True) - base
+        inside = (span(-f.before, f.after) - base) / level.clamp_min(0.1)
+        pulses = (self.mean_out + (inside - self.mean_in) @ self.weights.T).clamp(0, 1)
+        whole = pad(pad(pulses, (1, 0)), (0, 1), value=1.0)
+        return whole.gather(1, (index - at + f.before + 1).clamp(0, whole.shape[1] - 1))
+
+
+class LearnedResponse(Linear):
+    """A step response that moves in smooth modes, most where it rises.
+
+    Parameters
+    ----------
+    config
+        Preparation of the pulses.
+    decay
+        Decay of the data per sample, with which it begins.
+    """
+
+    begin: Tensor
+    modes: Tensor
+    between: Tensor
+
+    def __init__(self, config: PreparationConfig, decay: float) -> None:
+        super().__init__(config)
+        dt = config.sampled_ns
+        first, dense, last = (round(ns / dt) for ns in (FIRST_NS, DENSE_NS, LAST_NS))
+        later = np.geomspace(dense, last, KNOTS).round().astype(int)
+        knots = np.unique(np.r_[first:dense, later])
+        self.first, lags = first, np.arange(first, self.length - self.before)
+        ns = knots * dt
+        u, sizes = np.arcsinh(ns / CURVED_NS), np.full(len(ns), SIZES[2])
+        for size, reach in zip(SIZES, REACH_NS, strict=False):
+            sizes += size * np.exp(-((ns / reach) ** 2))
+        like = np.exp(-0.5 * ((u[:, None] - u) / SMOOTH) ** 2)
+        values, vectors = np.linalg.eigh(
+            sizes[:, None] * sizes * like + WHITE**2 * np.eye(len(u))
+        )
+        rise = np.maximum(ns, 0) / RISE_NS
+        begin = (1 - (1 + rise) * np.exp(-rise)) * np.exp(-decay * np.maximum(knots, 0))
+        modes = vectors[:, -MODES:] * np.sqrt(values[-MODES:])
+        between = np.stack([np.interp(lags, knots, one) for one in np.eye(len(knots))], 1)
+        for name, array in (("begin", begin), ("modes", modes), ("between", between)):
+            self.register_buffer(name, torch.from_numpy(array).float())
+        self.sizes = nn.Parameter(torch.zeros(MODES))
+        self.late = int((lags > knots[-1]).sum())
+        self.apart = float(knots[-1] - knots[-4])
+
+    def step(self) -> Tensor:
+        """Response to a step at sample 0, from the first lag on."""
+        knots = self.begin + self.modes @ self.sizes
+        rate = torch.log((knots[-1] / knots[-4]).clamp(0.5, 1.2)) / self.apart
+        late = torch.arange(1.0, 1 + self.late, device=rate.device)  # goes on as it ends
+        return torch.cat(
+            [(self.between @ knots)[: -self.late], knots[-1] * torch.exp(rate * late)]
+        )
+
+    def spectrum(self) -> Tensor:
+        return self.spectrum_of(self.step())
+
+    def spectrum_of(self, lags: Tensor) -> Tensor:
+        """Spectrum of values at lags from the first one on."""
+        whole = pad(lags, (0, self.padded - len(lags))).roll(self.first)
+        spectrum: Tensor = torch.fft.rfft(whole)
+        return spectrum
+
+
+class LearnedInverse(nn.Module):
+    """What undoes a learned response up to a learned noise: windows → charge, 0 … 1."""
+
+    def __init__(self, response: LearnedResponse) -> None:
+        super().__init__()
+        self.of = [response]  # a list: its parameters are REN's
+        self.log_noise = nn.Parameter(torch.tensor(math.log(NOISE)))
+
+    def forward(self, windows: Tensor) -> Tensor:
+        r, noise = self.of[0], self.log_noise.exp()
+        step = r.step().detach()
+        impulse = r.spectrum_of(step.diff(prepend=step.new_zeros(1)))
+        undone = impulse.conj() * (1 + noise) / (impulse.abs().square() + noise)
+        charge: Tensor = torch.fft.irfft(r.current(windows) * undone, r.padded).cumsum(dim=1)
+        charge = charge[:, r.before : r.before + r.config.length]
+        base = charge[:, : r.config.baseline_samples].mean(dim=1, keepdim=True)
+        late = r.config.samples(LATE_NS)
+        return (charge - base) / (charge[:, -late:].mean(dim=1, keepdim=True) - base).clamp_min(
+            0.1
+        )
+
+
+LATE_NS = 960.0  # at the end of a window, whose mean is 1

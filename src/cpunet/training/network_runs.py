@@ -1,0 +1,323 @@
+"""Networks of a recipe, trained on the pulses of a job, used as far as held-out pulses gain."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+from torch.optim.swa_utils import update_bn
+
+from cpunet.electronics.drawn_pile_up import TraceNoise
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import trace_noise
+from cpunet.errors import CpunetError
+from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
+from cpunet.networks.linear_parts import (
+    LearnedInverse,
+    LearnedResponse,
+    SolvedInverse,
+    SolvedResponse,
+)
+from cpunet.networks.positional_unet import PositionalUNet
+from cpunet.progress import stage
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import pulse_parameters
+from cpunet.pulses.two_sample import TwoSample, classifier_auc
+from cpunet.recipes.schema import Recipe, TrainingConfig
+from cpunet.training.adversarial import Game, Generator, Residual, train
+from cpunet.training.run import FitInfo, Record, Run
+from cpunet.training.sides import Side, Sides
+from cpunet.training.unfinished import UnfinishedRun
+
+if TYPE_CHECKING:
+    from cpunet.training.job import TrainingJob
+
+log = logging.getLogger(__name__)
+
+ENOUGH, MANY = 600, 4000  # pulses of a side that a critic needs, and that a large one needs
+SMALL = {"convolutional": {"channels": 8, "hidden": 32, "components": 32}}
+SCALES = 0.0, 0.5, 1.0  # of what a U-Net adds
+SURE, MOST = 2.0, 2000  # standard errors of a gain, and held-out pulses that decide
+LEAST = 0.02  # part of the mean square of a cycle that a gain must be
+# settings of logs and checkpoints, which do not affect the weights
+_LOGS: Any = {"log_interval", "checkpoint_interval"}
+
+
+def generators(recipe: Recipe, decay: float = 0.0) -> dict[str, Generator]:
+    """New generators, with a learned linear part or none; `decay` is the data's per sample."""
+    config, preparation = recipe.cyclegan.generator, recipe.preparation
+    if config.linear == "none":
+        unets = (PositionalUNet(config, preparation.length) for _ in range(2))
+        return {
+            part: Generator(unet) for part, unet in zip(("ren", "iren"), unets, strict=True)
+        }
+    response = LearnedResponse(preparation, decay)
+    linear = {"ren": response, "iren": LearnedInverse(response)}
+    dt_ns = preparation.sampled_ns
+    return {part: Generator(Residual(config, dt_ns), of) for part, of in linear.items()}
+
+
+def train_networks(job: TrainingJob) -> Run:
+    """Train the generators of a CycleGAN, or resume their training."""
+    recipe, own = job.recipe, job.recipe.preparation
+    noise, info = _noise(job)
+    late = job.data.prepared.pulses.waveforms[:, -own.decay_fit_samples :].mean(axis=0)
+    decay = -np.polyfit(np.arange(len(late)), np.log(np.maximum(late, 1e-3)), 1)[0]
+
+    def make() -> dict[str, Generator]:
+        made = generators(recipe, float(decay))
+        if job.init is not None:
+            for part, network in made.items():
+                fill_generator(job.init, part, network)
+        return made
+
+    if job.init is not None:
+        require_same_kind(job.init, recipe)
+    game, run = _played(job, recipe, make, noise)
+    parts: dict[str, Any] = {}
+    for part, side in (("ren", "sim"), ("iren", "data")):
+        network = game.averaged(part)
+        if network.linear is None:
+            settle(network, getattr(game.sides, side), game.config)
+        parts[part] = network.unet if network.linear is None else network
+    parts |= {f"discriminator_{side}": critic for side, critic in game.critics.items()}
+    if noise is not None:
+        parts["noise"] = KeptNoise(noise.dt_ns)
+        parts["noise"].set_noise(noise.noise)
+    more: dict[str, Any] = {"resumed_at": run.resumed_at} if run.resumed_at else {}
+    return job.run(
+        parts,
+        recipe,
+        run.started,
+        run.seconds,
+        **more,
+        **({} if info is None else {"fit": info}),
+    )
+
+
+def _noise(job: TrainingJob) -> tuple[TraceNoise | None, FitInfo | None]:
+    """Noise for the translations of simulated pulses, and what tails the data have."""
+    if job.recipe.cyclegan.training.noise == "none":
+        return None, None
+    try:
+        noise, tails = trace_noise(job.data, job.recipe.preparation)
+    except CpunetError as error:
+        raise CpunetError(
+            f"{job.data.path}: no baselines to draw noise from ({error}); or train "
+            "without it (training.noise=none in `settings`)"
+        ) from error
+    return noise, FitInfo(tails=tails)
+
+
+def fill_generator(run: Run, part: str, network: Generator, device: str = "cpu") -> Generator:
+    """Fill a generator, with or without a linear part, with the weights of a run."""
+    run.fill(part, network.unet if network.linear is None else network, device)
+    return network
+
+
+def require_same_kind(init: Run, recipe: Recipe) -> None:
+    """Raise a `CpunetError` if the networks of a run cannot be a start for a recipe."""
+    other = init.recipe
+    if other.generator.name != "punet":
+        raise CpunetError(
+            f"{init.name}: a readout chain ({other.name}), from which no network can start; "
+            "give a run of networks"
+        )
+    theirs, own = other.preparation, recipe.preparation
+    if (theirs.length, theirs.samples_before) != (own.length, own.samples_before):
+        raise CpunetError(
+            f"{init.name}: its networks know windows of {theirs.samples_before} + "
+            f"{theirs.samples_after} samples, this recipe has {own.samples_before} + "
+            f"{own.samples_after}; start from a run of the same windows"
+        )
+
+
+def _played(
+    job: TrainingJob,
+    recipe: Recipe,
+    make: Callable[[], Mapping[str, Generator]],
+    noise: TraceNoise | None,
+) -> tuple[Game, UnfinishedRun]:
+    """Play the game of a recipe, or the rest of it, with all that is needed to resume it."""
+    settings, threads = recipe.cyclegan, torch.get_num_threads()
+    exclude: Any = {"search": True, "training": _LOGS, "residual": {"training": _LOGS}}
+    run = UnfinishedRun(
+        job.folder,
+        {
+            "recipe": recipe.model_dump(mode="json", exclude=exclude),
+            "peak": job.peak,
+            "seed": job.seed,
+            "init": None if job.init is None else job.init.weights_sha256,
+            "simulation": job.sim.fingerprint(),
+            "data": job.data.fingerprint(),
+        },
+        # it changes the last bits
+        {"device": job.device, "threads": threads, "torch": torch.__version__},
+    )
+    state = run.begin(resume=job.resume)
+    pair = (side.prepared.pulses for side in (job.sim, job.data))
+    held_out = settings.training.held_out
+    sim, data = (Side.of(pulses, held_out, job.seed, job.device) for pulses in pair)
+    if min(sim.seen, data.seen) < MANY:  # which a large critic knows by heart
+        critic = settings.discriminator
+        small = critic.model_copy(update=SMALL.get(critic.name))
+        settings = settings._replace(discriminator=small)
+    sides = Sides(sim, data, recipe.preparation, noise, settings.generator.linear != "none")
+    left = settings.training.iterations - (state["iteration"] if state else 0)
+    with stage("Training", left) as bar:
+
+        def listen(records: list[Record]) -> None:
+            run.log(records)
+            if records:
+                bar.update(len(records))
+
+        def begin() -> Game:
+            pair = make()
+            return Game(pair["ren"], pair["iren"], sides, settings)
+
+        game = train(begin, job.seed, listener=listen, save=run.save, start=state)
+    run.finish()
+    return game, run
+
+
+def settle(network: nn.Module, side: Side, config: TrainingConfig) -> None:
+    """Replace the running statistics of batch norms by averages over one side's pulses.
+
+    In training a generator sees pulses of both sides (identity and cycle losses).  For one side
+    alone, the running averages of both shift the tail slope of a translation by more than its
+    spread (Wu and Johnson 2021, arXiv:2105.07576, section 3).  Dropout is off meanwhile, as in
+    a translation: it raises the variance at the batch norms behind it, here by up to a sixth
+    (Li et al. 2019, CVPR, "variance shift").
+    """
+    # `update_bn` switches every module to training mode
+    layers = [module for module in network.modules() if isinstance(module, nn.Dropout)]
+    fractions = [layer.p for layer in layers]
+    for layer in layers:
+        layer.p = 0.0
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        batches = range(config.statistics_batches)
+        update_bn((side.pulses[side.draw(config.batch_size)] for _ in batches), network)
+    for layer, fraction in zip(layers, fractions, strict=True):
+        layer.p = fraction
+
+
+class Learned(NamedTuple):
+    """Residuals that held-out pulses gain by, by part, and a line on each that was tried."""
+
+    parts: dict[str, Residual]
+    gains: dict[str, str]
+
+
+def learned_residuals(
+    job: TrainingJob, recipe: Recipe, chain: ResponseGenerator, inverse: LinearInverse
+) -> Learned:
+    """Train U-Nets behind a response and its inverse, and keep what held-out pulses gain by."""
+    n = min(len(job.sim.prepared), len(job.data.prepared))
+    if n < ENOUGH:
+        return Learned(
+            {}, {"networks": f"left out; {n} pulses of a side, a critic needs {ENOUGH}"}
+        )
+    config, preparation = recipe.cyclegan.generator, recipe.preparation
+    noise = TraceNoise(chain.noise, chain.tails)
+
+    def make() -> dict[str, Generator]:
+        linear = SolvedResponse(chain.response, preparation), SolvedInverse(inverse)
+        made = (Generator(Residual(config, preparation.sampled_ns), of) for of in linear)
+        return dict(zip(("ren", "iren"), made, strict=True))
+
+    game, _ = _played(job, recipe, make, noise)
+    parts, gains = dict[str, Residual](), dict[str, str]()
+    for name, found in (
+        ("ren", _ren_scale(game, chain, recipe)),
+        ("iren", _iren_scale(game)),
+    ):
+        gains[f"U-Net of {name.upper()}"] = found.line
+        residual = game.averaged(name).unet
+        if found.scale and isinstance(residual, Residual):
+            with torch.no_grad():
+                for values in residual.unet.outlet.parameters():
+                    values.mul_(found.scale)
+            parts[f"{name}_residual"] = residual
+    return Learned(parts, gains)
+
+
+def applied(network: nn.Module) -> Callable[[Any], npt.NDArray[np.float32]]:
+    """A network as a function of arrays."""
+    device = next(network.parameters()).device
+
+    def change(pulses: Any) -> npt.NDArray[np.float32]:
+        with torch.inference_mode():
+            made = network(torch.from_numpy(np.asarray(pulses, np.float32)).to(device))
+        return np.asarray(made.cpu().numpy())
+
+    return change
+
+
+class Scale(NamedTuple):
+    """Part of what a U-Net adds with which held-out pulses are best, and a line on it."""
+
+    scale: float
+    line: str
+
+    @classmethod
+    def of(cls, best: int, gain: float, error: float, told: str) -> Scale:
+        """The best of `SCALES`, if it gains."""
+        if gain <= 0 or gain < SURE * error:
+            return cls(0.0, f"left out; {told}")
+        return cls(SCALES[best], f"used, scaled by {SCALES[best]:g}; {told}")
+
+
+def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> Scale:
+    """Scale of REN's U-Net with which a classifier of held-out pulses is least right."""
+    sim, data, preparation = game.sides.sim, game.sides.data, recipe.preparation
+    charge, real = (side.pulses[side.seen :][:MOST].cpu().numpy() for side in (sim, data))
+    residual = game.averaged("ren").unet
+    assert isinstance(residual, Residual)
+    records = chain.response(charge)
+    change = applied(residual)(records)
+
+    def judged(scale: float) -> TwoSample:
+        windows = finish(
+            records + np.float32(scale) * change,
+            preparation,
+            dt_ns=preparation.sampled_ns,
+            noise=game.sides.noise,
+            energy_kev=sim.energy_kev[sim.seen :][:MOST],
+        ).windows
+        windows = windows[np.isfinite(windows).all(axis=1)]
+        pair = (Pulses.of(pulses, dt_ns=preparation.sampled_ns) for pulses in (real, windows))
+        values = [pulse_parameters(pulses, preparation, recipe.scores) for pulses in pair]
+        return classifier_auc(real, windows, seed=0, features=(values[0], values[1]))
+
+    found = [judged(scale) for scale in SCALES]
+    best = int(np.argmin([one.auc for one in found]))
+    told = f"AUC of held-out pulses {found[0].auc:.3f} → {found[-1].auc:.3f}"
+    error = found[0].auc_std
+    return Scale.of(best, found[0].auc - found[best].auc, error, f"{told} ± {error:.3f}")
+
+
+@torch.no_grad()
+def _iren_scale(game: Game) -> Scale:
+    """Scale of IREN's U-Net with which held-out cycles end closest to where they began."""
+    sides, (ren, iren) = game.sides, (game.averaged(part) for part in ("ren", "iren"))
+    assert ren.linear is not None
+    assert iren.linear is not None
+    rows = torch.arange(sides.sim.seen, len(sides.sim.pulses))[:MOST]
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        noisy = sides.noisy(ren.linear(sides.sim.pulses[rows]), rows)
+    back = iren.linear(sides.prepared(noisy))
+    apart, change = back - sides.sim.pulses[rows], iren.change(back)
+    squares = [(apart + scale * change).square().mean(dim=1) for scale in SCALES]
+    best = int(np.argmin([float(one.mean()) for one in squares]))
+    gains = squares[0] - squares[best]
+    rms = [float(one.mean().sqrt()) for one in squares]
+    told = f"RMS of held-out cycles {rms[0]:.2e} → {rms[-1]:.2e}"
+    error = max(float(gains.std()) / len(rows) ** 0.5, LEAST * float(squares[0].mean()) / SURE)
+    return Scale.of(best, float(gains.mean()), error, told)

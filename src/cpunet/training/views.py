@@ -1,0 +1,175 @@
+"""What critics see of pulses: aligned at half maximum, in units of the data's own spread.
+
+Everything has gradients, but the whole sample at which a pulse is cut.  Measured and translated
+pulses go through the same functions.  A view reaches to the end of the windows, where they are
+scaled, and has the current at its own scale: the current amplitude is a peak of a few percent.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool1d, conv1d, pad
+
+from cpunet.electronics.finishing import padding
+from cpunet.recipes.schema import ConvolutionalConfig, GruConfig, PreparationConfig
+
+BEFORE_NS, END_NS = 3200.0, 64.0  # before the half maximum; left out at the end of a window
+BASE_NS, LEVEL_NS = (-3200.0, -1600.0), (4800.0, 5600.0)  # which are scaled to 0 and 1
+EDGE_NS = -1792.0, 1280.0
+SEGMENT_NS = 400.0
+LEAST, LEAST_MEAN = 2e-4, 1e-5  # smallest spread of samples and of means
+CURRENT = 15.0  # of the highest currents in the view of an edge
+FINE = 0.05  # part of the highest current that a GRU resolves
+BLUR_NS, BLURRED_NS = 48.0, 1000.0  # two equal poles, and the length of their response
+BLOCK = 2000  # pulses at a time
+
+
+def nominal(pulses: Tensor, config: PreparationConfig) -> Tensor:
+    """Windows of records, where they are if nothing is delayed, scaled as measured ones."""
+    room = padding(config.sampled_ns)[0] if pulses.shape[1] > config.length else 0
+    window = pulses[:, room : room + config.length]  # (n, samples)
+    window = window - window[:, : config.baseline_samples].mean(dim=1, keepdim=True)
+    level = window[:, -config.tail_samples :].mean(dim=1, keepdim=True) / config.tail_level
+    return window / level.clamp_min(0.1)
+
+
+def half_sample(pulses: Tensor) -> Tensor:
+    """Last sample below half of the maximum before the maximum, shape (n, 1)."""
+    with torch.no_grad():
+        highest, at = pulses.max(dim=1, keepdim=True)
+        index = torch.arange(pulses.shape[1], device=pulses.device)
+        below = (pulses < 0.5 * highest) & (index < at)
+        return (below * index).amax(dim=1, keepdim=True)
+
+
+def aligned(pulses: Tensor, config: PreparationConfig) -> Tensor:
+    """Pulses at times from their half maximum, with baseline 0 and level 1.
+
+    Parameters
+    ----------
+    pulses
+        Windows or records, shape (n, samples).
+    config
+        Their preparation.
+    """
+
+    def at(first: int, stop: int) -> Tensor:
+        index = sample + torch.arange(first, stop, device=pulses.device)
+        return pulses.gather(1, index.clamp(0, pulses.shape[1] - 1))
+
+    sample = half_sample(pulses)
+    base, level = (
+        at(*map(config.samples, part)).mean(dim=1, keepdim=True) for part in (BASE_NS, LEVEL_NS)
+    )
+    half = 0.5 * (base + level)
+    with torch.no_grad():  # noise may cross half of the maximum elsewhere
+        near = at(-4, 6)
+        crosses = (near[:, :-1] < half) & (near[:, 1:] >= half)
+        last = 8 - crosses.flip(1).int().argmax(dim=1, keepdim=True)
+        sample = sample - 4 + torch.where(crosses.any(dim=1, keepdim=True), last, 4)
+    four = at(-1, 3).unbind(dim=1)
+    rise = (four[2] - four[1]).clamp_min(1e-3)
+    time = ((half[:, 0] - four[1]) / rise).clamp(-0.5, 1.5)
+    for _ in range(2):  # Newton
+        value, slope = _cubic(four[0], four[1], four[2], four[3], time)
+        time = (time - (value - half[:, 0]) / slope.clamp_min(2e-3)).clamp(-0.5, 1.5)
+    first, stop = -config.samples(BEFORE_NS), config.samples(config.after_ns - END_NS)
+    x = at(first - 1, stop + 2)
+    v, _ = _cubic(x[:, :-3], x[:, 1:-2], x[:, 2:-1], x[:, 3:], time[:, None])
+    base, level = (
+        v[:, config.samples(part[0]) - first : config.samples(part[1]) - first]
+        for part in (BASE_NS, LEVEL_NS)
+    )
+    zero = base.mean(dim=1, keepdim=True)
+    return (v - zero) / (level.mean(dim=1, keepdim=True) - zero).clamp_min(0.1)
+
+
+def _cubic(a: Tensor, b: Tensor, c: Tensor, d: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Value and slope between `b` and `c` (Catmull-Rom)."""
+    rise, bend, skew = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d, 0.5 * (3 * (b - c) + d - a)
+    return b + t * (rise + t * (bend + t * skew)), rise + t * (2 * bend + 3 * t * skew)
+
+
+def _spread(values: Tensor, least: float) -> tuple[Tensor, Tensor]:
+    """Median and robust standard deviation of each column."""
+    middle = values.median(dim=0).values
+    return middle, 1.4826 * (values - middle).abs().median(dim=0).values + least
+
+
+def _soft(values: Tensor) -> Tensor:
+    """The same near 0, and logarithms of outliers."""
+    return 2 * torch.asinh(values / 2)
+
+
+class View:
+    """Makes views of the pulses of a side, in units of the spread of real ones.
+
+    Parameters
+    ----------
+    side
+        ``"data"`` or ``"sim"``; simulated pulses, whose edges are the sharpest, are blurred.
+    real
+        Real pulses of this side, shape (n, samples).
+    critic
+        What reads the views.
+    config
+        Preparation of the pulses.
+    """
+
+    def __init__(
+        self,
+        side: str,
+        real: Tensor,
+        critic: ConvolutionalConfig | GruConfig,
+        config: PreparationConfig,
+    ) -> None:
+        self.config, self.critic = config, critic
+        self.published = isinstance(critic, GruConfig) and critic.view == "window"
+        if self.published:
+            return
+        lags = torch.arange(1.0, round(BLURRED_NS / config.sampled_ns), device=real.device)
+        poles = (lags * torch.exp(-lags * config.sampled_ns / BLUR_NS)).flip(0)
+        self.blur = (poles / poles.sum())[None, None] if side == "sim" else None
+        v = torch.cat([self.aligned(some) for some in torch.split(real, BLOCK)])
+        self.middle, self.spread = _spread(v, LEAST)
+        self.mean_middle, self.mean_spread = _spread(self.means(v), LEAST_MEAN)
+        self.current = v.diff(dim=1).amax(dim=1).median()
+        first, stop = (round((ns + BEFORE_NS) / config.sampled_ns) for ns in EDGE_NS)
+        self.n_edge = (stop - first) // 16 * 16
+        self.edge = slice(first, first + self.n_edge)
+        q = _soft((v - self.middle) / self.spread)
+        self.q_mean = q.mean(dim=0)
+        some = (q - self.q_mean)[: 3 * BLOCK]
+        _, sizes, vectors = torch.linalg.svd(some, full_matrices=False)
+        n = min(critic.components, *some.shape)
+        self.white = vectors[:n].T / (sizes[:n] / len(some) ** 0.5).clamp_min(1e-4)
+        self.size = self(real[:2]).shape[1]
+
+    def aligned(self, pulses: Tensor) -> Tensor:
+        """Pulses at times from their half maximum, shape (n, times)."""
+        if self.blur is not None:
+            edge = pulses[:, None, :1].expand(-1, -1, self.blur.shape[2] - 1)
+            pulses = conv1d(torch.cat([edge, pulses[:, None]], dim=2), self.blur)[:, 0]
+        return aligned(pulses, self.config)
+
+    def means(self, v: Tensor) -> Tensor:
+        """Means of segments, shape (n, segments)."""
+        return avg_pool1d(v[:, None], max(1, self.config.samples(SEGMENT_NS)))[:, 0]
+
+    def __call__(self, pulses: Tensor) -> Tensor:
+        """What the critic reads of windows or records (n, samples); shape (n, numbers)."""
+        if self.published:
+            return pulses
+        v = self.aligned(pulses)
+        q, current = (v - self.middle) / self.spread, pad(v.diff(dim=1), (1, 0)) / self.current
+        components = ((_soft(q) - self.q_mean) @ self.white).clamp(-8, 8)
+        if isinstance(self.critic, GruConfig):  # in turn, within the 0 … 1 of its table
+            begin = v.shape[1] % self.critic.samples_per_step  # where a pulse is flat
+            fine = torch.asinh((current - 1) / FINE) / 8
+            pairs = torch.stack([torch.asinh(q / 2) / 6, fine], dim=2)[:, begin:].flatten(1)
+            whole = torch.cat([pairs, components / 16], dim=1) + 0.5
+            return pad(whole, (0, -whole.shape[1] % self.critic.samples_per_step))
+        means = _soft((self.means(v) - self.mean_middle) / self.mean_spread)
+        edge = _soft(q[:, self.edge]), CURRENT * (current[:, self.edge] - 0.5)
+        return torch.cat([*edge, means, components], dim=1)

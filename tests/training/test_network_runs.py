@@ -1,0 +1,117 @@
+"""Networks behind a readout: used as far as held-out pulses gain, and else left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.training import network_runs
+from cpunet.training.network_runs import Scale
+from cpunet.training.run import Run
+from cpunet.training.train import train
+from cpunet.translation.export import export_onnx
+from cpunet.translation.translator import IREN, REN
+from cpunet.validation.run_figures import loss_curves
+from synthetic import (
+    after_pole,
+    decay,
+    load_recipe,
+    phased_edges,
+    require_drawn,
+    write_pulses,
+)
+
+SHORT = (
+    "training.components=4",
+    "training.squares=2",
+    "training.start_factors=[1]",
+    "training.ringing_mhz=[]",
+    "generator.slow_ns=[]",
+    "generator.fast_decays_us=[]",
+)
+GAME = (
+    "residual.generator.width=2",
+    "residual.training.iterations=6",
+    "residual.training.batch_size=16",
+    "residual.training.cycle_size=8",
+)
+RECIPE = load_recipe("cpunet", [*SHORT, *GAME])
+
+
+def write(path: Path, seed: int, pole: float | None, n: int = 240) -> PulseFile:
+    """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
+    rng = np.random.default_rng(seed)
+    pulses = phased_edges(n, rng, 450, 1100)
+    if pole is not None:
+        decayed = after_pole(pulses, pole, 90) * decay(450, 4000, 1100)
+        pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
+    kev = np.full(n, 2614.5)
+    write_pulses(path, Pulses.of(pulses, dt_ns=16.0, energy_kev=kev), table="geds/raw")
+    return PulseFile(path)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> tuple[PulseFile, PulseFile]:
+    folder = tmp_path_factory.mktemp("files")
+    return write(folder / "sim.lh5", 1, None), write(folder / "data.lh5", 2, 4.0)
+
+
+def test_with_few_pulses_it_is_the_readout_alone(files, tmp_path, caplog):
+    caplog.set_level("INFO", "cpunet")
+    run = train(*files, tmp_path / "run", recipe=RECIPE, device="cpu")
+    assert run.recipe.residual is None
+    (line,) = [text for text in caplog.messages if text.startswith("networks: ")]
+    assert line.endswith("pulses of a side, a critic needs 600")
+    alone = train(*files, tmp_path / "alone", recipe=load_recipe("fast", SHORT), device="cpu")
+    assert run.weights_sha256 == alone.weights_sha256
+    assert not (tmp_path / "run.unfinished").exists()
+
+
+@pytest.fixture(scope="module")
+def kept(files, tmp_path_factory) -> Run:
+    """A run whose networks were kept, though they are hardly trained."""
+    out = tmp_path_factory.mktemp("kept") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network_runs, "ENOUGH", 100)
+        patch.setattr(Scale, "of", lambda best, gain, error, told: Scale(0.5, f"used; {told}"))
+        return train(*files, out, recipe=RECIPE, device="cpu")
+
+
+def test_networks_that_gain_are_behind_the_readout_and_its_inverse(kept, files):
+    gains = kept.fit.gains
+    assert "AUC of held-out pulses" in gains["U-Net of REN"]
+    assert "RMS of held-out cycles" in gains["U-Net of IREN"]
+    again = Run.load(kept.folder)
+    ren, iren = REN.of(again), IREN.of(again)
+    assert ren.backend.chain.residual is not None
+    pulses = phased_edges(5, np.random.default_rng(5), 450, 1100)
+    windows = ren.translate(pulses, noise=False)
+    ren.backend.chain.residual = None
+    apart = np.abs(ren.translate(pulses, noise=False) - windows)
+    assert 0 < apart.max() < 0.05
+    assert iren.translate(windows).shape == windows.shape
+    with pytest.raises(CpunetError, match="ONNX graphs have a readout or a network") as error:
+        export_onnx(again, kept.folder.with_name("ren.onnx"))
+    assert "\n" not in str(error.value)
+
+
+def test_losses_and_accuracies_are_drawn(kept):
+    records = kept.records
+    assert [record["iteration"] for record in records] == list(range(6))
+    figure = loss_curves(records)
+    labels = [t.get_text() for axes in figure.axes for t in axes.get_legend().get_texts()]
+    assert {"data", "data unseen", "sim unseen", "cycle forward"} <= set(labels)
+    require_drawn(figure)
+
+
+@pytest.mark.parametrize(("gain", "scale"), [(-0.1, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.5)])
+def test_what_gains_by_two_standard_errors_is_used(gain, scale):
+    assert Scale.of(1, gain, 0.1, "AUC") == (
+        scale,
+        f"{'used, scaled by 0.5' if scale else 'left out'}; AUC",
+    )
