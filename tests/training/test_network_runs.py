@@ -79,7 +79,7 @@ def kept(files, tmp_path_factory) -> Run:
     out = tmp_path_factory.mktemp("kept") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network_runs, "ENOUGH", 100)
-        patch.setattr(Scale, "of", lambda best, gain, error, told: Scale(0.5, f"used; {told}"))
+        patch.setattr(Scale, "of", lambda best, gain, error, text: Scale(0.5, f"used; {text}"))
         return train(*files, out, recipe=RECIPE, device="cpu")
 
 
