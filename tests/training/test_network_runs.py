@@ -17,6 +17,7 @@ from cpunet.training.train import train
 from cpunet.translation.export import export_onnx
 from cpunet.translation.translator import IREN, REN
 from cpunet.validation.run_figures import loss_curves
+from games import SMALL
 from synthetic import (
     after_pole,
     decay,
@@ -78,7 +79,7 @@ def kept(files, tmp_path_factory) -> Run:
     out = tmp_path_factory.mktemp("kept") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network_runs, "ENOUGH", 100)
-        patch.setattr(Scale, "of", lambda best, gain, error, told: Scale(0.5, f"used; {told}"))
+        patch.setattr(Scale, "of", lambda best, gain, error, text: Scale(0.5, f"used; {text}"))
         return train(*files, out, recipe=RECIPE, device="cpu")
 
 
@@ -98,6 +99,22 @@ def test_networks_that_gain_are_behind_the_readout_and_its_inverse(kept, files):
     with pytest.raises(CpunetError, match="ONNX graphs have a readout or a network") as error:
         export_onnx(again, kept.folder.with_name("ren.onnx"))
     assert "\n" not in str(error.value)
+
+
+def test_a_mended_network_translates_as_it_was_trained(files, tmp_path):
+    run = train(*files, tmp_path / "run", recipe=load_recipe("paper", SMALL), device="cpu")
+    ren, iren = REN.of(run), IREN.of(run)
+    pulses = phased_edges(8, np.random.default_rng(5), 450, 1100)
+    clean = ren.translate(pulses, noise=False)
+    # prepared again: the baseline is 0, the level that of the data
+    np.testing.assert_allclose(clean[:, :200].mean(axis=1), 0, atol=1e-6)
+    np.testing.assert_allclose(clean[:, -5:].mean(axis=1), 0.8, atol=1e-6)
+    noisy = ren.translate(pulses, energy_kev=2614.5, seed=1)
+    assert 1e-4 < (noisy - clean)[:, :200].std() < 3e-3
+    back = iren.translate(noisy)
+    assert np.isfinite(back).all()
+    np.testing.assert_allclose(back.max(axis=1), 1, atol=1e-6)  # prepared as simulated ones are
+    assert run.fit.tails is not None
 
 
 def test_losses_and_accuracies_are_drawn(kept):

@@ -283,17 +283,17 @@ def train(
                 records[-1]["accuracy"] = judged(game)
             of_weights = [float(p.sum()) for p in game.average.parameters()] if keep else []
             if not all(map(math.isfinite, (*losses.values(), *of_weights))):
-                told = f"a loss or weight is not finite in iteration {done - 1} (seed {seed})"
+                text = f"a loss or weight is not finite in iteration {done - 1} (seed {seed})"
                 remedy = "lower the learning rates or change the seed, and begin again"
-                raise CpunetError(f"training diverged: {told}", remedy)
+                raise CpunetError(f"training diverged: {text}", remedy)
             if keep or done % c.log_interval == 0:
                 listener(records)
                 records = []
             if keep:
                 save(state_of(game))
             if stop:
-                told = f"stopped after {done} of {c.iterations} iterations"
-                interruption.act(f"{told}; resume goes on from there")
+                text = f"stopped after {done} of {c.iterations} iterations"
+                interruption.act(f"{text}; resume goes on from there")
         listener(records)
     if game.judge.over.get("data") == "won":
         game.average.load_state_dict(game.good.state_dict())

@@ -79,9 +79,9 @@ class Judge:
 @torch.no_grad()
 def judged(game: Game) -> dict[str, float]:
     """Part of pairs that critics order rightly: of the training, and of unseen pulses."""
-    found, n, sides = dict(game.right), game.config.batch_size, game.sides
+    results, n, sides = dict(game.right), game.config.batch_size, game.sides
     if not game.judge.unseen:
-        return found
+        return results
     rows, others = (side.draw(n, unseen=True) for side in sides[:2])
     x, y = sides.sim.pulses[rows], sides.data.pulses[others]
     pairs = {
@@ -90,9 +90,9 @@ def judged(game: Game) -> dict[str, float]:
     }
     for side, pair in pairs.items():
         real, fake = (game.critics[side](game.views[side](pulses)) for pulses in pair)
-        found[f"{side}_unseen"] = float((real > fake).float().mean())
+        results[f"{side}_unseen"] = float((real > fake).float().mean())
         done = game.iteration / game.config.iterations
-        game.judge.add(side, found[f"{side}_unseen"], done)
+        game.judge.add(side, results[f"{side}_unseen"], done)
     if game.judge.good("data"):
         game.good.load_state_dict(game.average.state_dict())
-    return found
+    return results

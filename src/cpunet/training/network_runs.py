@@ -233,16 +233,16 @@ def learned_residuals(
 
     game, _ = _played(job, recipe, make, noise)
     parts, gains = dict[str, Residual](), dict[str, str]()
-    for name, found in (
+    for name, results in (
         ("ren", _ren_scale(game, chain, recipe)),
         ("iren", _iren_scale(game)),
     ):
-        gains[f"U-Net of {name.upper()}"] = found.line
+        gains[f"U-Net of {name.upper()}"] = results.line
         residual = game.averaged(name).unet
-        if found.scale and isinstance(residual, Residual):
+        if results.scale and isinstance(residual, Residual):
             with torch.no_grad():
                 for values in residual.unet.outlet.parameters():
-                    values.mul_(found.scale)
+                    values.mul_(results.scale)
             parts[f"{name}_residual"] = residual
     return Learned(parts, gains)
 
@@ -266,11 +266,11 @@ class Scale(NamedTuple):
     line: str
 
     @classmethod
-    def of(cls, best: int, gain: float, error: float, told: str) -> Scale:
+    def of(cls, best: int, gain: float, error: float, text: str) -> Scale:
         """The best of `SCALES`, if it gains."""
         if gain <= 0 or gain < SURE * error:
-            return cls(0.0, f"left out; {told}")
-        return cls(SCALES[best], f"used, scaled by {SCALES[best]:g}; {told}")
+            return cls(0.0, f"left out; {text}")
+        return cls(SCALES[best], f"used, scaled by {SCALES[best]:g}; {text}")
 
 
 def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> Scale:
@@ -295,11 +295,11 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> Scale:
         values = [pulse_parameters(pulses, preparation, recipe.scores) for pulses in pair]
         return classifier_auc(real, windows, seed=0, features=(values[0], values[1]))
 
-    found = [judged(scale) for scale in SCALES]
-    best = int(np.argmin([one.auc for one in found]))
-    told = f"AUC of held-out pulses {found[0].auc:.3f} → {found[-1].auc:.3f}"
-    error = found[0].auc_std
-    return Scale.of(best, found[0].auc - found[best].auc, error, f"{told} ± {error:.3f}")
+    results = [judged(scale) for scale in SCALES]
+    best = int(np.argmin([one.auc for one in results]))
+    text = f"AUC of held-out pulses {results[0].auc:.3f} → {results[-1].auc:.3f}"
+    error = results[0].auc_std
+    return Scale.of(best, results[0].auc - results[best].auc, error, f"{text} ± {error:.3f}")
 
 
 @torch.no_grad()
@@ -318,6 +318,6 @@ def _iren_scale(game: Game) -> Scale:
     best = int(np.argmin([float(one.mean()) for one in squares]))
     gains = squares[0] - squares[best]
     rms = [float(one.mean().sqrt()) for one in squares]
-    told = f"RMS of held-out cycles {rms[0]:.2e} → {rms[-1]:.2e}"
+    text = f"RMS of held-out cycles {rms[0]:.2e} → {rms[-1]:.2e}"
     error = max(float(gains.std()) / len(rows) ** 0.5, LEAST * float(squares[0].mean()) / SURE)
-    return Scale.of(best, float(gains.mean()), error, told)
+    return Scale.of(best, float(gains.mean()), error, text)
