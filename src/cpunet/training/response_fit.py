@@ -111,12 +111,13 @@ def fit_response(
     CpunetError
         If there are too few pulses, or the fit does not find a finite chi-square.
     """
-    bands, tried = sets.sides(), []
+    bands, chains = sets.sides(), list[Fitted]()
     for start in _starts(sets, fitter, known):
-        tried.append(_learned(fit_chain(start, bands, fitter), bands, fitter))
-        if tried[-1].checks.good or not tried[-1].chain.poor:
+        chains.append(fit_chain(start, bands, fitter))
+        if not chains[-1].poor:
             break  # there is no other valley to search for
-    best = min(tried, key=lambda one: one.checks.chi_square)
+    nearest = min(chains, key=lambda chain: chain.chi_square)
+    best = _learned(nearest, bands, fitter)
     if not best.checks.good and "onset" in best.checks.off:
         stretched = _stretched(best.chain, bands, fitter)
         if stretched is not None:
