@@ -36,6 +36,7 @@ FALL, CONVERGED = 20.0, 0.1
 DAMPING, MORE, TRIES = 0.03, 8.0, 5
 # Chi-square per function above which a fit has missed its valley, or there is none.
 POOR = 5.0
+SLOW = 0.03  # share by which a step must lower a chi-square that is as poor as that
 STRETCHED = 0.004  # change of the stretch of the drift, for its derivatives
 
 
@@ -152,7 +153,10 @@ def _minimum(
             damping = max(DAMPING, MORE * damping)
         else:
             break
+        gained = best.cost - tried.cost
         best, damping = tried, damping / MORE if damping > DAMPING else 0.0
+        if best.chi_square > POOR * best.functions and gained < SLOW * best.cost:
+            break
     if not np.isfinite(best.cost):
         raise CpunetError(
             "the fit of the response diverged; check that the sets hold single pulses of one "
