@@ -24,10 +24,9 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.training.chain_parameters import STRETCH, with_decay, with_settings
 from cpunet.training.moments import Readings
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_problem import STRETCH
-from cpunet.training.response_starts import set_decay, with_settings
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, charge, coarse, faster, measured_with
 
@@ -231,7 +230,7 @@ def test_derivatives_are_those_of_wide_differences(monkeypatch):
     nearby = Nearby(SimpleNamespace(physics=PHYSICS), at, base, derivatives)
     response = with_settings(ElectronicsResponse(RECIPE.matching[0], DT_NS), drift_terms=1)
     response.drift.stretch[...] = 0.05
-    set_decay(response, band.moments.slope)
+    with_decay(response, band.moments.slope)
     parameters = JointParameters(response, PHYSICS, at, [0, 1], {}, response)
     functions = [SlicedFunctions(band.moments)]
     both = JointProblem(parameters, [band], functions, nearby, RECIPE)

@@ -26,7 +26,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.library import build_library
 from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings
-from cpunet.training.fitter import GOOD_FIT
+from cpunet.training.chain_fit import POOR
 from cpunet.training.train import train
 from synthetic import load_recipe, prepared_truth
 
@@ -150,7 +150,7 @@ def test_no_ringing_is_invented_for_a_fast_decay(tmp_path: Path) -> None:
     assert found["pole_1_ns"] == pytest.approx(55, rel=0.1)
     assert found["fast_decay_1_us"] == pytest.approx(2.9, rel=0.15)
     assert found["decay_us"] == pytest.approx(54.6, rel=0.05)
-    assert fit["chi_square"] < GOOD_FIT * fit["moments"]
+    assert fit["chi_square"] < POOR * fit["moments"]
 
 
 def test_a_stand_of_any_period_is_the_same_stand(tmp_path: Path) -> None:

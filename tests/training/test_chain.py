@@ -11,7 +11,7 @@ from cpunet.electronics.tails_law import TailsLaw
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.training.fitter import GOOD_FIT
+from cpunet.training.chain_fit import POOR
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.file_translation import Counts
@@ -167,7 +167,7 @@ def test_a_stretched_drift_is_told_and_translated(
     recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
     made = train(sim, files.data, tmp_path / "run", recipe=recipe, device="cpu")
     fit = made.fit.model_dump()
-    assert fit["chi_square"] < GOOD_FIT * fit["moments"]
+    assert fit["chi_square"] < POOR * fit["moments"]
     assert fit["parameters"]["drift_stretch"] == pytest.approx(0.25, abs=0.05)
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.05)
     assert any(note.startswith("charges drift for") for note in caplog.messages)

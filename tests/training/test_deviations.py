@@ -14,6 +14,7 @@ from cpunet.networks.response_layer import (
     late_lags,
     padding,
 )
+from cpunet.training.chain_parameters import with_settings
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
 from cpunet.training.comparison import Comparison, Sides, hats
 from cpunet.training.derivatives import Basis
@@ -21,7 +22,6 @@ from cpunet.training.deviations import with_deviations
 from cpunet.training.fitter import Fitter
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
-from cpunet.training.response_starts import with_settings
 from cpunet.training.verdict import PARTS, Verdict, verdict
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, Unpaired, charge, faster, measured_with, simulated
@@ -41,8 +41,8 @@ def true_response(poles_ns: tuple[float, float] = (55.0, 35.0)) -> ElectronicsRe
     return response
 
 
-def sides_of(sets: Unpaired, response: ElectronicsResponse) -> Sides:
-    (sides,) = PulseSets(*sets, RECIPE, np.random.default_rng(0)).sides(response)
+def sides_of(sets: Unpaired) -> Sides:
+    (sides,) = PulseSets(*sets, RECIPE, np.random.default_rng(0)).sides()
     return sides
 
 
@@ -65,7 +65,7 @@ def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> Electroni
 
 def test_chi_square_at_the_truth_is_one(plain):
     response = true_response()
-    sides = sides_of(plain, response)
+    sides = sides_of(plain)
     found = Comparison(sides, 1.5).differences(response.transfer(sides.padded))
     assert np.mean([d.chi_square for d in found if d.sliced]) == pytest.approx(1.0, abs=0.15)
     assert all(d.chi_square < 1.6 for d in found)
@@ -75,7 +75,7 @@ def test_chi_square_at_the_truth_is_one(plain):
 def test_derivatives_are_those_of_differences(plain, at_ns):
     """With little noise, of which slices with other pulses have other means."""
     response = true_response()
-    sides, lags = sides_of(plain, response), deviation_lags(DT_NS)
+    sides, lags = sides_of(plain), deviation_lags(DT_NS)
     sides.noise = replace(sides.noise, factor=1e-4 * sides.noise.factor)
     change = np.exp(-0.5 * ((lags * DT_NS - at_ns) / 60.0) ** 2)
     comparison, step = Comparison(sides, 6.0), 1e-4
@@ -93,7 +93,7 @@ def test_derivatives_are_those_of_differences(plain, at_ns):
 
 def test_a_chain_that_is_right_stays_as_it_is(plain):
     response = true_response()
-    found = with_deviations(response, [sides_of(plain, response)], lambda _: None)
+    found = with_deviations(response, [sides_of(plain)], lambda _: None)
     assert found.evidence < 0
     assert found.response is response
 
@@ -101,7 +101,7 @@ def test_a_chain_that_is_right_stays_as_it_is(plain):
 def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
     """The mean pulse tells what moments of a chain do not."""
     response = true_response()
-    sides = sides_of(rings, response)
+    sides = sides_of(rings)
     bad = verdict(response, [sides])
     assert not bad.good
     assert abs(bad.z) > 10
@@ -136,7 +136,7 @@ def test_other_physics_are_bad(plain, factor):
     """No linear readout makes up for a drift that is longer or shorter."""
     other = plain._replace(sim=simulated(faster(charge(1500, seed=1), factor)))
     response = true_response()
-    sides = sides_of(other, response)
+    sides = sides_of(other)
     found = with_deviations(response, [sides], lambda _: None)
     told = verdict(found.response, [sides])
     assert not told.good

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import current_amplitude
 from cpunet.pulses.preparation import prepare
-from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, Readings, stretch_name
+from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, stretch_name
 from synthetic import load_recipe, two_sites
 from unpaired import at_half_maximum
 
@@ -161,23 +159,3 @@ def test_too_few_pulses_are_refused(windows, n: int) -> None:
         CpunetError, match=rf"^{n} measured pulses can be used; {MIN_PULSES} or more"
     ):
         Moments.of_data(windows[:n], CONFIG, PREPARATION)
-
-
-def test_the_peak_of_single_sites_does_not_depend_on_the_mixture(moments) -> None:
-    """Twice as many other pulses do not matter, another amplitude does, and is told."""
-    rng = np.random.default_rng(0)
-
-    def set_of(many: int, shift: float = 0.0) -> Readings:
-        single, others = rng.normal(shift, 0.005, 20_000), rng.uniform(-1.0, -0.05, many)
-        logs = np.concatenate([single, others])
-        return Readings(np.zeros((len(logs), len(moments.centres))), logs, np.ones(len(logs)))
-
-    peak = replace(moments, data=set_of(10_000)).single_sites()
-    assert len(peak.names) == peak.values.shape[1] == len(peak.amplitude_centres) - 1
-    assert peak.amplitude_centres[6] == pytest.approx(0.0, abs=0.005)
-    np.testing.assert_allclose(peak.values.mean(axis=0), 0, atol=1e-12)
-    errors = peak.values.std(axis=0) / np.sqrt(20_000)
-    same, moved = (peak.functions(set_of(40_000, s)).mean(axis=0) for s in (0.0, 0.002))
-    assert np.abs(same / errors).max() < 5
-    assert np.abs(moved / errors).max() > 20
-    assert not peak.model_errors.any()

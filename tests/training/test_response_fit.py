@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,16 +12,16 @@ import pytest
 import scipy.fft
 
 from cpunet.electronics.chain import Electronics
-from cpunet.networks.response_layer import ElectronicsResponse, record_length
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
-from cpunet.training import response_starts
-from cpunet.training.fitter import GOOD_FIT, Fitted, Fitter
-from cpunet.training.moments import Moments, Readings
+from cpunet.training import response_fit
+from cpunet.training.chain_fit import POOR, differences
+from cpunet.training.chain_parameters import SmoothParameters
+from cpunet.training.comparison import Difference
+from cpunet.training.fitter import Fitter
+from cpunet.training.joint import Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_fit import Fit, fit_response
-from cpunet.training.response_problem import STRETCH, Band, ResponseProblem
-from cpunet.training.response_starts import drift_if_needed, with_settings
-from cpunet.training.translated import Noise, SimulatedSide
+from cpunet.training.response_fit import Fit, amplitude_shift, fit_response
 from synthetic import load_recipe
 from unpaired import (
     CHAIN,
@@ -35,6 +36,7 @@ from unpaired import (
 )
 
 STARTS = ["near", pytest.param("far", marks=pytest.mark.slow)]
+STEP = 0.02  # in widths of the priors
 FEW = ("generator.slow_ns=[400]", "generator.fast_decays_us=[]")
 RECIPE = load_recipe("fast", FEW)
 
@@ -124,11 +126,10 @@ def test_what_a_fit_tells(near: Told) -> None:
     steps, chi_square = zip(*near.steps, strict=True)
     assert steps == tuple(range(1, near.fit.steps + 1))
     assert chi_square[-1] == pytest.approx(near.fit.chi_square)
-    assert chi_square[-1] < near.fit.moments < chi_square[0]
-    assert len(near.fit.pulls) == near.fit.moments
+    assert chi_square[-1] < 1.1 * near.fit.moments
     labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}
     assert set(near.fit.errors) == labels
-    # of a good fit they are as standard deviations: a few are 2, hardly one is 4
+    # those of the mean pulse are as standard deviations: a few are 2, hardly one is 4
     pulls = np.abs(list(near.fit.pulls.values()))
     assert np.sqrt((pulls**2).mean()) < 1.6
     assert pulls.max() < 5
@@ -153,7 +154,7 @@ def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
     """The readout is then the true one, and not what makes up for the drift."""
     short = simulated(faster(charge(N, seed=1), 1.25))
     response, fit, steps = problem.fit(0, *DRIFT, sim=short)
-    assert fit.chi_square < GOOD_FIT * fit.moments
+    assert fit.chi_square < POOR * fit.moments
     assert fit.steps == len(steps)  # those of all fits
     numbers = response.describe()
     error = fit.errors["drift.stretch.1"]
@@ -171,7 +172,7 @@ def test_a_drift_simulated_too_short_is_stretched(problem: Problem) -> None:
 
 @pytest.mark.thorough
 def test_a_drift_of_another_detector_is_not_stretched(problem: Problem, monkeypatch) -> None:
-    monkeypatch.setattr(response_starts, "MAX_STRETCH", 0.05)
+    monkeypatch.setattr(response_fit, "MAX_STRETCH", 0.05)
     short = simulated(faster(charge(N, seed=1), 1.25))
     response, fit, _ = problem.fit(0, *DRIFT, sim=short)
     assert response.drift is None
@@ -195,82 +196,66 @@ def test_a_ringing_is_found_with_few_pulses() -> None:
     assert fit.checks.good
 
 
-@pytest.fixture(scope="module")
-def asked(problem: Problem) -> ResponseProblem:
-    """A small comparison, where the response's start is."""
-    recipe = load_recipe("fast", FEW)
-    generator, training = recipe.matching
-    few = problem.sim[:64]
-    length = record_length(few.waveforms.shape[1], few.dt_ns)
-    drawn = Noise.draw(problem.noise, few.energy_kev, length, 2, np.random.default_rng(0))
-    moments = Moments.of_data(problem.data.waveforms, training, recipe.preparation)
-    band = Band("all", SimulatedSide(few.waveforms, drawn, moments, np.ones(64)), np.arange(64))
-    return ResponseProblem(ElectronicsResponse(generator, DT_NS), [band])
+def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None:
+    """With little noise, by which pulses go from bin to bin; those of a stretch included."""
+    generator, _ = RECIPE.matching
+    config = generator.model_copy(update={"poles_ns": (55.0, 35.0), "drift_terms": 1})
+    start = ElectronicsResponse(config.model_copy(update={"decay_us": 80.0}), DT_NS)
+    (sides,) = PulseSets(*problem[:3], RECIPE, np.random.default_rng(0)).sides()
+    sides.noise = dataclasses.replace(sides.noise, factor=1e-3 * sides.noise.factor)
+    parameters = SmoothParameters(start)
+    place, compared = parameters.vector(), Joint(sides)
+    here = differences(parameters, compared)
+    for i, width in enumerate(parameters.widths):
+        ends = []
+        for sign in (1, -1):
+            parameters.set(place + sign * STEP * width * np.eye(len(place))[i])
+            ends.append(differences(parameters, compared).values)
+        parameters.set(place)
+        wanted, error = (
+            (ends[0] - ends[1]) / (2 * STEP * width),
+            here.covariance.diagonal() ** 0.5,
+        )
+        off = np.linalg.norm((here.slopes[:, i] - wanted) / error)
+        assert off < 0.15 * np.linalg.norm(wanted / error), parameters.labels[i]
 
 
-def test_records_are_stretched_as_the_layer_stretches(asked: ResponseProblem) -> None:
-    """And what is kept of one stretch is not used for the next."""
-    more = asked.of(with_settings(asked.response, drift_terms=1))
-    vector = more.parameters.vector()
-    as_simulated, plain = more.pulls(vector), asked.pulls(asked.parameters.vector())
-    np.testing.assert_allclose(as_simulated, plain, atol=1e-3)
-    vector[more.parameters.labels.index(STRETCH)] = 0.1
-    found = more.pulls(vector)
-    band = asked.bands[0]
-    longer = more.response.drifted(band.sim.sim)
-    by_hand = Band(band.name, dataclasses.replace(band.sim, sim=longer), band.rows)
-    expected = asked.of(asked.response, [by_hand]).pulls(asked.parameters.vector())
-    np.testing.assert_allclose(found, expected, atol=1e-3)
-    assert np.abs(found - plain).max() > 1
+def test_a_known_response_is_where_a_fit_starts(problem: Problem, near: Told) -> None:
+    """It is left as it is, and what is found does not depend on it."""
+    recipe, known = RECIPE, copy.deepcopy(near.response)
+    known.log_decay_us.fill(np.log(300.0))
+    fitter, rng = Fitter(recipe.matching.training), np.random.default_rng(0)
+    sets = PulseSets(problem.sim, problem.data, problem.noise, recipe, rng)
+    found, fit = fit_response(sets, fitter, known)
+    assert np.exp(known.log_decay_us[0]) == pytest.approx(300.0)
+    assert found.describe()["decay_us"] == pytest.approx(80, rel=0.01)
+    assert fit.steps < near.fit.steps
 
 
-def test_a_needless_stretch_is_taken_out(asked: ResponseProblem) -> None:
-    """It may have stood in for a ringing that was found later."""
-    stretched = asked.of(with_settings(asked.response, drift_terms=1))
-    vector = stretched.parameters.vector()
-    vector[stretched.parameters.labels.index(STRETCH)] = 0.002
-    stretched.parameters.set(vector)
-    residuals = stretched.residuals(vector)
+def test_the_peak_of_single_sites_does_not_depend_on_the_mixture() -> None:
+    """Twice as many other pulses do not matter, another amplitude does."""
+    rng = np.random.default_rng(0)
 
-    def known_to(error: float) -> Fitted:
-        cost = float(residuals @ residuals)
-        found = Fitted(stretched, cost, np.eye(len(vector)) * error**2)
-        return drift_if_needed(found, Fitter(RECIPE.training))
+    def set_of(many: int, shift: float = 0.0) -> SimpleNamespace:
+        single, others = rng.normal(shift, 0.005, 20_000), rng.uniform(-1.0, -0.05, many)
+        return SimpleNamespace(log_amplitude=np.concatenate([single, others]))
 
-    assert known_to(0.001).problem.response.drift is None
-    assert known_to(0.0005).problem is stretched
-    simulated = Fitted(asked, 1.0, np.eye(len(vector) - 1))
-    assert drift_if_needed(simulated, Fitter(RECIPE.training)) is simulated
+    peak = SingleSites(SimpleNamespace(data=set_of(10_000)))
+    assert peak.places[6] == pytest.approx(0.0, abs=0.005)
+    np.testing.assert_allclose(peak.data.mean(axis=0), 0, atol=1e-12)
+    errors = peak.data.std(axis=0) / np.sqrt(20_000)
+    same, moved = (peak._functions(set_of(40_000, s)).mean(axis=0) for s in (0.0, 0.002))
+    assert np.abs(same / errors).max() < 5
+    assert np.abs(moved / errors).max() > 20
 
 
-@pytest.mark.parametrize(("beyond", "share"), [(0.19, 0.81), (0.21, 1.0)])
-def test_blocks_do_not_decide_which_tails_are_excluded(
-    asked: ResponseProblem, beyond: float, share: float
-) -> None:
-    sim, slopes = asked.bands[0].sim, list[float]()
-    sim.sums(
-        asked.response,
-        lambda r: (slopes.extend(r.linear[:, -1]), (np.zeros(1),))[1],
-        cut=False,
-        draws=1,
-    )
-    moments = sim.moments
-    low = np.quantile(slopes, beyond) * moments.spreads[-1] + moments.centres[-1]
-    moments = dataclasses.replace(moments, slope_range=(low, np.inf))
-    some = dataclasses.replace(sim, moments=moments)
-
-    def of(readings: Readings) -> tuple[np.ndarray]:
-        return (readings.weights @ readings.linear,)
-
-    found = [
-        some.sums_of_blocks(asked.response, of, size=size, draws=1) for size in (7, 64, 512)
-    ]
-    totals = [sum(total for (total,), _ in blocks) for blocks in found]
-    used = [sum(n for _, n in blocks) for blocks in found]
-    assert used == [used[0]] * 3
-    assert used[0] / len(sim) == pytest.approx(share, abs=0.005)
-    for total in totals[1:]:
-        np.testing.assert_allclose(total, totals[0], rtol=1e-4, atol=1e-4 * used[0])
+@pytest.mark.parametrize("shift", [0.0, 0.002, -0.05])
+def test_the_shift_of_amplitudes_is_told(shift: float) -> None:
+    covariance = 1e-6 * (np.eye(16) + 0.5)
+    quantiles = Difference("log_amplitude quantiles", np.full(16, -shift), covariance)
+    found, error = amplitude_shift([quantiles])
+    assert found == pytest.approx(shift)
+    assert error == pytest.approx((1e-6 * (1 / 16 + 0.5)) ** 0.5)
 
 
 def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:

@@ -1,14 +1,12 @@
-"""Where fits start, which searches a poor one goes through, and what ends it early."""
+"""What calibrations try, and what held-out pulses say of it."""
 
 from __future__ import annotations
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training import fitter as fitter_module
 from cpunet.training import response_starts
@@ -25,45 +23,6 @@ from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, measured_with
-
-
-@pytest.mark.parametrize(
-    ("true_us", "tails", "expected"),
-    [
-        (300.0, None, 300.0),  # its own decay fits, although tails fall with 100 us
-        (101.0, None, 100.0),  # that of the tails does: it is from other data
-        (300.0, KnownDecay(50.0, 0.01), 50.0),  # what baselines tell is taken in any case
-    ],
-)
-def test_a_known_response_starts_with_the_main_decay_that_fits(
-    monkeypatch, true_us, tails, expected
-):
-    class Problem:
-        """A chi-square that knows the main decay."""
-
-        moments, slope = 1, -16e-3 / 100.0  # the slope of the tails is per sample
-
-        def __init__(self, response: ElectronicsResponse) -> None:
-            self.response = response
-
-        def of(self, response: ElectronicsResponse) -> Problem:
-            return Problem(response)
-
-        @property
-        def cost(self) -> float:
-            return (self.response.log_decay_us.item() - math.log(true_us)) ** 2
-
-    recipe = load_recipe("fast")
-    known = ElectronicsResponse(recipe.matching[0], 16.0)
-    known.log_decay_us.fill(math.log(300.0))
-    fitter = Fitter(recipe.matching[1], tails)
-    monkeypatch.setattr(fitter, "fit", lambda of, **_: Fitted(of, 0.0, np.eye(1)))
-    found = response_starts.from_known(Problem(known), known, fitter)
-    assert found is not None
-    decay_us = math.exp(found.problem.response.log_decay_us.item())
-    assert decay_us == pytest.approx(expected)
-    assert math.exp(known.log_decay_us.item()) == pytest.approx(300.0)  # it is left alone
-
 
 RECIPE = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"])
 

@@ -18,9 +18,10 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
+from cpunet.training.chain_parameters import SmoothParameters
 from cpunet.training.differentiable import DifferentiableSet
 from cpunet.training.moments import Readings, Rows
-from cpunet.training.response_problem import Band, SmoothParameters
+from cpunet.training.response_problem import Band, ways
 from cpunet.training.translated import SimulatedSide
 
 RIDGE = 0.05  # fraction of the identity in the correlation matrix of the functions
@@ -276,18 +277,18 @@ class JointProblem:
             for i, step in zip(parameters.free, steps, strict=True)
         ]
         for k, side in enumerate(self._simulated(at, self.few)):
-            ways = parameters.chain.ways(side)
+            records = ways(parameters.chain, side)
 
             def of_pulses(
                 rows: slice,
-                of_chain: OfPulses = ways.of_pulses,
+                of_chain: OfPulses = records.of_pulses,
                 band: Rows = self.bands[k].rows,
             ) -> FloatArray:
                 own = [change[band[rows]][np.newaxis] for change in changes]
                 return np.concatenate([of_chain(rows), *own])
 
             mean = DifferentiableSet(side).slopes(
-                ways._replace(of_pulses=of_pulses),
+                records._replace(of_pulses=of_pulses),
                 partial(self.functions[k], clip=self._clip),
                 draws=None if self.few is None else 1,
             )

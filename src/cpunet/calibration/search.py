@@ -25,10 +25,10 @@ from cpunet.calibration.sliced_functions import SlicedFunctions
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
+from cpunet.training.chain_parameters import with_decay
 from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_problem import Band, ResponseProblem
-from cpunet.training.response_starts import set_decay
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class Search:
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
         dt_ns = self.simulator.physics.settings.dt_ns
         self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
-        set_decay(self._start, float(np.mean([b.moments.slope for b in self._bands])))
+        with_decay(self._start, float(np.mean([b.moments.slope for b in self._bands])))
 
     def plan(self) -> Information:
         """Information of the pulses on all parameters that may become free, before a fit."""

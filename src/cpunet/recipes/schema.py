@@ -300,10 +300,8 @@ class MatchingConfig(Timed):
     deviations.  ``ridge`` is the fraction of the identity in the correlation matrix of all of
     these.  The valley is searched for with ``search_pulses`` of each side, in fits of at most
     ``steps`` iterations.  A fit that ends in the wrong valley is started again with the
-    response's poles times the next of ``start_factors``; the best of all is kept.  All pulses
-    are compared with ``noise_sets`` draws of the noise each, optimally weighted with the
-    components in ``conditional_bins`` of the current amplitude; or, if the drift was stretched,
-    by their moments and by the single sites of the continuum.  If a fit is bad and pulses begin
+    response's poles times the next of ``start_factors``; the best of all is kept.  Each pulse
+    is compared with ``noise_sets`` draws of the noise.  If a fit is bad and pulses begin
     differently than simulated, up to ``drift_terms`` parameters that stretch the drift are
     tried, and kept if held-out pulses gain.  A calibration tries a ringing at one of
     ``ringing_mhz``.
@@ -322,7 +320,6 @@ class MatchingConfig(Timed):
     clip: Positive
     ridge: Fraction
     search_pulses: Annotated[int, Field(ge=200, le=10_000_000)]
-    conditional_bins: Annotated[int, Field(ge=2, le=1000)]
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)]

@@ -30,7 +30,7 @@ from cpunet.networks.response_layer import (
     deviation_lags,
 )
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.training.response_problem import SmoothParameters
+from cpunet.training.chain_parameters import SmoothParameters
 
 Numbers = dict[str, float]
 

@@ -19,16 +19,17 @@ draws of opposite sign leave of the simulated noise.  Compared are
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
+import scipy.linalg
 
 from cpunet.electronics.finishing import padding
-from cpunet.networks.response_layer import padded_length
+from cpunet.networks.response_layer import ElectronicsResponse, padded_length
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Floats, Frame, Values, read
 from cpunet.training.derivatives import Basis, Derivatives
@@ -50,6 +51,7 @@ RANKS = {
 QUANTILES = np.r_[np.linspace(0.01, 0.95, 13), 0.97, 0.985, 0.995]
 _ODDS = QUANTILES / (1 - QUANTILES)
 CORRELATION = np.sqrt(np.minimum.outer(_ODDS, _ODDS) / np.maximum.outer(_ODDS, _ODDS))
+NONE = np.empty((0, 0))  # derivatives
 POOLED = 0.5  # of the shapes' covariance, taken from all slices
 # A measured pulse with another before it, or on its tail: height of its baseline, time from
 # which the tail counts, and its RMS in units of the median.
@@ -85,14 +87,9 @@ class Sides:
     ) -> None:
         self.frame, self.noise, self.tail_level = frame, noise, tail_level
         self.before, self.behind = padding(frame.dt_ns)
-        n, window = sim.shape
-        self.length = window + self.before + self.behind
+        self.length = sim.shape[1] + self.before + self.behind
         self.padded = padded_length(self.length)
-        self.current = np.zeros((n, self.length), np.float32)
-        inside = slice(self.before, self.before + window)
-        self.current[:, inside] = np.diff(sim, axis=1, prepend=np.float32(0))
-        self.charge = self.current.cumsum(axis=1, dtype=np.float32)
-        self.spectra = scipy.fft.rfft(self.current, self.padded)
+        self.take(sim)
         self.data = read(data, frame)
         late = self.data.pulses[:, self._late]
         self.middle = np.median(late, axis=0)
@@ -100,25 +97,47 @@ class Sides:
         self.widest = LATE_RMS * float(np.median(self._late_rms(self.data)))
         single = self.single(self.data)
         self.data, self.left_out = self.data[single], int((~single).sum())
-        self.first = _stretches(frame, min(n, len(self.data)))
-        self.widths = np.diff(np.append(self.first, frame.length))
+        self.divide()
+
+    def take(self, sim: FloatArray) -> None:
+        """Let these be the simulated pulses."""
+        self.sim, inside = sim, slice(self.before, self.before + sim.shape[1])
+        self.current = np.zeros((len(sim), self.length), np.float32)
+        self.current[:, inside] = np.diff(sim, axis=1, prepend=np.float32(0))
+        self.charge = self.current.cumsum(axis=1, dtype=np.float32)
+        self.spectra = scipy.fft.rfft(self.current, self.padded)
+
+    def divide(self) -> None:
+        """Divide pulses into stretches, of which few pulses have few."""
+        self.first = _stretches(self.frame, min(len(self), len(self.data)))
+        self.widths = np.diff(np.append(self.first, self.frame.length))
+        self.__dict__.pop("time_ns", None)
 
     def __len__(self) -> int:
         return len(self.current)
+
+    def entering(self, response: ElectronicsResponse) -> Sides:
+        """The same pulses after what stands before a readout: a stretch of their drift."""
+        if response.drift is None:
+            return self
+        other = copy.copy(self)
+        other.take(response.drifted(self.sim))
+        return other
 
     def of(self, most: int) -> Sides:
         """The first pulses of both sides."""
         if most >= max(len(self), len(self.data)):
             return self
+        return self.some(slice(most))
+
+    def some(self, rows: slice) -> Sides:
+        """Some pulses of both sides."""
         some = copy.copy(self)
-        rows = slice(most)
-        some.current, some.charge, some.spectra = (
-            part[rows] for part in (self.current, self.charge, self.spectra)
+        some.sim, some.current, some.charge, some.spectra = (
+            part[rows] for part in (self.sim, self.current, self.charge, self.spectra)
         )
         some.noise, some.data = self.noise.of(rows), self.data[rows]
-        some.first = _stretches(self.frame, min(len(some), len(some.data)))
-        some.widths = np.diff(np.append(some.first, self.frame.length))
-        some.__dict__.pop("time_ns", None)
+        some.divide()
         return some
 
     @property
@@ -191,7 +210,7 @@ class Difference:
     name: str
     values: Values
     covariance: Values
-    slopes: Values | None = None
+    slopes: Values = field(default_factory=lambda: NONE)
 
     @property
     def chi_square(self) -> float:
@@ -199,6 +218,14 @@ class Difference:
         return float(self.values @ np.linalg.solve(self.covariance, self.values)) / len(
             self.values
         )
+
+    @property
+    def white(self) -> tuple[Values, Values]:
+        """Uncorrelated differences of unit variance, and their derivatives."""
+        root = np.linalg.cholesky(self.covariance)
+        both = np.column_stack([self.values, self.slopes])
+        white = scipy.linalg.solve_triangular(root, both, lower=True)
+        return white[:, 0], white[:, 1:]
 
     @property
     def sliced(self) -> bool:
@@ -220,6 +247,12 @@ class Comparison:
     def __init__(self, sides: Sides, width: float) -> None:
         self.sides, self.width = sides, width
         self.data = sides.view(sides.data.pulses)
+
+    def entering(self, response: ElectronicsResponse) -> Comparison:
+        """The same of pulses after what stands before a readout."""
+        other = copy.copy(self)
+        other.sides = self.sides.entering(response)
+        return other
 
     def differences(self, transfer: Spectrum, basis: Basis | None = None) -> list[Difference]:
         """Compare the pulses translated by a response, with derivatives in a basis if given."""
@@ -266,7 +299,7 @@ class Comparison:
         own = getattr(self.sides.data, by)
         simulated = np.concatenate([getattr(one, by) for one in noisy])
         found = np.quantile(simulated, QUANTILES)
-        apart, slopes = found - np.quantile(own, QUANTILES), None
+        apart, slopes = found - np.quantile(own, QUANTILES), NONE
         errors = np.hypot(
             quantile_errors(own, len(own)), quantile_errors(simulated, len(self.sides))
         )
@@ -306,7 +339,7 @@ class Comparison:
             parts = _covariances(clean_own, noisy_own, w)
             mean = np.einsum("dp,dpf->f", w, noisy_own) / w.sum()
             used = own_data[own_data > 0]
-            difference, derivatives = mean - used @ data / used.sum(), None
+            difference, derivatives = mean - used @ data / used.sum(), NONE
             if moves is not None and moved is not None:
                 each = w[0] / w[0].sum()
                 derivatives = moves.mean(rows, each[:, np.newaxis] * slopes)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import fftconvolve
 
 from cpunet.training.aligned import (
     EARLY,
@@ -83,6 +84,8 @@ class Derivatives:
         self.reversed = basis.changes[::-1].astype(SINGLE)
         self.changes = basis.changes.astype(SINGLE)
         self.values, self.slopes = (sides.view(of) for of in (aligned.pulses, aligned.slopes))
+        level = slice(*(sides.frame.before + at for at in sides.frame.level))
+        self.level = aligned.pulses[:, level].mean(axis=0)
         frame, rows = sides.frame, np.arange(len(aligned))
         height = (aligned.height * heights).astype(SINGLE)[:, np.newaxis]
         weights, _ = cubic(aligned.part)
@@ -159,4 +162,28 @@ class Derivatives:
         found -= weights.T @ self.base[rows]
         found += (weights * self.slopes[rows]).T @ self.time[rows]
         found -= (weights * self.values[rows]).T @ self.span[rows]
+        return np.asarray(found)
+
+    def each(self, matrix: Values) -> Floats:
+        """Change of linear functions of each pulse, shape (pulses, functions, coordinates).
+
+        Parameters
+        ----------
+        matrix
+            Weights of the stretches, shape (stretches, functions).
+        """
+        widths, (n, m) = self.sides.widths, (matrix.shape[1], self.changes.shape[1])
+        weights = np.repeat(matrix / widths[:, np.newaxis], widths, axis=0)
+        kernel = fftconvolve(
+            weights[:, :, np.newaxis], self.basis.changes[::-1, np.newaxis], axes=0
+        )
+        changes = self.currents @ kernel.reshape(-1, n * m).astype(SINGLE)
+        found = changes.reshape(-1, n, m)
+        matrix = matrix.astype(SINGLE)
+        # samples of the level follow the half height, by whole ones
+        falling = np.gradient(self.level).mean()
+        span = self.span + self.time * SINGLE(falling)
+        found -= self.base[:, np.newaxis] * matrix.sum(axis=0)[:, np.newaxis]
+        found += (self.slopes @ matrix)[:, :, np.newaxis] * self.time[:, np.newaxis]
+        found -= (self.values @ matrix)[:, :, np.newaxis] * span[:, np.newaxis]
         return np.asarray(found)

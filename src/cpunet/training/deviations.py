@@ -33,9 +33,9 @@ from scipy.special import expit
 
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
 from cpunet.training.aligned import Values
+from cpunet.training.chain_parameters import SmoothParameters
 from cpunet.training.comparison import MOST, Comparison, Sides, Spectrum
 from cpunet.training.derivatives import Basis
-from cpunet.training.response_problem import SmoothParameters
 
 # Knots in ns: the last one of the dense ones and of all, and how far apart.
 DENSE_NS, LAST_NS, APART_NS, SPARSE_NS, GROWTH = 3000.0, 6800.0, 8.0, 96.0, 1.12

@@ -35,14 +35,14 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import PunetConfig, Recipe
+from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.moments import MIN_PULSES
-from cpunet.training.pulse_sets import SINGLE, Continuum, PulseSets, continuum
-from cpunet.training.response_fit import Fit, fit_response
-from cpunet.training.response_starts import DRIFT, with_settings
+from cpunet.training.pulse_sets import Continuum, PulseSets, continuum
+from cpunet.training.response_fit import DRIFT, Fit, fit_response
 from cpunet.training.run import (
     INFO,
     RUN,
@@ -278,7 +278,6 @@ def match(
     response, fit = fit_response(sets, fitter, known)
     parameters = response.describe()
     stretches = stretched(parameters, fit.gains)
-    counts = [pair for name, pair in fit.bands.items() if name != SINGLE]
     told = asdict(fit) | {
         "checks": fit.checks,
         "parameters": parameters,
@@ -286,8 +285,8 @@ def match(
         "verdict": "; ".join([fit.verdict, *stretches]),
         "causes": fit.checks.causes,
         "in_no_band": {
-            "sim": len(sim) - sum(n for n, _ in counts),
-            "data": len(data) - sum(m for _, m in counts) - fit.data_left_out,
+            "sim": len(sim) - sum(len(band.sim) for band, _ in sets.parted),
+            "data": len(data) - sum(len(band.data) for band, _ in sets.parted),
         },
         "noise": {
             "baselines": noise.noise.n_baselines,

@@ -34,20 +34,10 @@ Rows = npt.NDArray[np.intp]
 SIGMA_PER_MAD = 1.4826
 MIN_PULSES = 200  # minimum number of pulses for a covariance of about a hundred moments
 EDGE_NS = 960.0  # on either side of the half maximum, contains the steepest point
-# Charge drift shapes a pulse up to EARLY_NS from the half maximum, later the electronics.
-# If the simulated physics are wrong, moments may be off by WRONG and LATE standard deviations.
-EARLY_NS, WRONG, LATE = 480.0, 20.0, 2.0
 MIN_SHARE = 0.2  # of the median amplitude; below it, there is no single pulse
 QUIET = 0.05  # of the height; above it before the pulse, there is another pulse
-# Width of the logarithm of the current amplitude in which the peak of the single sites is the
-# highest, and the centres of the bins about it.
-PEAK_WIDTH, ABOUT_PEAK = 0.01, np.linspace(-0.03, 0.02, 10)
 # Maximum number of measured pulses that define the functions, and pulses read at a time.
 DRAWN, BLOCK = 8192, 512
-
-
-class TooFewPulsesError(CpunetError):
-    """There are too few measured pulses to define the functions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +92,6 @@ class Moments:
         Lowest and highest tail slope of the data.  Quality cuts limit it, so simulated pulses
         beyond it are excluded, too: with a fast decay the tails of late pulses are steeper, and
         such a cut removes more of them.
-    balance
-        Makes moments of the bins of the current amplitude which do not depend on how many
-        pulses are in them, shape (bins, moments); then there are no others.  See
-        `single_sites`.
     """
 
     config: MatchingConfig
@@ -122,7 +108,6 @@ class Moments:
     names: tuple[str, ...]
     left_out: int = 0
     slope_range: tuple[float, float] = (-np.inf, np.inf)
-    balance: Values | None = None
 
     @classmethod
     def of_data(
@@ -132,7 +117,7 @@ class Moments:
 
         Raises
         ------
-        TooFewPulsesError
+        CpunetError
             If there are too few pulses.
         """
         whole = np.flatnonzero([np.isfinite(block).all() for block in windows])
@@ -144,7 +129,7 @@ class Moments:
         if usable.any():
             usable &= log_amplitude > _least(log_amplitude[usable])
         if usable.sum() < MIN_PULSES:
-            raise TooFewPulsesError(
+            raise CpunetError(
                 f"{int(usable.sum())} measured pulses can be used; {MIN_PULSES} or more are "
                 "needed: select more energies (`peak`) or give more files"
             )
@@ -210,35 +195,6 @@ class Moments:
         )
         return (readings, beyond) if counts.all() else (readings[counts], beyond[counts])
 
-    def single_sites(self) -> Moments:
-        r"""Only the place and shape of the peak of the single-site pulses.
-
-        How many pulses are in this peak depends on where the gammas come from, the peak does
-        not.  Of the bins :math:`f_k` about it, with shares :math:`p_k` in the data, the moments
-        are :math:`f_k - p_k \sum_j f_j`.
-        """
-        logs = np.sort(self.data.log_amplitude)
-        counts = np.searchsorted(logs, logs + PEAK_WIDTH) - np.arange(len(logs))
-        highest = logs[counts.argmax()] + 0.5 * PEAK_WIDTH
-        bins = np.eye(len(ABOUT_PEAK))
-        peak = replace(
-            self,
-            amplitude_centres=highest + ABOUT_PEAK,
-            amplitude_widths=np.full(len(bins), np.diff(ABOUT_PEAK).max()),
-            balance=bins,
-        )
-        shares = peak.functions(self.data).mean(axis=0)
-        balance = (bins - shares / shares.sum())[:, :-1]  # the last follows from the others
-        peak = replace(peak, balance=balance)
-        return replace(
-            peak,
-            values=peak.functions(self.data),
-            left_out=0,
-            names=tuple(
-                f"current amplitude of single sites, bin {i + 1}" for i in range(len(bins) - 1)
-            ),
-        )
-
     def window(self, last: int) -> RecordWindow:
         """Where records are read whose half maxima are before a sample."""
         return _window(self.config, self.preparation, self.level, last)
@@ -262,25 +218,11 @@ class Moments:
         density = gaussian_bins(
             readings.log_amplitude, self.amplitude_centres, self.amplitude_widths
         )
-        if self.balance is not None:
-            of_bins: Values = density @ self.balance
-            return of_bins
         linear = readings.linear.clip(-limit, limit)
         first = len(self.config.segments) - 1
         squared = linear[:, first : first + self.config.squares] ** 2
         all_of_them: Values = joined([linear, squared, linear[:, -1:] ** 2, density])
         return all_of_them
-
-    @property
-    def model_errors(self) -> Values:
-        """Errors of the moments, in their standard deviations, if the physics are wrong."""
-        if self.balance is not None:
-            return np.zeros(len(self.names))
-        errors = [WRONG if stop <= EARLY_NS else LATE for stop in self.config.segments_ns[1:]]
-        errors += [WRONG] * self.config.components + [0.0]
-        errors += [WRONG] * self.config.squares
-        errors += [0.0] * (len(self.names) - len(errors))
-        return np.array(errors)
 
     @cached_property
     def quantities(self) -> FloatArray:

@@ -17,14 +17,21 @@ import numpy as np
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import ElectronicsResponse, record_length
+from cpunet.networks.response_layer import record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.aligned import Frame
 from cpunet.training.comparison import MOST, Sides
-from cpunet.training.moments import BLOCK, MIN_PULSES, Moments, Rows, TooFewPulsesError, Values
+from cpunet.training.moments import (
+    DRAWN,
+    MIN_PULSES,
+    Moments,
+    Rows,
+    Values,
+    spread,
+)
 from cpunet.training.response_problem import Band
 from cpunet.training.translated import Noise, SimulatedSide
 
@@ -36,9 +43,8 @@ SLICES, IN_SLICE = 32, 50
 CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
 HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
 MIN_OF_BAND = 400  # minimum number of pulses of a band if only some of a set are taken
-SINGLE = "single sites of the continuum"  # name of their band
-# Draws of the noise of single sites, of which there are few, for each of other pulses.
-MORE_DRAWS = 4
+
+SINGLE = "single sites of the continuum"
 
 Continuum = Callable[[], tuple[InputSet, InputSet]]
 
@@ -230,47 +236,50 @@ class PulseSets:
             some.append(self._band(band, *chosen))
         return some
 
-    def sides(self, response: ElectronicsResponse) -> list[Sides]:
-        """Pulses of both sides in each band for the comparison at every sample.
+    @property
+    def names(self) -> list[str]:
+        """Names of the bands."""
+        return [band.name for band, _ in self.parted]
 
-        The simulated ones have passed what stands before the readout.
-        """
-        preparation, training = self.recipe.preparation, self.recipe.matching.training
-        frame, found = Frame.of(training), []
-        for band, orders in self.parted:
-            some, of_data = (order[:MOST] for order in orders)
-            weights = band.weights[some]
-            if np.ptp(weights) > 0:  # each as often as its weight says, to a whole number
-                share = np.cumsum(weights) / weights.sum()
-                places = (np.arange(len(some)) + 0.5) / len(some)
-                some = some[np.searchsorted(share, places)]
-            sim = self.sim[band.sim[some]]
-            data = self.data.waveforms[band.data[of_data]]  # in random order, as the simulated
-            data = data[np.isfinite(data).all(axis=1)]
-            length = record_length(sim.waveforms.shape[1], sim.dt_ns)
-            drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)
-            noise = Noise.draw(self.noise, *drawn)
-            entering = _entering(response, sim.waveforms)
-            found.append(Sides(entering, data, noise, frame, preparation.tail_level))
+    @property
+    def tail_slope(self) -> float:
+        """Median slope per sample of the logarithm of the data's tails."""
+        samples = self.recipe.preparation.decay_fit_samples
+        lever = np.arange(samples) - 0.5 * (samples - 1)
+        tails = self.data.waveforms[spread(len(self.data), DRAWN), -samples:]
+        slopes = np.log(np.maximum(tails, 1e-3)) @ (lever / (lever @ lever))
+        return float(np.nanmedian(slopes))
+
+    def sides(self) -> list[Sides]:
+        """Pulses of both sides in each band, for the comparison at every sample."""
+        found = []
+        for band, (of_sim, of_data) in self.parted:
+            data = self.data.waveforms[band.data[of_data[:MOST]]]
+            some = of_sim[:MOST]
+            found.append(self._sides(self.sim, band.sim[some], data, band.weights[some]))
         return found
 
-    def single_sites(self) -> list[Band]:
-        """Single sites of the continuum, whose peak of the current amplitude is compared.
-
-        There are none if the pulses are too few.
-        """
+    def single_sites(self) -> list[Sides]:
+        """Pulses of the continuum, whose single sites are compared; none if they are few."""
         if self.continuum is None:
             return []
         sim, data = (side.prepared.pulses for side in self.continuum())
-        _, training = self.recipe.matching
-        try:
-            moments = Moments.of_data(data.waveforms, training, self.recipe.preparation)
-        except TooFewPulsesError:
+        rows, of_data = (self.rng.permutation(len(side))[:MOST] for side in (sim, data))
+        if min(len(rows), len(of_data)) < MIN_PULSES:
             return []
-        weights = spectrum_weights(sim.energy_kev, data.energy_kev)
-        draws = MORE_DRAWS * training.noise_sets
-        translated = self._translated(sim, moments.single_sites(), weights, draws)
-        return [Band(SINGLE, translated, np.arange(len(sim)))]
+        weights = spectrum_weights(sim.energy_kev[rows], data.energy_kev[of_data])
+        return [self._sides(sim, rows, data.waveforms[of_data], weights)]
+
+    def _sides(self, sim: Pulses, rows: Rows, data: FloatArray, weights: Values) -> Sides:
+        preparation, training = self.recipe.preparation, self.recipe.matching.training
+        if np.ptp(weights) > 0:  # each as often as its weight says, to a whole number
+            share = np.cumsum(weights) / weights.sum()
+            rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
+        sim, data = sim[rows], data[np.isfinite(data).all(axis=1)]
+        length = record_length(sim.waveforms.shape[1], sim.dt_ns)
+        drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)
+        noise, frame = Noise.draw(self.noise, *drawn), Frame.of(training)
+        return Sides(sim.waveforms, data, noise, frame, preparation.tail_level)
 
     def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
         _, training = self.recipe.matching
@@ -289,11 +298,3 @@ class PulseSets:
         length = record_length(sim.waveforms.shape[1], sim.dt_ns)
         drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
         return SimulatedSide(sim.waveforms, drawn, moments, weights)
-
-
-def _entering(response: ElectronicsResponse, sim: FloatArray) -> FloatArray:
-    """Simulated pulses as they enter the readout."""
-    if response.drift is None:
-        return sim
-    parts = (sim[first : first + BLOCK] for first in range(0, len(sim), BLOCK))
-    return np.concatenate([response.drifted(part) for part in parts])

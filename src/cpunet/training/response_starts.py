@@ -10,17 +10,15 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import ResponseConfig
+from cpunet.training.chain_parameters import with_decay, with_settings
 from cpunet.training.fitter import Fitted, Fitter, held_out_gain
-from cpunet.training.moments import stretch_name
-from cpunet.training.response_problem import STRETCH, ResponseProblem
+from cpunet.training.response_problem import ResponseProblem
 
 # A ringing must lower chi-square to this fraction, and promise the next: derivatives
 # far from the minimum underestimate the decrease.
@@ -45,63 +43,6 @@ MIN_DECAY_ERROR = 0.01
 ONSET_NS, OFF = -240.0, 4.0
 
 
-def from_known(
-    first: ResponseProblem, known: ElectronicsResponse, fitter: Fitter
-) -> Fitted | None:
-    """Fit from a known response, first as if the data were near; None if the fit is poor.
-
-    Its main decay is kept or replaced by that of the data, whichever fits them better: tails of
-    a response with several decays do not follow the main one.
-    """
-    start = copy.deepcopy(known)
-    set_decay(start, first.slope, fitter.decay)
-    starts = [first.of(start)]
-    if fitter.decay is None:
-        starts.append(first.of(copy.deepcopy(known)))
-    problem = min(starts, key=lambda start: start.cost)
-    for coarse in (False, True):
-        found = fitter.fit(problem, coarse=coarse)
-        if not found.poor:
-            return found
-    return None
-
-
-def from_start(
-    first: ResponseProblem, config: ResponseConfig, fitter: Fitter, factor: float
-) -> Fitted:
-    """Fit from the recipe's chain, with its poles times a factor and the data's decay."""
-    start = ElectronicsResponse(config, float(first.response.dt_ns))
-    start.log_poles_ns += math.log(factor)
-    set_decay(start, first.slope)
-    return fitter.fit(first.of(start))
-
-
-def onset_is_off(problem: ResponseProblem) -> bool:
-    """Whether pulses begin differently than simulated, which physics can cause, but no readout.
-
-    If only later parts are off, the data contain effects that no readout chain has, such as
-    pile-up in their tails, and the edge can still be trusted.
-    """
-    edges = problem.bands[0].moments.config.segments_ns
-    onset = {stretch_name(a, b) for a, b in pairwise(edges) if b <= ONSET_NS}
-    pulls = problem.pulls(problem.parameters.vector())
-    named = zip(problem.names, pulls, strict=True)
-    return any(abs(pull) > OFF for name, pull in named if name.split(": ")[-1] in onset)
-
-
-def drift_if_better(found: Fitted, fitter: Fitter) -> Fitted:
-    """Stretch the simulated drift by one more parameter if that gains."""
-    response = found.problem.response
-    terms = response.config.drift_terms + 1
-    if terms > fitter.training.drift_terms:
-        return found
-    tried = with_settings(response, drift_terms=terms)
-    again = fitter.fit(found.problem.of(tried), coarse=terms == 1)
-    assert tried.drift is not None
-    sane = np.abs(tried.drift.stretch).max() < MAX_STRETCH
-    return again if sane and gains(DRIFT[terms], found, again, fitter) else found
-
-
 def gains(part: str, before: Fitted, after: Fitted, fitter: Fitter) -> bool:
     """Whether a part that was added lowers chi-square, that of held-out pulses, too."""
     if after.cost > before.cost - ADDS:
@@ -110,21 +51,6 @@ def gains(part: str, before: Fitted, after: Fitted, fitter: Fitter) -> bool:
     gain = held_out_gain(cases, before.problem.bands, fitter)
     fitter.gains[part] = f"{'kept' if gain.best else 'left out'}; {gain}"
     return gain.best > 0
-
-
-def drift_if_needed(found: Fitted, fitter: Fitter) -> Fitted:
-    """Take the drift as simulated if what stretches it is 0 within its errors.
-
-    It may have been added before a ringing was found.
-    """
-    problem, parameters = found.problem, found.problem.parameters
-    stretch = [i for i, label in enumerate(parameters.labels) if label == STRETCH]
-    errors = np.sqrt(np.diagonal(found.covariance)[stretch])
-    if not stretch or (np.abs(parameters.vector()[stretch]) > SURE * errors).any():
-        return found
-    simulated = problem.of(with_settings(problem.response, drift_terms=0))
-    again = fitter.fit(simulated, coarse=False)
-    return again if again.cost < found.cost + ADDS else found
 
 
 def with_free_decay(problem: ResponseProblem, fitter: Fitter) -> Fitted | None:
@@ -166,7 +92,7 @@ def _free_decay_starts(
             shares = (min(max(share, MIN_SHARE), MAX_SHARE),)
         for share in shares:
             response = ElectronicsResponse(config, dt_ns)
-            set_decay(response, problem.slope + dt_us * share * steeper, decay)
+            with_decay(response, problem.slope + dt_us * share * steeper, decay)
             response.log_poles_ns[:] = known.log_poles_ns
             if with_slow:
                 kept = [tau in config.slow_ns for tau in known.config.slow_ns]
@@ -236,27 +162,3 @@ def most_promising_ringing(
         if float(left @ left) < best[1]:
             best = response, float(left @ left)
     return best
-
-
-def with_settings(response: ElectronicsResponse, **settings: Any) -> ElectronicsResponse:
-    """A copy of a response with other parts, which have no effect yet."""
-    config = response.config.model_copy(update=settings)
-    copied = ElectronicsResponse(config, float(response.dt_ns))
-    known = response.arrays()
-    for name, values in copied.arrays().items():
-        if name in known:
-            n = min(values.size, known[name].size)
-            values.reshape(-1)[:n] = known[name].reshape(-1)[:n]
-    copied.decay_known = response.decay_known
-    return copied
-
-
-def set_decay(
-    response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
-) -> None:
-    """Set the main decay to that of the data: known from pile-up, or from the tails."""
-    if decay is not None:
-        response.log_decay_us[:] = math.log(decay.us)
-        response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)
-    elif slope < 0:
-        response.log_decay_us[:] = math.log(-float(response.dt_ns) * 1e-3 / slope)

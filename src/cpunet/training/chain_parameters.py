@@ -1,0 +1,257 @@
+"""The parameters of a chain as a vector, on which pulses depend nearly linearly."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.fft
+
+from cpunet.electronics.drawn_pile_up import KnownDecay
+from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, deviation_lags
+from cpunet.training.aligned import Values
+from cpunet.training.derivatives import Basis
+
+POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"
+# Widths of the priors around the start: wide for times (in their logarithm).
+TIME_WIDTH = 1.0
+# The same for the stretch of the drift, and for its change per us.
+STRETCH, STRETCH_WIDTHS = "drift.stretch", (0.1, 0.05)
+# The same of what is no time: half of the charge may be slow, and the main decay dominates.
+SCALES = {DECAY_WEIGHTS: 0.03, "ringing": 0.3, "slow_weights": 0.1}
+# Step of differences in widths of the priors, for what is computed in double precision.
+STEP = 1e-5
+
+
+class Parameters:
+    """The parameters of a response as one vector, with their priors.
+
+    Parameters
+    ----------
+    response
+        Response with the parameters; their current values are the centres of the priors.
+    """
+
+    response: ElectronicsResponse
+
+    def __init__(self, response: ElectronicsResponse) -> None:
+        self.response = response
+        named = response.parameters.items()
+        self.labels = [n for n, p in named for _ in p]
+        self._names = [f"{n}.{i}" for n, p in named for i in range(1, len(p) + 1)]
+        self.centre = self.vector()
+        self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
+        if response.decay_known is not None:
+            self.widths[self.labels.index(DECAY)] = response.decay_known
+        self.longest = self.widths.copy()
+        self.low = np.full(len(self.centre), -np.inf)
+        self.high = -self.low
+        self.stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
+        self.widths[self.stretched] = STRETCH_WIDTHS[: len(self.stretched)]
+
+    def vector(self) -> Values:
+        """Parameters as one vector."""
+        return np.concatenate([*self.response.parameters.values()])
+
+    def set(self, vector: Values) -> None:
+        """Set the parameters of the response from a vector."""
+        first = 0
+        for part in self.response.parameters.values():
+            part[:] = vector[first : first + len(part)]
+            first += len(part)
+
+    def slopes_of_transfer(self, padded: int) -> list[tuple[float, Spectrum]]:
+        """Widths of all parameters but a stretch, and how the spectrum changes with each."""
+        found: list[tuple[float, Spectrum]] = []
+        for i, label in enumerate(self.labels):
+            if label != STRETCH:
+                a, b, step = self.ends(i)
+                change = (b.transfer(padded) - a.transfer(padded)) / step
+                found.append((float(self.widths[i]), change))
+        return found
+
+    def basis(self, padded: int) -> Basis:
+        """Changes of the step response with each parameter but a stretch."""
+        lags = deviation_lags(float(self.response.dt_ns))
+        changes = np.array([change for _, change in self.slopes_of_transfer(padded)])
+        steps = scipy.fft.irfft(changes, padded)
+        return Basis(int(lags[0]), np.ascontiguousarray(steps[:, lags].T))
+
+    def stretches(self, step: float) -> list[tuple[ElectronicsResponse, ElectronicsResponse]]:
+        """Copies of the response with each term of a stretch smaller and larger by a step."""
+        found = []
+        for i in self.stretched:
+            ends = copy.deepcopy(self.response), copy.deepcopy(self.response)
+            for end, sign in zip(ends, (-1, 1), strict=True):
+                assert end.drift is not None
+                end.drift.stretch[i - self.stretched[0]] += sign * step
+            found.append(ends)
+        return found
+
+    def ends(self, i: int) -> tuple[ElectronicsResponse, ElectronicsResponse, float]:
+        """Copies of the response on both sides of it along one coordinate, and their distance.
+
+        What they compute in double precision differs in proportion.
+        """
+        here, step, ends = self.vector(), STEP * self.widths[i], []
+        low, high = max(here[i] - step, self.low[i]), here[i] + step
+        for end in (low, high):
+            there = here.copy()
+            there[i] = end
+            self.set(there)
+            ends.append(copy.deepcopy(self.response))
+        self.set(here)
+        return ends[0], ends[1], high - low
+
+    def by_name(self, values: Values) -> dict[str, float]:
+        """Values of the parameters by name and number."""
+        return dict(zip(self._names, values.tolist(), strict=True))
+
+
+SLOWEST = -0.99  # rate of the slowest decay: a hundred times slower than at the start
+SQUARE_WIDTH = 0.25  # of the prior for the square of half the difference of two logarithms
+
+
+class SmoothParameters(Parameters):
+    r"""The parameters in coordinates on which pulses depend nearly linearly.
+
+    Two poles act alike: pulses depend on the mean of their logarithms and on the *square* of
+    their difference, and each pair is replaced by these.  Where two poles are equal,
+    derivatives with respect to the difference vanish, and steps along it go astray.
+
+    Tails depend on the rate of the main decay times its share.  With the shares :math:`a_i` of
+    the faster ones, its time :math:`\tau` is replaced by
+
+    .. math:: r = \Big(1 - \sum_i a_i\Big) \left(\frac{\tau_0}{\tau} - 1\right).
+
+    Tails determine all these together a hundred times better than each.  In other coordinates,
+    a step from one to another would curve out of this valley.
+
+    Parameters
+    ----------
+    response
+        Response with the parameters.
+    start
+        Response on whose values the priors of the same parameters are centred; those of others
+        on the current ones.  Its decay is :math:`\tau_0`.
+    poles
+        Whether the poles are replaced, too.
+    """
+
+    _pairs: Sequence[tuple[int, int]] = ()
+    _decay: int | None = None
+
+    def __init__(
+        self,
+        response: ElectronicsResponse,
+        start: ElectronicsResponse | None = None,
+        *,
+        poles: bool = True,
+    ) -> None:
+        super().__init__(response)
+        known = {} if start is None else (own := Parameters(start)).by_name(own.centre)
+        current = self.by_name(self.centre)
+        centre = np.array([known.get(name, value) for name, value in current.items()])
+        of_poles = [i for i, label in enumerate(self.labels) if poles and label == POLES]
+        self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
+        self._plain_widths = self.widths.copy()
+        for mean, square in self._pairs:
+            self.widths[mean] /= np.sqrt(2)
+            self.widths[square] = self.longest[square] = SQUARE_WIDTH
+            self.low[square] = 0.0
+        self._shares = np.array([label == DECAY_WEIGHTS for label in self.labels])
+        if DECAY in self.labels:
+            self._decay = self.labels.index(DECAY)
+            self._log_reference = centre[self._decay]
+            self.low[self._decay] = SLOWEST
+        self.centre = self._of(centre)
+
+    def vector(self) -> Values:
+        """Coordinates of the current response."""
+        return self._of(super().vector())
+
+    def set(self, vector: Values) -> None:
+        """Set the response from its coordinates."""
+        plain = vector.copy()
+        for mean, square in self._pairs:
+            half = np.sqrt(max(vector[square], 0.0))
+            plain[mean], plain[square] = vector[mean] + half, vector[mean] - half
+        if (i := self._decay) is not None:
+            rate = 1 + vector[i] / self._main_share(vector)
+            plain[i] = self._log_reference - np.log(max(rate, 1 + SLOWEST))
+        super().set(plain)
+
+    def covariance(self, information: Values) -> Values:
+        """Covariance of the parameters themselves, which have priors of their own.
+
+        Parameters
+        ----------
+        information
+            What the data alone tell of the coordinates: products of the derivatives of all
+            residuals but those of the priors.
+        """
+        turn = self.turn()
+        plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
+        return np.asarray(np.linalg.inv(plain), float)
+
+    def turn(self) -> Values:
+        """Derivatives of the coordinates in the parameters themselves, here."""
+        here = self.vector()
+        turn = np.eye(len(here))
+        for mean, square in self._pairs:
+            half = np.sqrt(max(here[square], 0.0))
+            turn[mean, [mean, square]] = 0.5
+            turn[square, [mean, square]] = half, -half
+        if (i := self._decay) is not None:
+            share = self._main_share(here)
+            turn[i, self._shares] = -here[i] / share
+            turn[i, i] = -(share + here[i])
+        return turn
+
+    def _of(self, plain: Values) -> Values:
+        """Coordinates of a vector of parameters."""
+        place = plain.copy()
+        for mean, square in self._pairs:
+            first, second = plain[mean], plain[square]
+            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
+        if (i := self._decay) is not None:
+            rate = np.expm1(self._log_reference - plain[i])
+            place[i] = self._main_share(plain) * rate
+        return place
+
+    def _main_share(self, plain: Values) -> float:
+        """Share of the main decay."""
+        return float(1 - plain[self._shares].sum())
+
+
+# Minimum relative error of a main decay known from pile-up tails: these are fitted
+# with one exponential, and a readout may have more.
+MIN_DECAY_ERROR = 0.01
+
+
+def with_decay(
+    response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
+) -> ElectronicsResponse:
+    """A response, its main decay set to that of the data: by pile-up, or by the tails."""
+    if decay is not None:
+        response.log_decay_us[:] = math.log(decay.us)
+        response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)
+    elif slope < 0:
+        response.log_decay_us[:] = math.log(-float(response.dt_ns) * 1e-3 / slope)
+    return response
+
+
+def with_settings(response: ElectronicsResponse, **settings: Any) -> ElectronicsResponse:
+    """A copy of a response with other parts, which have no effect yet."""
+    config = response.config.model_copy(update=settings)
+    copied = ElectronicsResponse(config, float(response.dt_ns))
+    known = response.arrays()
+    for name, values in copied.arrays().items():
+        if name in known:
+            n = min(values.size, known[name].size)
+            values.reshape(-1)[:n] = known[name].reshape(-1)[:n]
+    copied.decay_known = response.decay_known
+    return copied

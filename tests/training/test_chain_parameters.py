@@ -1,0 +1,61 @@
+"""The coordinates of a chain in which it is fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.chain_parameters import Parameters, SmoothParameters
+from synthetic import load_recipe
+
+DT_NS = 16.0
+
+
+def response(poles_ns: tuple[float, float], slow: float) -> ElectronicsResponse:
+    few = ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"]
+    made = ElectronicsResponse(load_recipe("fast", few).matching[0], DT_NS)
+    made.log_poles_ns[...] = np.log(poles_ns)
+    made.log_decay_us.fill(float(np.log(80.0)))
+    made.slow_weights.fill(slow)
+    return made
+
+
+def test_coordinates_are_those_of_the_poles_and_back() -> None:
+    made = response((60.0, 40.0), 0.05)
+    smooth, plain = SmoothParameters(made), Parameters(made)
+    place, vector = smooth.vector(), plain.vector()
+    np.testing.assert_allclose(place[0], np.log(2400) / 2)
+    np.testing.assert_allclose(place[1], (np.log(1.5) / 2) ** 2)
+    smooth.set(place + np.array([0, -1, 0, 0]))  # below 0 there are no real poles
+    np.testing.assert_allclose(np.exp(made.log_poles_ns), 2400**0.5)
+    smooth.set(place)
+    np.testing.assert_allclose(np.exp(made.log_poles_ns), [60, 40])
+    # derivatives of the coordinates with the parameters
+    slopes = []
+    for i in range(4):
+        plain.set(vector + 1e-6 * np.eye(4)[i])
+        slopes.append((smooth.vector() - place) / 1e-6)
+    plain.set(vector)
+    known = np.diag([1e4, 1e6, 1e4, 1e6])
+    by_parameters = np.array(slopes) @ known @ np.transpose(slopes)
+    covariance = np.linalg.inv(by_parameters + np.diag(plain.widths**-2.0))
+    np.testing.assert_allclose(smooth.covariance(known), covariance, rtol=1e-4, atol=1e-9)
+
+
+def test_coordinates_are_those_of_the_decays_and_back() -> None:
+    made = ElectronicsResponse(load_recipe("fast").matching[0], DT_NS)
+    smooth, plain = SmoothParameters(made, poles=False), Parameters(made)
+    decay = plain.labels.index("log_decay_us")
+    vector = plain.vector()
+    vector[decay] += np.log(0.8)
+    vector[-2:] = 0.05, -0.02
+    plain.set(vector)
+    place = smooth.vector()
+    assert place[decay] == pytest.approx(0.97 * 0.25)
+    smooth.set(place)
+    np.testing.assert_allclose(plain.vector(), vector, rtol=1e-12)
+    steps = 1e-6 * np.eye(len(vector))
+    moved = [plain.set(vector + step) or smooth.vector() for step in steps]
+    plain.set(vector)
+    np.testing.assert_allclose(smooth.turn().T, (np.array(moved) - place) / 1e-6, atol=1e-5)
