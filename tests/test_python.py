@@ -18,7 +18,7 @@ from cpunet.recipes import load_recipe
 from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {
-    "training.steps": 1,
+    "training.steps": 20,
     "training.components": 4,
     "training.squares": 2,
     "training.start_factors": [1],

@@ -50,6 +50,7 @@ def layer(poles: tuple[float, ...], ringing: dict | None = None) -> ElectronicsR
         ringing_ns=RINGING["damping_ns"],
         drift_terms=0,
         deviations=False,
+        by_height=False,
     )
     response = ElectronicsResponse(config, DT_NS)
     response.slow_weights[1] = 0.065

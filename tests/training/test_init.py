@@ -96,7 +96,8 @@ def poles(run: Path) -> list[float]:
 def test_a_run_tells_of_its_fit(chain) -> None:
     fit = json.loads((chain / "run.json").read_text())["fit"]
     assert Run.load(chain).fit.model_dump(exclude_unset=True) == fit
-    assert fit["chi_square"] < 1.6 * fit["moments"] == 1.6 * len(fit["pulls"])
+    assert fit["chi_square"] < 1.6 * fit["moments"]
+    assert max(map(abs, fit["pulls"].values())) < 5
     assert fit["in_no_band"] == {"sim": 0, "data": 0}
     assert np.hypot(*poles(chain)) == pytest.approx(4 * 16, rel=0.05)
     assert fit["parameters"]["decay_us"] == pytest.approx(64, rel=0.02)

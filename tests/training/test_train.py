@@ -73,7 +73,8 @@ def test_sets_of_different_sampling(sim_set, files):
     with pytest.raises(CpunetError) as error:
         require_same_sampling(sim_set, other)
     assert str(error.value) == (
-        f"{files[0].path}: sampled every 16 ns, but other.lh5 every 10 ns; resample one of them"
+        f"{files[0].path}: sampled every 16 ns, but other.lh5 every 10 ns; "
+        "resample one of them, or give `dt_ns` if one says it wrongly"
     )
 
 

@@ -98,6 +98,13 @@ class ReadoutNoise(Config):
     spectrum: NoiseSpectrum
 
 
+class Nonlinearity(Config):
+    """What a digitiser adds to a height, as a fraction of its range: a sine of some waves."""
+
+    fraction: Fraction
+    waves: Annotated[int, Field(ge=1, le=20)]
+
+
 class OtherPulses(Config):
     """Rate of the pulses before a trace, or within its record."""
 
@@ -143,6 +150,12 @@ class Electronics(Config):
         Time before the pulse and of the whole record in ns, which are rounded to whole samples.
     dt_ns
         Sampling period in ns, 1 to 200. A sample is the mean over one period.
+    slew_kev_per_ns
+        Rate of an amplifier's output that it cannot exceed, or null; a step of d keV per period
+        becomes ``s tanh(d / s)`` of the limit s.
+    nonlinearity
+        Integral non-linearity of the digitiser: fraction of its range by which counts are off,
+        and waves of the sine that they follow over the range; null for none.
     """
 
     name: str
@@ -165,6 +178,8 @@ class Electronics(Config):
     before_ns: Positive
     record_ns: Positive
     dt_ns: Annotated[float, Field(ge=1, le=200)]
+    slew_kev_per_ns: Positive | None = None
+    nonlinearity: Nonlinearity | None = None
 
     @model_validator(mode="after")
     def _is_possible(self) -> Electronics:

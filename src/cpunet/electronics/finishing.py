@@ -6,7 +6,8 @@ anew once noise is added.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -84,6 +85,7 @@ def with_room(
 
 
 RecordNoise = BaselineNoise | TraceNoise
+ByHeight = Callable[[npt.NDArray[Any], npt.NDArray[np.float64]], npt.NDArray[Any]]
 
 
 class Finished(NamedTuple):
@@ -116,6 +118,7 @@ def finish(
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,
+    by_height: ByHeight | None = None,
 ) -> Finished:
     """Align and normalise noise-free records as measured traces are, optionally with noise.
 
@@ -141,6 +144,9 @@ def finish(
         Seed or random generator of the noise.
     added
         Added together with the noise, in prepared units, shape ``(n, samples)``.
+    by_height
+        What the electronics do to records in units of the charge with their noise, given the
+        energies.
 
     Raises
     ------
@@ -160,6 +166,9 @@ def finish(
     codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
     for rows in blocks(n):
         block = records[rows]
+        if by_height is not None:
+            assert energy_kev is not None  # what a height is
+            block = by_height(block, energy_kev[rows])
         clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
         codes[rows] = clean.codes
         kept = np.arange(n)[rows][clean.index]
@@ -172,7 +181,11 @@ def finish(
             drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
             if added is not None:
                 drawn += added[kept]
-            raw = Pulses.of(np.asarray(level + drawn, np.float32), dt_ns=dt_ns)
+            noisy_records = np.asarray(level + drawn, np.float32)
+            if by_height is not None:
+                charge = records[rows][clean.index] + drawn * height
+                noisy_records = np.asarray(by_height(charge, energy_kev[kept]), np.float32)
+            raw = Pulses.of(noisy_records, dt_ns=dt_ns)
             prepared = prepare(raw, config, "measured")
             codes[kept] = prepared.codes
             noisy[kept[prepared.index]] = prepared.pulses.waveforms

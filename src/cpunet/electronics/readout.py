@@ -192,6 +192,36 @@ class RawTraces(Pulses):
     piled_ns: FloatArray
 
 
+def by_height(signal_kev: FloatArray, electronics: Electronics) -> FloatArray:
+    """Signals as an amplifier of limited slew rate and a digitiser leave them.
+
+    Parameters
+    ----------
+    signal_kev
+        Height in keV, shape (pulses, samples).
+    """
+    result = np.array(signal_kev, float)
+    if electronics.slew_kev_per_ns is not None:
+        limit = electronics.slew_kev_per_ns * electronics.dt_ns
+        for i in range(1, result.shape[1]):
+            ahead = result[:, i] - result[:, i - 1]
+            result[:, i] = result[:, i - 1] + limit * np.tanh(ahead / limit)
+    if (off := electronics.nonlinearity) is not None:
+        full = electronics.adc_top / electronics.gain_adc_per_kev
+        result += off.fraction * full * np.sin(2 * np.pi * off.waves * result / full)
+    return result
+
+
+def of_energy(
+    response: FloatArray, energy_kev: FloatArray, electronics: Electronics
+) -> FloatArray:
+    """Noise-free pulses in units of the charge, with what acts by their height."""
+    if electronics.slew_kev_per_ns is None and electronics.nonlinearity is None:
+        return response
+    kev = energy_kev[:, np.newaxis]
+    return by_height(kev * response, electronics) / kev
+
+
 def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     """Pass ideal pulses through a readout chain; energies have the resolution of the chain.
 
@@ -237,6 +267,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     unit = coloured_noise(spectrum, n, length, dt_ns, noise)
     total_kev = energy[:, None] * response + added_kev
     total_kev += unit * np.float32(electronics.noise.rms_kev)
+    total_kev = by_height(total_kev, electronics)
     baseline = level.normal(
         electronics.baseline_mean_adc, electronics.baseline_spread_adc, size=n
     )
@@ -258,7 +289,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         peak=pulses.peak,
         t0_ns=np.zeros(n),
         flag=flag,
-        response=response.astype(np.float32),
+        response=of_energy(response, energy, electronics).astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
         tails_kev=tails_kev,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.readout import SATURATED, read_out
+from cpunet.electronics.readout import SATURATED, of_energy, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.progress import stage
@@ -381,7 +381,8 @@ def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: St
         for fine, label, hits in side.blocks("Simulated events", library):
             writer.append(_block_means(fine, per_sample))
             writer.append_rows(HIT_TABLE, hit_columns(hits))
-            truth.write(linear_response(fine, electronics).astype(np.float32).tobytes())
+            true = of_energy(linear_response(fine, electronics), fine.energy_kev, electronics)
+            truth.write(true.astype(np.float32).tobytes())
             labels.append(label)
         simulation = {"cpunet": cpunet.__version__, **side.provenance()}
         simulation["settings"] |= {"dt_ns": electronics.dt_ns}  # that of the means

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -53,6 +54,8 @@ from cpunet.pulses.writing import written_hdf5
 from cpunet.training.run import RunLike, used_run
 from cpunet.translation.translator import BATCH, REN
 
+log = logging.getLogger(__name__)
+
 
 class TemplateTranslator:
     """Translates templates without noise; sample k of the result is at the time of sample k.
@@ -78,6 +81,11 @@ class TemplateTranslator:
             raise CpunetError(
                 "the run's network translates whole pulses, not the templates that they are "
                 "summed from; give a run of the recipe fast"
+            )
+        if ren.backend.by_height is not None:
+            log.warning(
+                "templates are summed, and get the linear part of the readout alone: its slew "
+                "rate and curve act on the sums"
             )
         self._chain = copy.deepcopy(ren.backend.chain)
         self._chain.response.dt_ns[...] = dt_ns

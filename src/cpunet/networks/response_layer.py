@@ -18,6 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from cpunet.electronics.finishing import padding as padding
 from cpunet.electronics.finishing import record_length as record_length
+from cpunet.networks.by_height import ByHeight
 from cpunet.networks.stored import Stored
 from cpunet.recipes.schema import ResponseConfig
 
@@ -214,6 +215,7 @@ class ElectronicsResponse(Stored):
         # weights of sine and cosine; frequency in MHz and damping in ns
         self.ringing, self.log_ringing = np.zeros(len(rings)), np.log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
+        self.by_height = ByHeight() if config.by_height else None
         if config.deviations:
             lags = len(deviation_lags(dt_ns))
             self.deviation_dt_ns = float(dt_ns)  # the response itself may be sampled otherwise
@@ -226,7 +228,7 @@ class ElectronicsResponse(Stored):
         return {
             name: values
             for name, values in self.arrays().items()
-            if name not in fixed and len(values)
+            if name not in fixed and not name.startswith("by_height") and len(values)
         }
 
     def set_deviation(self, deviation: Values, draws: Values | None = None) -> None:
@@ -377,6 +379,8 @@ class ElectronicsResponse(Stored):
         told = {name: value for name, (_, value) in self.named().items()}
         if self.config.deviations:
             told["deviation"] = float(np.abs(self.deviation).max())
+        if self.by_height is not None:
+            told |= self.by_height.describe(float(self.dt_ns))
         return told
 
 

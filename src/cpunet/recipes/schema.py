@@ -75,7 +75,8 @@ class ResponseConfig(Config):
     values of free times, too.  ``drift_terms`` is the number of parameters that stretch the
     simulated drift, see `cpunet.networks.response_layer`; 0 for the drift as simulated.
     ``deviations`` are those of the step response from that of the chain, which are added where
-    the pulses ask for them.
+    the pulses ask for them; ``by_height`` is what the electronics do by the height of a pulse,
+    see `cpunet.networks.by_height`.
     """
 
     name: Literal["response"]
@@ -88,6 +89,7 @@ class ResponseConfig(Config):
     ringing_ns: Positive
     drift_terms: DriftTerms
     deviations: bool
+    by_height: bool
 
     @field_validator("slow_ns", "fast_decays_us")
     @classmethod

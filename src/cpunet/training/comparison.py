@@ -19,6 +19,7 @@ draws of opposite sign leave of the simulated noise.  Compared are
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -29,6 +30,7 @@ import scipy.fft
 import scipy.linalg
 
 from cpunet.electronics.finishing import padding
+from cpunet.networks.by_height import ByHeight
 from cpunet.networks.response_layer import ElectronicsResponse, padded_length
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Floats, Frame, Values, read
@@ -36,6 +38,8 @@ from cpunet.training.derivatives import Basis, Derivatives
 from cpunet.training.translated import PLATEAU_NS, Noise
 
 Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
+# Derivatives of pulses that are aligned, in coordinates of whatever moves these.
+Moved = Callable[["Sides", Aligned], Any]
 
 MOST = 4096  # pulses of each side that are compared
 # Times in ns from the half height between which every sample is compared, shortest and longest
@@ -71,6 +75,8 @@ class Sides:
         What is read.
     tail_level
         Height of the plateau of a prepared pulse, which the noise refers to.
+    energy_kev
+        Energies of the simulated pulses.
 
     Attributes
     ----------
@@ -80,12 +86,23 @@ class Sides:
         Measured pulses that are single.
     left_out
         Number of the others.
+    by_height
+        What the electronics do by the height of a pulse.
     """
 
+    by_height: ByHeight | None = None
+
     def __init__(
-        self, sim: FloatArray, data: FloatArray, noise: Noise, frame: Frame, tail_level: float
+        self,
+        sim: FloatArray,
+        data: FloatArray,
+        noise: Noise,
+        frame: Frame,
+        tail_level: float,
+        energy_kev: Values,
     ) -> None:
         self.frame, self.noise, self.tail_level = frame, noise, tail_level
+        self.energy_kev = energy_kev
         self.before, self.behind = padding(frame.dt_ns)
         self.length = sim.shape[1] + self.before + self.behind
         self.padded = padded_length(self.length)
@@ -117,11 +134,13 @@ class Sides:
         return len(self.current)
 
     def entering(self, response: ElectronicsResponse) -> Sides:
-        """The same pulses after what stands before a readout: a stretch of their drift."""
-        if response.drift is None:
+        """The same pulses around a readout: drift stretched, and what acts by their height."""
+        if response.drift is None and response.by_height is self.by_height:
             return self
         other = copy.copy(self)
-        other.take(response.drifted(self.sim))
+        other.by_height = response.by_height
+        if response.drift is not None:
+            other.take(response.drifted(self.sim))
         return other
 
     def of(self, most: int) -> Sides:
@@ -136,6 +155,7 @@ class Sides:
         some.sim, some.current, some.charge, some.spectra = (
             part[rows] for part in (self.sim, self.current, self.charge, self.spectra)
         )
+        some.energy_kev = self.energy_kev[rows]
         some.noise, some.data = self.noise.of(rows), self.data[rows]
         some.divide()
         return some
@@ -173,10 +193,17 @@ class Sides:
         heights = records[:, plateau].mean(axis=1) / np.float32(self.tail_level)
         return np.asarray(records / heights[:, np.newaxis], np.float32), heights
 
-    def noisy(self, clean: FloatArray) -> list[Aligned]:
+    def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
         """Records with each draw of the noise, read."""
         draws = range(len(self.noise.factor))
-        return [read(self.noise.add(clean, draw, 0), self.frame) for draw in draws]
+        return [self.read(self.noise.add(clean, draw, 0), heights) for draw in draws]
+
+    def read(self, records: FloatArray, heights: Floats) -> Aligned:
+        """Records of prepared height, read as they leave the electronics."""
+        if self.by_height is not None:
+            charge = records * heights[:, np.newaxis].astype(np.float32)
+            records = np.asarray(self.by_height(charge, self.energy_kev), np.float32)
+        return read(records, self.frame)
 
 
 def _stretches(frame: Frame, pulses: int) -> npt.NDArray[np.intp]:
@@ -242,10 +269,12 @@ class Comparison:
         Pulses.
     width
         Width of the bounded functions in robust standard deviations.
+    least
+        Least error of a quantile.
     """
 
-    def __init__(self, sides: Sides, width: float) -> None:
-        self.sides, self.width = sides, width
+    def __init__(self, sides: Sides, width: float, least: float = 1e-6) -> None:
+        self.sides, self.width, self.least = sides, width, least
         self.data = sides.view(sides.data.pulses)
 
     def entering(self, response: ElectronicsResponse) -> Comparison:
@@ -254,16 +283,20 @@ class Comparison:
         other.sides = self.sides.entering(response)
         return other
 
-    def differences(self, transfer: Spectrum, basis: Basis | None = None) -> list[Difference]:
+    def differences(
+        self, transfer: Spectrum, basis: Basis | Moved | None = None
+    ) -> list[Difference]:
         """Compare the pulses translated by a response, with derivatives in a basis if given."""
         sides = self.sides
         clean, heights = sides.translated(transfer)
-        noisy = sides.noisy(clean)
-        moves = None
-        if basis is not None:
+        noisy = sides.noisy(clean, heights)
+        moves: Any = None
+        if callable(basis):
+            moves = basis(sides, noisy[0])
+        elif basis is not None:
             moves = Derivatives(sides, sides.first, noisy[0], heights, basis)
         views = [sides.view(one.pulses) for one in noisy]
-        clean_view = sides.view(read(clean, sides.frame).pulses)
+        clean_view = sides.view(sides.read(clean, heights).pulses)
         return [
             *(self._quantiles(by, noisy, moves) for by in RANKS),
             *self._slices(AMPLITUDE, noisy, views, clean_view, moves),
@@ -275,13 +308,13 @@ class Comparison:
 
         It is 0 within a sample of the half height, where all pulses are aligned.
         """
-        clean, _ = self.sides.translated(transfer)
-        noisy = self.sides.noisy(clean)
+        clean, heights = self.sides.translated(transfer)
+        noisy = self.sides.noisy(clean, heights)
         kept = self.sides.single(noisy[0])
         if kept.sum() < 2:  # far from the data
             kept[:] = True
         views = [self.sides.view(one.pulses)[kept] for one in noisy]
-        clean_view = self.sides.view(read(clean, self.sides.frame).pulses)[kept]
+        clean_view = self.sides.view(self.sides.read(clean, heights).pulses)[kept]
         n, ones = len(self.data), np.ones((len(views), int(kept.sum())))
         data, simulated, pulses, _ = self._bounded(
             np.ones(n), views, clean_view, np.arange(len(clean_view)), _rms(views, clean_view)
@@ -303,7 +336,9 @@ class Comparison:
         errors = np.hypot(
             quantile_errors(own, len(own)), quantile_errors(simulated, len(self.sides))
         )
-        covariance = np.outer(errors, errors) * CORRELATION + 1e-12 * np.eye(len(errors))
+        covariance = np.outer(errors, errors) * CORRELATION + self.least**2 * np.eye(
+            len(errors)
+        )
         if moves is not None:
             near, _ = hats(getattr(noisy[0], by), found)
             counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]

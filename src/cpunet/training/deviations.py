@@ -34,8 +34,9 @@ from scipy.special import expit
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
 from cpunet.training.aligned import Values
 from cpunet.training.chain_parameters import SmoothParameters
-from cpunet.training.comparison import MOST, Comparison, Sides, Spectrum
+from cpunet.training.comparison import MOST, Comparison, Moved, Sides, Spectrum
 from cpunet.training.derivatives import Basis
+from cpunet.training.joint import Joint
 
 # Knots in ns: the last one of the dense ones and of all, and how far apart.
 DENSE_NS, LAST_NS, APART_NS, SPARSE_NS, GROWTH = 3000.0, 6800.0, 8.0, 96.0, 1.12
@@ -50,6 +51,7 @@ STEPS, SETTLED, CLOSE = 10, 0.7, 3.0
 # Errors are larger than those of independent slices, since both kinds see the same pulses: rise
 # times (10 to 90, 1 to 99, 0.1 to 99.9 %) on seven stands scatter by this factor more.
 SHARED = 1.5
+MODES = 24  # of the posterior in which the amplitude moves it
 GAUGE = 1e10  # pulses are scaled to their level: information that holds it
 HALVED = 3  # times that a step which makes it worse is halved
 
@@ -265,7 +267,7 @@ def with_deviations(
     gauge = knots.between[inside].mean(axis=0)
     place, prior, first = np.zeros(len(knots.time_ns)), STARTS[0], None
     for width, most, gain in STAGES:
-        problem = _Linear([Comparison(side.of(most), width) for side in bands], basis)
+        problem = Linearised([Comparison(side.of(most), width) for side in bands], basis)
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
             own.set_deviation(knots.between @ place)
@@ -279,7 +281,9 @@ def with_deviations(
             gained, before, halved = before[0] - cost, (cost, place), 0
             information = problem.information + GAUGE * np.outer(gauge, gauge)
 
-            def of(prior: Prior, problem: _Linear = problem, a: Values = information) -> float:
+            def of(
+                prior: Prior, problem: Linearised = problem, a: Values = information
+            ) -> float:
                 return posterior(a, problem.right, knots.covariance(prior)).evidence
 
             if far:
@@ -303,8 +307,33 @@ def with_deviations(
     alone = problem.evaluate(response.transfer(padded), 0 * place, anew=False)
     if not cost < alone:
         return Deviated(response, first)
+    own.set_deviation(knots.between @ place)
+    modes = _modes(information, covariance)
+    moves = Basis(basis.first, knots.between @ modes)
+    place = place + modes @ _with_amplitude(own, [side.of(MOST) for side in bands], moves)
     own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))
     return Deviated(own, first)
+
+
+def _modes(information: Values, covariance: Values) -> Values:
+    """Directions of unit variance in which the posterior is the widest, (knots, modes)."""
+    root = np.linalg.cholesky(covariance)
+    inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ information @ root)
+    left, widths, _ = np.linalg.svd(root @ scipy.linalg.inv(inner).T)
+    return np.asarray(left[:, :MODES] * widths[:MODES])
+
+
+def _with_amplitude(own: ElectronicsResponse, bands: Sequence[Sides], modes: Basis) -> Values:
+    """Step in the modes by how shapes go with the amplitude, which slices see less well."""
+    transfer, n = own.transfer(bands[0].padded), modes.changes.shape[1]
+    information, right = np.eye(n), np.zeros(n)
+    for sides in bands:
+        difference = Joint(sides).difference(transfer, modes)
+        root = np.linalg.cholesky(difference.covariance)
+        slopes = scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
+        information += slopes.T @ slopes
+        right -= slopes.T @ scipy.linalg.solve_triangular(root, difference.values, lower=True)
+    return np.asarray(np.linalg.solve(information, right))
 
 
 def _draws(information: Values, covariance: Values) -> Values:
@@ -316,10 +345,10 @@ def _draws(information: Values, covariance: Values) -> Values:
     return np.asarray(root @ scipy.linalg.solve_triangular(inner.T, normal))
 
 
-class _Linear:
+class Linearised:
     """Chi-square of comparisons to second order in the coordinates."""
 
-    def __init__(self, comparisons: Sequence[Comparison], basis: Basis) -> None:
+    def __init__(self, comparisons: Sequence[Comparison], basis: Basis | Moved) -> None:
         self.comparisons, self.basis = comparisons, basis
         self.white: list[tuple[Values, Values]] = []  # roots of covariances, slopes
 

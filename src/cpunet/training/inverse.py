@@ -74,7 +74,7 @@ def fit_inverse(
         )
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(len(sim), min(len(sim), MAX_PULSES), replace=False))
-    windows, delay, used = _translated(generator, sim[rows], recipe)
+    windows, delay, used = _translated(generator, sim[rows], energy_kev[rows], recipe)
     inverse = LinearInverse(recipe.preparation.length, training)
     inverse.half_height[...] = 0.5 * np.median(windows.max(axis=1))
     sample = inverse.half_sample(windows)
@@ -93,7 +93,7 @@ def fit_inverse(
 
 
 def _translated(
-    generator: ResponseGenerator, sim: FloatArray, recipe: Recipe
+    generator: ResponseGenerator, sim: FloatArray, energy_kev: Values, recipe: Recipe
 ) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Noise-free translated windows prepared like the data, and the shift of each pulse.
 
@@ -105,6 +105,8 @@ def _translated(
     """
     preparation = recipe.preparation
     records = np.concatenate([generator(sim[rows]) for rows in blocks(len(sim))])
+    if (by_height := generator.response.by_height) is not None:
+        records = np.asarray(by_height(records, energy_kev), np.float32)
     # a record without noise can have equal samples at its top without being clipped
     config = preparation.model_copy(update={"saturation_run": records.shape[1] + 1})
     dt_ns = float(generator.response.dt_ns)

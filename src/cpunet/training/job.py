@@ -269,7 +269,7 @@ def match(
     noise, tails = trace_noise(job.data, recipe.preparation)
     if known is not None:  # its deviations are those of another readout
         terms = min(known.config.drift_terms, recipe.matching.training.drift_terms)
-        known = with_settings(known, drift_terms=terms, deviations=False)
+        known = with_settings(known, drift_terms=terms, deviations=False, by_height=False)
         recipe = recipe.model_copy(update={"generator": known.config})
     rng, drawn = np.random.default_rng(job.seed), noise.tails
     sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)

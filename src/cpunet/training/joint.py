@@ -33,6 +33,8 @@ SHRUNK = 0.05  # share of a diagonal matrix in the covariance
 # Width of the logarithm of the current amplitude in which the peak of the single sites is the
 # highest, and bins about it.
 PEAK_WIDTH, ABOUT_PEAK = 0.01, np.linspace(-0.03, 0.02, 10)
+FOR_PRODUCTS = 600  # pulses of a side, of which products have a covariance
+MOSTLY = 0.8  # part of the simulated pulses that is single near the data
 TINY = 1e-9  # least scale
 
 
@@ -51,7 +53,8 @@ class Joint:
     """
 
     def __init__(self, sides: Sides, wider: float = 1.0, *, products: bool = True) -> None:
-        self.sides, self.clipped, self.products = sides, CLIPPED * wider, products
+        self.sides, self.clipped = sides, CLIPPED * wider
+        self.products = products and min(len(sides), len(sides.data)) >= FOR_PRODUCTS
         views = sides.view(sides.data.pulses).astype(float)
         self.middle, size = np.median(views, axis=0), views.shape[1]
         largest = (max(size - COMPONENTS, 0), size - 1)
@@ -82,8 +85,11 @@ class Joint:
     def difference(self, transfer: Spectrum, basis: Basis | None = None) -> Difference:
         """Compare the pulses translated by a response, with derivatives in a basis if given."""
         clean, heights = self.sides.translated(transfer)
-        noisy = self.sides.noisy(clean)
-        values = [self._functions(one) for one in noisy]
+        noisy = self.sides.noisy(clean, heights)
+        # without those on the tail of another, as the data; far from the data all
+        kept = np.all([self.sides.single(one) for one in noisy], axis=0)
+        kept = kept if kept.mean() > MOSTLY else np.ones_like(kept)
+        values = [self._functions(one[kept]) for one in noisy]
         mean = np.mean([one.mean(axis=0) for one in values], axis=0)
         covariance = 0.5 * (np.cov(values[0].T) + np.cov(self.data.T))
         covariance *= 1 / len(self.sides) + 1 / len(self.data)

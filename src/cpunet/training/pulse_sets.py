@@ -279,7 +279,7 @@ class PulseSets:
         length = record_length(sim.waveforms.shape[1], sim.dt_ns)
         drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)
         noise, frame = Noise.draw(self.noise, *drawn), Frame.of(training)
-        return Sides(sim.waveforms, data, noise, frame, preparation.tail_level)
+        return Sides(sim.waveforms, data, noise, frame, preparation.tail_level, sim.energy_kev)
 
     def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
         _, training = self.recipe.matching

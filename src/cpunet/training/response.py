@@ -57,6 +57,8 @@ ROWS = {
     r"fast_decay_(\d)_share": (r"share of fast decay \1", "%"),
     r"effective_decay_us": ("effective decay, tail", "µs"),
     r"decay_(.*)_us": (r"share decaying with \1 µs", "%"),
+    r"slew_kev_per_ns": ("slew rate", "keV/ns"),
+    r"nonlinearity": ("largest non-linearity", "‰"),
     r"noise_rms_kev": ("noise RMS", "keV"),
     r"noise_corner_mhz": ("noise corner", "MHz"),
     r"chi_square_per_moment": ("chi-square per moment", ""),
@@ -168,7 +170,7 @@ class Response:
     def _cells(self, name: str) -> list[str]:
         """A row of the table."""
         _, label, unit = _row(name)
-        scale = 100.0 if unit == "%" else 1.0
+        scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
         alone = len(self.runs) == 1  # beside several runs there is no room for errors
         errors = self.runs[0].errors if alone else {}
         cells = [f"{label} [{unit}]" if unit else label]

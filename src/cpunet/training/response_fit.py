@@ -27,6 +27,7 @@ from cpunet.training.chain_parameters import Parameters, with_decay, with_settin
 from cpunet.training.comparison import AMPLITUDE, Comparison, Difference, Sides
 from cpunet.training.deviations import with_deviations
 from cpunet.training.fitter import Fitter
+from cpunet.training.heights import with_heights
 from cpunet.training.pulse_sets import SINGLE, PulseSets
 from cpunet.training.verdict import WIDTH, Verdict, verdict
 
@@ -114,10 +115,15 @@ def fit_response(
     bands, chains = sets.sides(), list[Fitted]()
     for start in _starts(sets, fitter, known):
         chains.append(fit_chain(start, bands, fitter))
-        if not chains[-1].poor:
+        if not chains[-1].poor or len(bands) > 1:
             break  # there is no other valley to search for
     nearest = min(chains, key=lambda chain: chain.chi_square)
+    shaped = _by_height(nearest, bands, fitter)
+    if shaped is not None and shaped.checks.good:
+        return shaped.response, described(shaped, sets, bands, fitter)
     best = _learned(nearest, bands, fitter)
+    if shaped is not None:
+        best = min(best, shaped, key=lambda one: one.checks.chi_square)
     if not best.checks.good and "onset" in best.checks.off:
         stretched = _stretched(best.chain, bands, fitter)
         if stretched is not None:
@@ -146,6 +152,23 @@ class _Learned(NamedTuple):
     chain: Fitted
     response: ElectronicsResponse
     checks: Verdict
+
+
+def _by_height(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned | None:
+    """What the readout does by the height of a pulse, if several energies ask for it."""
+    if len(bands) < 2 or (not chain.poor and verdict(chain.response, bands).good):
+        return None
+    response, gain = with_heights(chain.response, bands, fitter.count)
+    fitter.gains["slew rate and curve"] = gain
+    if response.by_height is None:
+        return None
+    behind = [sides.entering(response) for sides in bands]
+    shaped = _Learned(chain, response, verdict(response, behind))
+    if shaped.checks.good:
+        return shaped
+    other = with_deviations(response, behind, fitter.count).response
+    deviated = _Learned(chain, other, verdict(other, [one.entering(other) for one in bands]))
+    return min(shaped, deviated, key=lambda one: one.checks.chi_square)
 
 
 def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:

@@ -33,11 +33,12 @@ PARTS = {
     "edge": (
         240.0,
         "a readout that is not linear, as one of limited slew rate, or other physics; try: "
-        "cpunet calibrate; cpunet response tells what was fitted",
+        "cpunet train --peak FEP,1000-1580; cpunet calibrate",
     ),
     "top": (
         1344.0,
-        "charges that are trapped, or a readout that is not linear; try: cpunet calibrate",
+        "charges that are trapped, or a readout that is not linear; try: cpunet train --peak "
+        "FEP,1000-1580; cpunet calibrate",
     ),
     "tail": (
         np.inf,
@@ -173,8 +174,7 @@ def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
         since = until
         if largest > MAX_Z:
             off[part] = round(largest, 1)
-    clean, _ = sides.translated(transfer)
-    translated = sides.noisy(clean)[0]
+    translated = sides.noisy(*sides.translated(transfer))[0]
     translated = translated[sides.single(translated)]
     auc = {}
     if min(len(translated), len(sides.data)) >= MIN_PULSES:

@@ -13,6 +13,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.electronics.finishing import finish, padding, with_room
 from cpunet.networks import require_torch
+from cpunet.networks.by_height import ByHeight
 from cpunet.networks.generators import (
     KeptNoise,
     LinearInverse,
@@ -82,11 +83,14 @@ class Translated(NamedTuple):
         A `Rejection` for each row.
     begin
         First sample of each, in samples after the first one of what was translated.
+    charge
+        Of a window of height 1; of a readout chain only.
     """
 
     windows: FloatArray
     codes: Codes
     begin: npt.NDArray[np.int64]
+    charge: FloatArray | None = None
 
 
 class Backend(ABC):
@@ -108,6 +112,8 @@ class Backend(ABC):
         Noise that is added to the output of the network.
     tails : DrawnTails or None
         Distribution of the pile-up tails under the data, if known.
+    by_height : ByHeight or None
+        What the electronics do by the height of a pulse, if anything.
     """
 
     network: Generator | ResponseGenerator | Inverse
@@ -117,6 +123,7 @@ class Backend(ABC):
     chain: ResponseGenerator | None = None
     noise: BaselineNoise | None = None
     tails: DrawnTails | None = None
+    by_height: ByHeight | None = None
 
     @abstractmethod
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
@@ -146,9 +153,10 @@ class Backend(ABC):
             self.config,
             dt_ns=self.dt_ns,
             noise=self.noise if drawn.noise else None,
-            energy_kev=energy_kev if drawn.noise else None,
+            energy_kev=energy_kev,
             seed=drawn.generator,
             added=added,
+            by_height=self.by_height,
         )
         return Translated(done.windows, done.codes, done.begin - padding(self.dt_ns)[0])
 
@@ -223,6 +231,7 @@ class ResponseBackend(Backend):
         self.network = self.chain = generator
         self.noise, self.tails = generator.noise, generator.tails
         self.config, self.dt_ns = config, float(generator.response.dt_ns)
+        self.by_height = generator.response.by_height
 
     def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
@@ -243,7 +252,9 @@ class ResponseBackend(Backend):
         levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / height
         begin = np.zeros(len(windows), np.int64)
         begin[clean.index] = clean.align_sample - n_pre - before - padding(self.dt_ns)[0]
-        return Translated(levels, clean.codes, begin)
+        charge = np.ones(len(windows), np.float32)
+        charge[clean.index] = clean.scale
+        return Translated(levels, clean.codes, begin, charge)
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
         """Records without noise, and the same prepared; flat tops do not count as saturated."""

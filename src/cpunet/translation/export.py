@@ -143,6 +143,11 @@ def graph_of(network: Any, length: int) -> Graph:
             "of the recipe fast"
         )
     if isinstance(network, ResponseGenerator):
+        if network.response.by_height is not None:
+            raise CpunetError(
+                "the electronics of this run act by the height of a pulse, and a graph has no "
+                "energies; train on one line alone for the linear part"
+            )
         model = chain_model(network.response, length)
         return Graph(model, windows, lambda given: network(given["windows"]))
     if isinstance(network, LinearInverse):

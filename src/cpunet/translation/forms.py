@@ -180,7 +180,7 @@ class AdcTraces(Windows):
         backend, piled, dt_ns = self.translator.backend, known.piled, self.translator.dt_ns
         energies = known.energy_kev
         assert energies is not None  # those of the pulses
-        levels, codes, begin = backend.levels(windows, self.n_pre, self.length)
+        levels, codes, begin, charge = backend.levels(windows, self.n_pre, self.length)
         if known.noise and backend.noise is not None:
             levels += backend.noise.draw(energies, self.length, known.generator)
         if piled is not None and len(piled.row):
@@ -188,6 +188,9 @@ class AdcTraces(Windows):
             reached = self.length + piled.reach(dt_ns)
             shapes = backend.levels(windows[piled.partner], self.n_pre, reached).windows
             levels += piled.added(np.nan_to_num(shapes), energies, dt_ns, self.length)
+        if backend.by_height is not None and charge is not None:
+            scale = charge[:, np.newaxis]
+            levels = backend.by_height(levels * scale, energies) / scale
         return Translated(levels, codes, begin)
 
 
@@ -316,7 +319,7 @@ def _height(translator: Translator) -> float:
     config = translator.recipe.preparation
     time = np.arange(config.length) - config.samples_before
     ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
-    height = float(translator.apply(ramp[np.newaxis], noise=False).max())
+    height = float(translator.apply(ramp[np.newaxis], energy_kev=np.ones(1), noise=False).max())
     if not (np.isfinite(height) and height > 0):
         raise CpunetError("the run cannot translate a fast pulse; train again")
     return height

@@ -34,6 +34,7 @@ Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], "torch.Tensor")
 Act: TypeAlias = Callable[[FloatArray, Drawn], Translated]
 
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
+NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
 
 
@@ -201,8 +202,9 @@ class Translator:
         array = given.detach().cpu().float().numpy() if tensor else np.asarray(given)
         if not array.ndim:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
-        if noise and self.needs_energies and energy_kev is None:
-            raise CpunetError(NO_ENERGY)
+        self._require_energies(
+            Drawn(None if energy_kev is None else np.asarray(energy_kev, float), noise)
+        )
         pulses = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
         if energy_kev is not None:
             energies = _one_each("energy_kev", energy_kev, len(pulses))
@@ -266,7 +268,7 @@ class Translator:
         prepared = prepare(pulses, self.recipe.preparation, self.takes)
         length = length or self.recipe.preparation.length
         codes = prepared.codes.copy()
-        if drawn.noise and self.needs_energies:
+        if self._by_energy(drawn):
             unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
             codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
         rows = codes[prepared.index] == Rejection.ACCEPTED
@@ -279,6 +281,14 @@ class Translator:
         t0_ns = pulses.t0_ns.copy()
         t0_ns[index] = prepared.pulses.t0_ns[rows] + done.begin * self.dt_ns - self.delay_ns
         return TranslatedPulses(replace(pulses, waveforms=waveforms, t0_ns=t0_ns), codes)
+
+    def _by_energy(self, drawn: Drawn) -> bool:
+        """Whether a translation depends on the energies."""
+        return self.backend.by_height is not None or (drawn.noise and self.needs_energies)
+
+    def _require_energies(self, drawn: Drawn) -> None:
+        if self._by_energy(drawn) and drawn.energy_kev is None:
+            raise CpunetError(NO_ENERGY if self.backend.by_height is None else NO_HEIGHT)
 
     def require_sampling(self, what: str, dt_ns: float) -> None:
         """Raise a `CpunetError` if pulses are not sampled like those of the training."""
@@ -326,8 +336,7 @@ class Translator:
         CpunetError
             If energies or what is known of other pulses are missing.
         """
-        if drawn.noise and self.needs_energies and drawn.energy_kev is None:
-            raise CpunetError(NO_ENERGY)
+        self._require_energies(drawn)
         if drawn.others and not (drawn.noise and self.needs_energies):
             raise CpunetError(
                 "other pulses are drawn with electronic noise; leave out tails_kev and piled"
@@ -339,7 +348,7 @@ class Translator:
         for first in range(0, len(windows), BATCH):
             rows = np.arange(first, min(first + BATCH, len(windows)))
             some = windows[rows], drawn.of_rows(rows)
-            result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)
+            result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)[:3]
         return Translated(result, codes, begin)
 
 

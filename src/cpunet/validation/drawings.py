@@ -69,9 +69,11 @@ def _cycles(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
         (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
         (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
     ):
-        start = peak.windows(side)[:SHOWN]
-        middle = there.apply(start, noise=False)
-        stages = zip(names, (start, middle, back.apply(middle, noise=False)), strict=True)
+        start, rows = peak.windows(side)[:SHOWN], peak.rows[side][:SHOWN]
+        kev = peak.translations.energy_kev[side][rows]
+        middle = there.apply(start, energy_kev=kev, noise=False)
+        end = back.apply(middle, energy_kev=kev, noise=False)
+        stages = zip(names, (start, middle, end), strict=True)
         draw = partial(cycle_figure, dict(stages), ren.dt_ns)
         drawn[f"{peak.name} cycle of {names[0].lower()}"] = draw
     return drawn

@@ -273,7 +273,9 @@ class Translations:
         found = {"raw": raw}
         for name, method in self.baselines.methods.items():
             found[name] = method.translate_like_data(raw, config)
-        found["ren"] = self.ren.apply(raw, noise=False)
+        found["ren"] = self.ren.apply(
+            raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
+        )
         return found if self.truth is None else found | {"truth": self.truth[[row]]}
 
 
@@ -332,7 +334,7 @@ def translate_all(
                 clean[name] = finished.clean
                 if noise is not None:
                     noisy[name][rows] = finished.windows
-            clean["ren"] = ren.apply(block.waveforms, noise=False)
+            clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
             for windows in clean.values():
                 known[rows] &= _whole(windows)

@@ -1,0 +1,217 @@
+"""Fit what electronics do to a pulse by its height, from lines and continua together.
+
+Chain, follower and curve (`cpunet.networks.by_height`) are solved together by the steps of
+Gauss and Newton on the comparison at every sample, with derivatives by finite differences at
+fixed noise.  Half of the pulses are held out: without a gain in their chi-square the readout
+stays linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+
+from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.aligned import Aligned, Floats, Values
+from cpunet.training.chain_parameters import SmoothParameters, with_settings
+from cpunet.training.comparison import Comparison, Sides
+from cpunet.training.deviations import Linearised, posterior
+
+# Stages: most pulses of a side, width of the bounded functions, and least error of a quantile,
+# since those of a limited current are all but equal.
+STAGES = ((512, 60.0, 3e-3), (512, 6.0, 1e-3), (1024, 1.5, 2e-4))
+MOST, WIDTH = 2048, 1.5
+LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
+STEPS, SETTLED, FIRST, TRIES = 10, 3.0, 1e-3, 5  # gain that ends a stage; damping, and tries
+GAIN = 20.0  # in chi-square of pulses that were held out
+# Priors: variances of the follower's logarithm per largest step, widths of the curve in parts
+# of its height, and its correlation length in knots.
+LAGS, CURVES, NEAR = (1e-6, 1e-3, 0.03, 0.3), (1e-6, 1e-4, 3e-4, 1e-3, 3e-3), 1.5
+PART, LAG_STEP, CURVE_STEP = 0.02, 0.01, 1e-4  # of the differences
+
+
+class Moves:
+    """Derivatives of aligned pulses by finite differences, as of `derivatives.Derivatives`.
+
+    Parameters
+    ----------
+    sides
+        Pulses.
+    aligned, moved
+        As they are, and after a step of each coordinate.
+    steps
+        Lengths of these.
+    """
+
+    def __init__(
+        self, sides: Sides, aligned: Aligned, moved: Sequence[Aligned], steps: Values
+    ) -> None:
+        self.log_amplitude, self.rise = (
+            np.stack([getattr(one, by) - getattr(aligned, by) for one in moved], 1) / steps
+            for by in ("log_amplitude", "rise")
+        )
+        view = sides.view(aligned.pulses)
+        self.views = [
+            (sides.view(one.pulses) - view) / np.float32(step)
+            for one, step in zip(moved, steps, strict=True)
+        ]
+
+    def mean(self, rows: npt.NDArray[np.intp], weights: Floats) -> Values:
+        """Change of weighted sums of the stretches, shape (stretches, coordinates)."""
+        return np.stack([(weights * view[rows]).sum(axis=0) for view in self.views], 1)
+
+
+class Heights(NamedTuple):
+    """A response that acts by height, or the linear one, and what held-out pulses say."""
+
+    response: ElectronicsResponse
+    gain: str
+
+
+def with_heights(
+    response: ElectronicsResponse, bands: Sequence[Sides], count: Callable[[float], None]
+) -> Heights:
+    """Follower and curve behind a response, if held-out pulses of several energies gain.
+
+    Parameters
+    ----------
+    response
+        The linear readout with the drift as simulated, which is not changed.
+    bands
+        Pulses of both sides in several bands of energy.
+    count
+        Called with chi-square after each step.
+    """
+    own = with_settings(response, by_height=True)
+    by_height = own.by_height
+    assert by_height is not None
+    transfer = own.transfer(bands[0].padded)
+    steps = [_largest_step(sides, sides.translated(transfer)) for sides in bands]
+    by_height.step_kev[...] = max(steps)
+    by_height.top_kev[...] = 1.02 * max(float(sides.energy_kev.max()) for sides in bands)
+    behind = [sides.entering(own) for sides in bands]
+    halves = [min(len(one), len(one.data), 2 * MOST) // 2 for one in bands]
+    fitted = [one.of(n) for one, n in zip(behind, halves, strict=True)]
+    for most, width, least in STAGES:
+        _solve(own, [one.of(most) for one in fitted], width, least, count)
+    held = [
+        (linear.some(slice(n, 2 * n)), shaped.some(slice(n, 2 * n)))
+        for linear, shaped, n in zip(bands, behind, halves, strict=True)
+    ]
+    before = sum(_chi_square(response, linear) for linear, _ in held)
+    after = sum(_chi_square(own, shaped) for _, shaped in held)
+    kept = before - after > GAIN
+    gain = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
+    return Heights(own if kept else response, f"{'used' if kept else 'left out'}; {gain}")
+
+
+def _largest_step(sides: Sides, translated: tuple[Floats, Floats]) -> float:
+    records, heights = translated
+    steps = np.diff(records, axis=1).max(axis=1) * heights * sides.energy_kev
+    return float(np.quantile(steps, 0.99))
+
+
+def _solve(
+    own: ElectronicsResponse,
+    bands: Sequence[Sides],
+    width: float,
+    least: float,
+    count: Callable[[float], None],
+) -> None:
+    """Set chain, follower and curve to their minimum of chi-square with priors."""
+    by_height, parameters, padded = own.by_height, SmoothParameters(own), bands[0].padded
+    assert by_height is not None
+    n = len(parameters.centre)
+    lag, curve = np.arange(1, LAG_KNOTS) / PER_STEP, np.arange(1, CURVE_KNOTS - 1)
+    near = np.exp(-0.5 * ((curve[:, np.newaxis] - curve) / NEAR) ** 2)
+
+    def covariance(of_lag: float, of_curve: float) -> Values:
+        return np.asarray(
+            scipy.linalg.block_diag(
+                np.diag(parameters.widths**2),
+                of_lag * np.minimum.outer(lag, lag),
+                of_curve**2 * (near + 1e-4 * np.eye(len(curve))),
+            )
+        )
+
+    precision = np.linalg.inv(covariance(LAGS[-1], CURVES[-1]))
+    centre = np.r_[parameters.centre, np.zeros(len(lag) + len(curve))]
+    steps = np.r_[
+        PART * parameters.widths,
+        np.full(len(lag), LAG_STEP),
+        np.full(len(curve), CURVE_STEP),
+    ]
+    place = np.r_[parameters.vector(), by_height.vector]
+
+    def put(vector: Values) -> None:
+        parameters.set(vector[:n])
+        by_height.set(vector[n:])
+
+    def moves(sides: Sides, aligned: Aligned) -> Moves:
+        moved, (clean, heights) = [], sides.translated(own.transfer(padded))
+        for i, step in enumerate(steps):
+            put(place + step * (np.arange(len(place)) == i))
+            if i < n:
+                new, of = sides.translated(own.transfer(padded))
+                moved.append(sides.read(sides.noise.add(new, 0, 0), of))
+            else:
+                moved.append(sides.read(sides.noise.add(clean, 0, 0), heights))
+        put(place)
+        return Moves(sides, aligned, moved, steps)
+
+    problem = Linearised([Comparison(sides, width, least) for sides in bands], moves)
+    damping = FIRST
+    for _ in range(STEPS):
+        cost = problem.evaluate(own.transfer(padded), place, anew=True)
+        if width == WIDTH:  # near enough that the evidence says how much of each there is
+            start = problem.right - problem.information @ centre
+            evidence = {
+                choice: posterior(problem.information, start, covariance(*choice)).evidence
+                for choice in product(LAGS, CURVES)
+            }
+            best = max(evidence, key=lambda choice: evidence[choice])
+            precision = np.linalg.inv(covariance(*best))
+        apart = place - centre
+        cost += float(apart @ precision @ apart)
+        count(cost)
+        information, right = problem.information + precision, problem.right
+        right = right + precision @ centre - information @ place
+        if not by_height.lag.any():  # far from here, pulses are not linear in a slew rate
+            tried = [(cost, place)]
+            for limit in LIMITS:
+                limited = np.log(lag / limit / np.tanh(lag / limit))
+                other = np.r_[place[:n], limited, place[n + len(lag) :]]
+                put(other)
+                cost = problem.evaluate(own.transfer(padded), other, anew=False)
+                tried.append((cost, other))
+            (cost, other), begun = min(tried, key=lambda one: one[0]), place
+            place = other
+            put(place)
+            if place is not begun:
+                continue
+        for _ in range(TRIES):
+            scale = damping * np.diag(information.diagonal())
+            move = np.linalg.solve(information + scale, right)
+            put(place + move)
+            apart = place + move - centre
+            new = problem.evaluate(own.transfer(padded), place + move, anew=False)
+            if (new := new + float(apart @ precision @ apart)) < cost:
+                break
+            damping *= 10
+        else:
+            put(place)
+            return
+        place, damping = place + move, 0.1 * damping
+        if cost - new < SETTLED:
+            return
+
+
+def _chi_square(response: ElectronicsResponse, sides: Sides) -> float:
+    found = Comparison(sides, WIDTH).differences(response.transfer(sides.padded))
+    return sum(len(d.values) * d.chi_square * (0.5 if d.sliced else 1.0) for d in found)

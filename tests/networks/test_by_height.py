@@ -1,0 +1,93 @@
+"""Follower and curve against recursions written down, and pulses that pass them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cpunet.electronics.finishing import finish
+from cpunet.errors import CpunetError
+from cpunet.networks.by_height import LAG_KNOTS, PER_STEP, ByHeight
+from cpunet.networks.generators import LinearInverse, ResponseGenerator
+from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.translation.translator import REN
+from synthetic import edges, load_recipe, write_run
+
+KEV, LIMIT = 2000.0, 60.0
+
+
+def slewing() -> ByHeight:
+    """An amplifier whose output rises by not much more than `LIMIT` keV per sample."""
+    circuit = ByHeight()
+    circuit.step_kev[...], circuit.top_kev[...] = 100.0, 1.02 * KEV
+    step = 100.0 * np.arange(1, LAG_KNOTS) / PER_STEP / LIMIT
+    circuit.lag[1:] = -np.log(np.tanh(step) / step)
+    return circuit
+
+
+def test_a_follower_is_its_recursion() -> None:
+    records = edges(5, seed=1).astype(np.float64)
+    expected = KEV * records
+    for i in range(1, records.shape[1]):
+        d = expected[:, i] - expected[:, i - 1]
+        expected[:, i] = expected[:, i - 1] + LIMIT * np.tanh(d / LIMIT)
+    found = slewing()(records, np.full(5, KEV)) * KEV
+    np.testing.assert_allclose(found, expected, atol=1.0)
+    assert np.diff(found, axis=1).max() < LIMIT < np.diff(KEV * records, axis=1).max()
+
+
+def test_a_curve_adds_what_the_height_says() -> None:
+    circuit = ByHeight()
+    circuit.top_kev[...] = KEV
+    place = np.linspace(0, 1, len(circuit.curve))
+    circuit.curve[:] = 0.01 * place * (1 - place)
+    records = np.linspace(-0.1, 1.1, 50)[np.newaxis]
+    inside = records.clip(0, 1)
+    expected = records + 0.01 * inside * (1 - inside)
+    np.testing.assert_allclose(circuit(records, np.array([KEV])), expected, atol=1e-6)
+
+
+def test_energies_decide_what_an_amplifier_does() -> None:
+    records = edges(3, seed=2)
+    low, high = (slewing()(records, np.full(3, kev)) for kev in (200.0, KEV))
+    np.testing.assert_allclose(low, records, atol=0.01)
+    assert np.abs(high - records).max() > 0.02
+
+
+def test_noise_passes_the_amplifier_with_the_pulse() -> None:
+    config, pulses = load_recipe("fast").at(16.0).preparation, edges(4, seed=3)
+    kev = np.full(4, KEV)
+    records = np.pad(pulses, ((0, 0), (200, 400)), mode="edge")
+    found = finish(records, config, dt_ns=16.0, energy_kev=kev, by_height=slewing())
+    alone = finish(slewing()(records, kev), config, dt_ns=16.0)
+    np.testing.assert_array_equal(found.windows, alone.windows)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    recipe = load_recipe("fast", ["generator.by_height=true"])
+    chain = ResponseGenerator(recipe.at(16.0).generator, 16.0)
+    assert isinstance(chain.response, ElectronicsResponse)
+    by_height = chain.response.by_height
+    assert by_height is not None
+    by_height.fill(slewing().arrays())
+    at = recipe.at(16.0)
+    inverse = LinearInverse(at.preparation.length, at.matching.training)
+    info = {"recipe": recipe.name, "peak": "FEP", "seed": 0, "dt_ns": 16.0}
+    write_run(
+        tmp_path,
+        {"ren": chain, "iren": inverse},
+        recipe,
+        info | {"seconds": 1.0, "device": "cpu"},
+    )
+    return tmp_path
+
+
+def test_a_run_stores_what_acts_by_height_and_asks_for_energies(run: Path) -> None:
+    ren, pulses = REN.load(run), edges(4, seed=4)
+    with pytest.raises(CpunetError, match="energy_kev"):
+        ren.translate(pulses, noise=False)
+    low, high = (ren.translate(pulses, energy_kev=kev, noise=False) for kev in (200.0, KEV))
+    assert np.abs(np.diff(low)).max() > 1.05 * np.abs(np.diff(high)).max()
