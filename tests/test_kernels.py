@@ -45,7 +45,8 @@ def home(tmp_path: Path) -> Path:
     home = tmp_path / "site" / "cpunet"
     home.mkdir(parents=True)
     (home / "__init__.py").touch()
-    shutil.copy(kernels.__file__, home)
+    for name in ("kernels.py", "errors.py"):
+        shutil.copy(Path(kernels.__file__).with_name(name), home)
     (home / "numbers.py").write_text("N = 1")
     for name, text in {"called": CALLED, "calling": CALLING, "loop": LOOP}.items():
         (home / f"{name}.py").write_text(f"from cpunet.kernels import kernel\n{text}\n")

@@ -113,7 +113,7 @@ def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
     stretched = written(tmp_path / "stretched", "generator.drift_terms=2")
     for folder, kind in ((run, IREN), (chain, IREN), (stretched, REN)):
         graph = graph_of(kind.load(folder).backend.network, 800)
-        assert write_onnx(graph, tmp_path / "graph") < 2e-5
+        assert write_onnx(graph, tmp_path / "graph", {}) < 2e-5
 
 
 @pytest.mark.thorough
@@ -148,7 +148,7 @@ def test_a_graph_that_is_not_that_of_the_run_is_not_left(chain, tmp_path):
     other.backend.chain.response.log_decay_us += 1
     wrong = replace(graph, expected=graph_of(other.backend.network, 800).expected)
     with pytest.raises(CpunetError, match="differs from the run"):
-        write_onnx(wrong, tmp_path / "x")
+        write_onnx(wrong, tmp_path / "x", {})
     assert [p.name for p in tmp_path.iterdir() if p.name != "x"] == []
 
 

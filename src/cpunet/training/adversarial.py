@@ -294,7 +294,8 @@ def train(
             if stop:
                 text = f"stopped after {done} of {c.iterations} iterations"
                 interruption.act(f"{text}; resume goes on from there")
-        listener(records)
+        if records:
+            listener(records)
     if game.judge.over.get("data") == "won":
         game.average.load_state_dict(game.good.state_dict())
     return game
