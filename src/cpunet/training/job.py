@@ -15,11 +15,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numba
 import numpy as np
 
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
+from cpunet.kernels import threads
 from cpunet.networks import require_torch
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -139,7 +139,7 @@ class TrainingJob:
             seed=self.seed,
             init=None if self.init is None else self.init.name,
             device=self.device,
-            threads=numba.get_num_threads(),
+            threads=threads(),
             started=started,
             seconds=round(seconds, 1),
             peak_memory_mb={where: round(mb, 1) for where, mb in memory.items()},

@@ -173,8 +173,7 @@ def _played(
 
         def listen(records: list[Record]) -> None:
             run.log(records)
-            if records:
-                bar.update(len(records))
+            bar.update(len(records))
 
         def begin() -> Game:
             pair = make()

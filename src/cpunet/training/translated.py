@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TypeVar
 
-import numba
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails
+from cpunet.kernels import threads
 from cpunet.networks.response_layer import (
     DriftClock,
     ElectronicsResponse,
@@ -136,10 +136,9 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 def in_threads(of: Callable[[int], T], starts: range) -> list[T]:
     """What is made of blocks of pulses, in their order, whichever thread finishes first."""
-    threads = numba.get_num_threads()
-    if threads == 1 or len(starts) == 1:
+    if (several := threads()) == 1 or len(starts) == 1:
         return [of(first) for first in starts]
-    return list(_pool(threads).map(of, starts))
+    return list(_pool(several).map(of, starts))
 
 
 @dataclass(frozen=True, eq=False)
