@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +18,15 @@ import scipy.linalg
 from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
+from cpunet.training.chain_fit import Fitted, chi_square
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
 from cpunet.training.comparison import Comparison, Sides
-from cpunet.training.deviations import Linearised, posterior
+from cpunet.training.deviations import SHARED, Linearised, posterior
 
 # Stages: most pulses of a side, width of the bounded functions, and least error of a quantile,
 # since those of a limited current are all but equal.
 STAGES = ((512, 60.0, 3e-3), (512, 6.0, 1e-3), (1024, 1.5, 2e-4))
-MOST, WIDTH = 2048, 1.5
+MOST = 2048  # pulses that are fitted, and as many that are held out
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
 STEPS, SETTLED, FIRST, TRIES = 10, 3.0, 1e-3, 5  # gain that ends a stage; damping, and tries
 GAIN = 20.0  # in chi-square of pulses that were held out
@@ -67,16 +67,9 @@ class Moves:
         return np.stack([(weights * view[rows]).sum(axis=0) for view in self.views], 1)
 
 
-class Heights(NamedTuple):
-    """A response that acts by height, or the linear one, and what held-out pulses say."""
-
-    response: ElectronicsResponse
-    gain: str
-
-
 def with_heights(
     response: ElectronicsResponse, bands: Sequence[Sides], count: Callable[[float], None]
-) -> Heights:
+) -> tuple[Fitted | None, str]:
     """Follower and curve behind a response, if held-out pulses of several energies gain.
 
     Parameters
@@ -87,6 +80,11 @@ def with_heights(
         Pulses of both sides in several bands of energy.
     count
         Called with chi-square after each step.
+
+    Returns
+    -------
+    tuple
+        Chain with what acts by height, None if nothing is gained, and a line on it.
     """
     own = with_settings(response, by_height=True)
     by_height = own.by_height
@@ -99,16 +97,13 @@ def with_heights(
     halves = [min(len(one), len(one.data), 2 * MOST) // 2 for one in bands]
     fitted = [one.of(n) for one, n in zip(behind, halves, strict=True)]
     for most, width, least in STAGES:
-        _solve(own, [one.of(most) for one in fitted], width, least, count)
-    held = [
-        (linear.some(slice(n, 2 * n)), shaped.some(slice(n, 2 * n)))
-        for linear, shaped, n in zip(bands, behind, halves, strict=True)
-    ]
-    before = sum(_chi_square(response, linear) for linear, _ in held)
-    after = sum(_chi_square(own, shaped) for _, shaped in held)
-    kept = before - after > GAIN
-    gain = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
-    return Heights(own if kept else response, f"{'used' if kept else 'left out'}; {gain}")
+        covariance = _solve(own, [one.of(most) for one in fitted], width, least, count)
+    held = [sides.some(slice(n, 2 * n)) for sides, n in zip(bands, halves, strict=True)]
+    (before, _), (after, functions) = chi_square(response, held), chi_square(own, held)
+    line = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
+    if before - after <= GAIN:
+        return None, f"left out; {line}"
+    return Fitted(own, after, round(functions), covariance), f"used; {line}"
 
 
 def _largest_step(sides: Sides, translated: tuple[Floats, Floats]) -> float:
@@ -123,8 +118,11 @@ def _solve(
     width: float,
     least: float,
     count: Callable[[float], None],
-) -> None:
-    """Set chain, follower and curve to their minimum of chi-square with priors."""
+) -> Values:
+    """Set chain, follower and curve to their minimum of chi-square with priors.
+
+    Returns the covariance of the chain's parameters.
+    """
     by_height, parameters, padded = own.by_height, SmoothParameters(own), bands[0].padded
     assert by_height is not None
     n = len(parameters.centre)
@@ -140,7 +138,8 @@ def _solve(
             )
         )
 
-    precision = np.linalg.inv(covariance(LAGS[-1], CURVES[-1]))
+    best = LAGS[-1], CURVES[-1]
+    precision = np.linalg.inv(covariance(*best))
     centre = np.r_[parameters.centre, np.zeros(len(lag) + len(curve))]
     steps = np.r_[
         PART * parameters.widths,
@@ -166,10 +165,10 @@ def _solve(
         return Moves(sides, aligned, moved, steps)
 
     problem = Linearised([Comparison(sides, width, least) for sides in bands], moves)
-    damping = FIRST
+    damping, last = FIRST, width == STAGES[-1][1]
     for _ in range(STEPS):
         cost = problem.evaluate(own.transfer(padded), place, anew=True)
-        if width == WIDTH:  # near enough that the evidence says how much of each there is
+        if last:  # near enough that the evidence says how much of each there is
             start = problem.right - problem.information @ centre
             evidence = {
                 choice: posterior(problem.information, start, covariance(*choice)).evidence
@@ -183,17 +182,14 @@ def _solve(
         information, right = problem.information + precision, problem.right
         right = right + precision @ centre - information @ place
         if not by_height.lag.any():  # far from here, pulses are not linear in a slew rate
-            tried = [(cost, place)]
+            costs = [cost]
             for limit in LIMITS:
-                limited = np.log(lag / limit / np.tanh(lag / limit))
-                other = np.r_[place[:n], limited, place[n + len(lag) :]]
-                put(other)
-                cost = problem.evaluate(own.transfer(padded), other, anew=False)
-                tried.append((cost, other))
-            (cost, other), begun = min(tried, key=lambda one: one[0]), place
-            place = other
-            put(place)
-            if place is not begun:
+                by_height.lag[1:] = np.log(lag / limit / np.tanh(lag / limit))
+                costs.append(problem.evaluate(own.transfer(padded), place, anew=False))
+            if nearest := int(np.argmin(costs)):
+                limit = LIMITS[nearest - 1]
+                place[n : n + len(lag)] = np.log(lag / limit / np.tanh(lag / limit))
+                put(place)
                 continue
         for _ in range(TRIES):
             scale = damping * np.diag(information.diagonal())
@@ -206,12 +202,14 @@ def _solve(
             damping *= 10
         else:
             put(place)
-            return
+            break
         place, damping = place + move, 0.1 * damping
         if cost - new < SETTLED:
-            return
-
-
-def _chi_square(response: ElectronicsResponse, sides: Sides) -> float:
-    found = Comparison(sides, WIDTH).differences(response.transfer(sides.padded))
-    return sum(len(d.values) * d.chi_square * (0.5 if d.sliced else 1.0) for d in found)
+            break
+    if best[0] == LAGS[0]:
+        by_height.lag[:] = 0
+    if best[1] == CURVES[0]:
+        by_height.curve[:] = 0
+    of_chain = SHARED**2 * np.linalg.inv(problem.information + precision)[:n, :n]
+    prior = np.diag(parameters.widths**-2.0)
+    return parameters.covariance(np.linalg.inv(of_chain) - prior)

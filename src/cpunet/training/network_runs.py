@@ -218,10 +218,11 @@ def learned_residuals(
 ) -> Learned:
     """Train U-Nets behind a response and its inverse, and keep what held-out pulses gain by."""
     n = min(len(job.sim.prepared), len(job.data.prepared))
-    if n < ENOUGH:
-        return Learned(
-            {}, {"networks": f"left out; {n} pulses of a side, a critic needs {ENOUGH}"}
-        )
+    if n < ENOUGH or chain.response.by_height is not None:
+        why = f"{n} pulses of a side, a critic needs {ENOUGH}"
+        if n >= ENOUGH:
+            why = "they know no energies, by which the electronics act"
+        return Learned({}, {"networks": f"left out; {why}"})
     config, preparation = recipe.cyclegan.generator, recipe.preparation
     noise = TraceNoise(chain.noise, chain.tails)
 

@@ -35,6 +35,7 @@ from cpunet.training.verdict import WIDTH, Verdict, verdict
 # out again if it is 0 within so many of its errors.  Drift that is longer or shorter by more
 # than a third is that of another detector.
 NEEDED, SURE, MAX_STRETCH = 16.0, 3.0, 1 / 3
+BY_HEIGHT = "slew rate and curve"
 DRIFT = {1: "a stretch of the drift", 2: "its change with time"}  # by number of terms
 
 
@@ -115,15 +116,10 @@ def fit_response(
     bands, chains = sets.sides(), list[Fitted]()
     for start in _starts(sets, fitter, known):
         chains.append(fit_chain(start, bands, fitter))
-        if not chains[-1].poor or len(bands) > 1:
+        if not chains[-1].poor:
             break  # there is no other valley to search for
     nearest = min(chains, key=lambda chain: chain.chi_square)
-    shaped = _by_height(nearest, bands, fitter)
-    if shaped is not None and shaped.checks.good:
-        return shaped.response, described(shaped, sets, bands, fitter)
     best = _learned(nearest, bands, fitter)
-    if shaped is not None:
-        best = min(best, shaped, key=lambda one: one.checks.chi_square)
     # of few pulses, the onset is not off for sure, but nothing else is either
     if not best.checks.good and (not best.checks.off or "onset" in best.checks.off):
         stretched = _stretched(best.chain, bands, fitter)
@@ -155,34 +151,25 @@ class _Learned(NamedTuple):
     checks: Verdict
 
 
-def _by_height(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned | None:
-    """What the readout does by the height of a pulse, if several energies ask for it."""
-    if len(bands) < 2 or (not chain.poor and verdict(chain.response, bands).good):
-        return None
-    response, gain = with_heights(chain.response, bands, fitter.count)
-    fitter.gains["slew rate and curve"] = gain
-    if response.by_height is None:
-        return None
-    behind = [sides.entering(response) for sides in bands]
-    shaped = _Learned(chain, response, verdict(response, behind))
-    if shaped.checks.good:
-        return shaped
-    other = with_deviations(response, behind, fitter.count).response
-    deviated = _Learned(chain, other, verdict(other, [one.entering(other) for one in bands]))
-    return min(shaped, deviated, key=lambda one: one.checks.chi_square)
-
-
 def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
-    """Learn what a chain does not do."""
+    """Learn what a chain does not do, by the height of a pulse if there are several."""
     response = chain.response
-    entering = [sides.entering(response) for sides in bands]
-    if not chain.poor:
-        checks = verdict(response, entering)
-        # behind a stretched drift, deviations would make up for what is left of other physics
-        if checks.good if response.drift is not None else checks.clear:
-            return _Learned(chain, response, checks)
-    deviated = with_deviations(response, entering, fitter.count).response
-    return _Learned(chain, deviated, verdict(deviated, entering))
+    around = [sides.entering(response) for sides in bands]
+    alone = _Learned(chain, response, verdict(response, around))
+    # behind a stretched drift, deviations would make up for what is left of other physics
+    linear = response.drift is None and response.by_height is None
+    if not chain.poor and (alone.checks.clear if linear else alone.checks.good):
+        return alone
+    tried = list[_Learned]()
+    if linear and len(bands) > 1 and not alone.checks.good:
+        shaped, fitter.gains[BY_HEIGHT] = with_heights(response, bands, fitter.count)
+        tried += [] if shaped is None else [_learned(shaped, bands, fitter)]
+        if tried and tried[0].checks.good:
+            return tried[0]
+    deviated = with_deviations(response, around, fitter.count).response
+    around = [sides.entering(deviated) for sides in bands]
+    tried.append(_Learned(chain, deviated, verdict(deviated, around)))
+    return min(tried, key=lambda one: one.checks.chi_square)
 
 
 def _stretched(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> Fitted | None:

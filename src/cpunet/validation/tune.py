@@ -187,7 +187,7 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
     if not recipe.search:
         raise CpunetError(
             f"recipe {recipe.name}: has no search space; add one, as "
-            "search: {training.ridge: {low: 0.01, high: 0.2, log: true}}"
+            "search: {training.noise_sets: {choices: [2, 4, 8]}}"
         )
     known = dict(flat(recipe.model_dump(mode="json")))
     for key, config in recipe.search.items():
