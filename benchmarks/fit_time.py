@@ -23,7 +23,7 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
-from cpunet.training.fitter import Fitter
+from cpunet.training.chain_fit import Fitter
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
 

@@ -27,7 +27,7 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.recipes import load_recipe
-from cpunet.training.fitter import Fitter
+from cpunet.training.chain_fit import Fitter
 from cpunet.training.job import known_response
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response

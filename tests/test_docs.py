@@ -148,7 +148,7 @@ def slugify(title: str) -> str:
     return re.sub(r"[-\s]+", "-", words)
 
 
-SHORT = ("steps=1", "components=4", "squares=2", "start_factors=[1]", "ringing_mhz=[]")
+SHORT = ("steps=1", "start_factors=[1]")
 """A fit that ends at once, whatever it has found."""
 
 

@@ -19,10 +19,7 @@ from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {
     "training.steps": 20,
-    "training.components": 4,
-    "training.squares": 2,
     "training.start_factors": [1],
-    "training.ringing_mhz": [],
     "training.noise_sets": 1,
     "scores.bootstraps": 20,
 }

@@ -201,9 +201,9 @@ def test_wrong_settings_are_named(override, part):
     ("override", "part"),
     [
         ("training.method=cyclegan", "training"),
-        ("training.segments_ns=[a, 1]", "training.segments_ns.0: "),
+        ("training.start_factors=[a, 1]", "training.start_factors.0: "),
         ("generator.slow_ns=[100, 100.0]", "times must differ"),
-        ("training.segments_ns=[3, 1]", "segments_ns must be in rising order"),
+        ("training.level_ns=9000", "level_ns must be less than after_ns"),
         ("preparation.align_at=0.999", "align_at must be half_height"),
         ("search={a: {low: 1, choices: [1, 2]}}", "give either low and high, or choices"),
         ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),

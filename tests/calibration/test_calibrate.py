@@ -26,7 +26,6 @@ READOUT = {
 PLAIN = (
     "generator.slow_ns=[400]",
     "generator.fast_decays_us=[]",
-    "training.ringing_mhz=[]",
     "training.start_factors=[1]",
     "training.steps=5",
 )
@@ -61,8 +60,7 @@ def calibrated_and_reads(
     """A search of two short rounds for few parameters; how often files were read."""
     reads.clear()
     with pytest.MonkeyPatch.context() as patch:
-        for name, few in {"ROUNDS": 2, "STEPS": 6, "FIRST_STEPS": 8}.items():
-            patch.setattr(f"cpunet.calibration.search.{name}", few)
+        patch.setattr("cpunet.calibration.search.ROUNDS", 2)
         run = calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
     return run, reads.copy()
 

@@ -40,7 +40,6 @@ def calibrated(values=(), given=None) -> Calibrated:
         by_chance=(2.0, 0.5),
         pulls=lambda: np.zeros(2),
         residuals=lambda at: at - vector,
-        jacobian=lambda at: np.eye(len(at)),
     )
     return Calibrated(
         problem=problem,

@@ -10,8 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration import alternatives, search
-from cpunet.calibration.alternatives import NEEDED, decaying_chain, other_chain
 from cpunet.calibration.identifiability import Selection
 from cpunet.calibration.nuisances import (
     Freedom,
@@ -22,11 +20,9 @@ from cpunet.calibration.nuisances import (
 )
 from cpunet.calibration.search import Search, _relaxed
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.simulation.fields import solve
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from synthetic import load_recipe
 
 
 @given(st.floats(-3, -0.05), st.floats(0.1, 10))
@@ -57,13 +53,13 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
     assert not len(known_depletion(physics, None)(np.zeros(2)))
 
 
-def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
+def test_only_physics_that_explain_the_pulses_as_well_are_fitted():
     """Of three parameters the second acts as the first one, which has moved by ten errors."""
     columns = np.array([[10.0, 9.9, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 3.0]])
     selection = Selection(columns, np.zeros(3), np.zeros((2, 3)), np.array([1.0, 0, 0]))
     fitted = []
 
-    def problem(response, nearby, free):
+    def problem(response, nearby, free, weights=()):
         fitted.append((free, nearby.centre))
         parameters = SimpleNamespace(
             chain=SimpleNamespace(response=response),
@@ -71,13 +67,12 @@ def test_only_physics_that_explain_the_pulses_as_well_are_fitted(monkeypatch):
             free=free,
             n_chain=0,
         )
+        parameters.widths = np.full(len(free), np.inf)
+        end = SimpleNamespace(information=np.eye(len(free)))
         return SimpleNamespace(
-            parameters=parameters, nearby=nearby, weigh_like=lambda other: None
+            parameters=parameters, nearby=nearby, weights=weights, fitted=lambda: end
         )
 
-    monkeypatch.setattr(
-        search, "levenberg_marquardt", lambda *_, **__: SimpleNamespace(covariance=np.eye(3))
-    )
     found = Search.__new__(Search)
     found.chosen = False
     found.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
@@ -148,73 +143,3 @@ def test_what_is_free_and_what_is_not():
             Freedom.of(free, ["li_thickness=1±0.1"])
     some = Freedom.of("li_thickness")
     assert [nuisance.name for nuisance in some.looked_at] == ["li_thickness_mm"]
-
-
-RECIPE = load_recipe("fast")
-CHAIN, OTHER = (ElectronicsResponse(RECIPE.matching[0], 16.0) for _ in range(2))
-
-
-def compared(chi_square, chain=CHAIN, after=None):
-    """A comparison with a chi-square, and that of another chain."""
-    return SimpleNamespace(
-        parameters=SimpleNamespace(
-            chain=SimpleNamespace(response=chain), vector=lambda: np.empty(0)
-        ),
-        chi_square=lambda: chi_square,
-        by_chance=(100.0, 10.0),
-        of_chain=lambda chain: compared(after, chain),
-    )
-
-
-@pytest.fixture
-def decay_free(monkeypatch):
-    """Stubs of the fits; what they are called with."""
-    called = []
-
-    def fit(plain, fitter):
-        called.append(fitter.decay)
-        return SimpleNamespace(problem=SimpleNamespace(response=OTHER))
-
-    monkeypatch.setattr(alternatives, "_at_these_physics", lambda *_: None)
-    monkeypatch.setattr(alternatives, "with_free_decay", fit)
-    monkeypatch.setattr(alternatives, "levenberg_marquardt", lambda *_, **__: None)
-    return called
-
-
-SETS = SimpleNamespace(tails=SimpleNamespace(known_decay="that of the tails"))
-
-
-def test_what_chance_may_leave_needs_no_other_chain(decay_free):
-    assert decaying_chain(compared(139.0), SETS, RECIPE.matching[1]) is None
-    assert not decay_free
-
-
-@pytest.mark.parametrize(("fall", "kept"), [(NEEDED - 1, False), (NEEDED + 1, True)])
-def test_a_decay_of_free_time_is_kept_if_chi_square_falls(decay_free, fall, kept):
-    found = decaying_chain(compared(141.0, after=141.0 - fall), SETS, RECIPE.matching[1])
-    assert found is (OTHER if kept else None)
-    assert decay_free == ["that of the tails"]
-
-
-def test_each_kind_of_chain_is_tried_in_its_round_and_at_the_end():
-    tried = []
-
-    def never(problem, sets, training):
-        tried.append("never")
-
-    def ever(problem, sets, training):
-        tried.append("ever")
-        return OTHER
-
-    kinds = {never: 1, ever: 2}
-
-    def other(number, *, settled=False):
-        tried.clear()
-        found = other_chain(None, SETS, None, kinds, number, settled=settled)
-        return found, tried.copy()
-
-    assert other(1) == (None, ["never"])
-    assert other(2) == (OTHER, ["ever"])
-    assert other(3) == (None, [])
-    assert other(4, settled=True) == (None, ["never"])
-    assert not kinds

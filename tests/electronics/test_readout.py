@@ -21,6 +21,7 @@ from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.finishing import record_length, with_room
 from cpunet.electronics.readout import (
     RawTraces,
+    by_height,
     coloured_noise,
     draw_other_pulses,
     noise_power,
@@ -261,6 +262,19 @@ def test_piled_up_pulses_are_where_the_truth_says():
     assert rise_ns(rest) - rise_ns(own[alone]) == pytest.approx(traces.piled_ns[alone], abs=5)
     assert rest.max(axis=1) == pytest.approx(traces.piled_kev[alone], rel=0.03)
     assert np.isnan(traces.piled_kev[traces.n_piled == 0]).all()
+
+
+def test_what_acts_by_height_follows_its_definition():
+    """A slew rate limits the steps of large signals, and a curve adds what the height says."""
+    height = np.array([[50.0], [2000.0]])
+    step = height * np.clip(np.arange(-10.0, 30.0) / 10, 0, 1)
+    slow = by_height(step, altered(slew_kev_per_ns=5.0, nonlinearity=None))
+    assert np.diff(slow[1]).max() == pytest.approx(5.0 * 16.0, rel=0.05)
+    np.testing.assert_allclose(slow[0], step[0], atol=0.2)
+    bent = altered(nonlinearity={"fraction": 0.002, "waves": 5})
+    full = bent.adc_top / bent.gain_adc_per_kev
+    added = 0.002 * full * np.sin(2 * np.pi * 5 * step / full)
+    np.testing.assert_allclose(by_height(step, bent), step + added)
 
 
 def test_saturation_is_flagged_and_clipped(pulses: Pulses):

@@ -12,8 +12,12 @@ from cpunet.errors import CpunetError
 from cpunet.networks.by_height import LAG_KNOTS, PER_STEP, ByHeight
 from cpunet.networks.generators import LinearInverse, ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.reading.files import open_pulses
+from cpunet.translation.options import Adc
+from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
-from synthetic import edges, load_recipe, write_run
+from synthetic import edges, load_recipe, write_pulses, write_run
 
 KEV, LIMIT = 2000.0, 60.0
 
@@ -91,3 +95,17 @@ def test_a_run_stores_what_acts_by_height_and_asks_for_energies(run: Path) -> No
         ren.translate(pulses, noise=False)
     low, high = (ren.translate(pulses, energy_kev=kev, noise=False) for kev in (200.0, KEV))
     assert np.abs(np.diff(low)).max() > 1.05 * np.abs(np.diff(high)).max()
+
+
+def test_raw_traces_have_what_acts_by_height(run: Path, tmp_path: Path) -> None:
+    """The largest step of a high pulse is limited, that of a low one is not."""
+    kev = np.repeat([200.0, KEV], 4)
+    pulses = Pulses.of(np.tile(edges(4, seed=4), (2, 1)), dt_ns=16.0, energy_kev=kev)
+    write_pulses(tmp_path / "sim.lh5", pulses)
+    scale = Adc(adc_per_kev=8.0, baseline=1000.0)
+    out = tmp_path / "out.lh5"
+    translate(run, tmp_path / "sim.lh5", out, adc=True, scale=scale, noise=False)
+    traces = open_pulses(out).read().waveforms.astype(float)
+    low, high = np.diff(traces, axis=1).max(axis=1).reshape(2, 4)
+    assert high.max() < 8 * 1.1 * LIMIT
+    assert (low / 200.0 > 1.05 * high / KEV).all()

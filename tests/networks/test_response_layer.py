@@ -19,17 +19,15 @@ from cpunet.recipes.schema import ResponseConfig
 from synthetic import PADDING_AFTER, PADDING_BEFORE
 
 DT_NS, FINE_PER_SAMPLE, SAMPLES = 16.0, 16, 800
-RINGING = {"frequency_MHz": 5.0, "fraction": 0.1, "damping_ns": 160.0}
 
 
-def electronics(poles: tuple[float, ...], ringing: dict | None = None) -> Electronics:
+def electronics(poles: tuple[float, ...]) -> Electronics:
     """A chain with slow part and fast decay whose times are among the layer's fixed ones."""
     return Electronics.model_validate(
         read_electronics("legend200").model_dump()
         | {
             "bandwidth_poles_ns": poles,
             "slow": {"fraction": 0.065, "tau_ns": 400.0},
-            "ringing": ringing,
             "decays": [{"fraction": 0.96, "tau_us": 80.0}, {"fraction": 0.04, "tau_us": 4.0}],
             "before_ns": DT_NS * PADDING_BEFORE,
             "record_ns": DT_NS * (PADDING_BEFORE + SAMPLES + PADDING_AFTER),
@@ -37,7 +35,7 @@ def electronics(poles: tuple[float, ...], ringing: dict | None = None) -> Electr
     )
 
 
-def layer(poles: tuple[float, ...], ringing: dict | None = None) -> ElectronicsResponse:
+def layer(poles: tuple[float, ...]) -> ElectronicsResponse:
     """The same chain as a layer."""
     config = ResponseConfig(
         name="response",
@@ -45,9 +43,6 @@ def layer(poles: tuple[float, ...], ringing: dict | None = None) -> ElectronicsR
         slow_ns=(100, 400),
         decay_us=80,
         fast_decays_us=(4, 16),
-        free_decays=False,
-        ringing_mhz=None if ringing is None else ringing["frequency_MHz"],
-        ringing_ns=RINGING["damping_ns"],
         drift_terms=0,
         deviations=False,
         by_height=False,
@@ -55,8 +50,6 @@ def layer(poles: tuple[float, ...], ringing: dict | None = None) -> ElectronicsR
     response = ElectronicsResponse(config, DT_NS)
     response.slow_weights[1] = 0.065
     response.decay_weights[0] = 0.04
-    if ringing is not None:
-        response.ringing[0] = ringing["fraction"]
     return response
 
 
@@ -74,15 +67,12 @@ def windows(pulses: Pulses) -> npt.NDArray[np.float32]:
     return blocks.mean(axis=2, dtype=float).astype(np.float32)
 
 
-CHAINS = [((40.0, 40.0), None), ((55.0, 35.0), None), ((55.0, 35.0), RINGING), ((60.0,), None)]
-
-
-@pytest.mark.parametrize(("poles", "ringing"), CHAINS)
+@pytest.mark.parametrize("poles", [(40.0, 40.0), (55.0, 35.0), (60.0,)])
 @pytest.mark.parametrize("width_ns", [10, 20, 80])
-def test_finely_simulated_pulses_come_out_as_from_the_exact_chain(poles, ringing, width_ns):
+def test_finely_simulated_pulses_come_out_as_from_the_exact_chain(poles, width_ns):
     pulses = fine_pulses(width_ns)
-    got = layer(poles, ringing)(windows(pulses))
-    wanted = linear_response(pulses, electronics(poles, ringing))
+    got = layer(poles)(windows(pulses))
+    wanted = linear_response(pulses, electronics(poles))
     # 1e-4 is what a decay loses in half a sample: the layer's begins at a sample's edge,
     # 16 ns / 2 / 80 µs. The rest is the spline between the samples: at worst for a single
     # pole, which passes most of what is beyond half the sampling rate, and an edge of 44 ns.
@@ -121,19 +111,6 @@ def test_pulses_of_any_height_and_time():
     later = np.pad(pulses, ((0, 0), (7, 0)))[:, :SAMPLES]
     records, moved = response(pulses), response(3 * later)
     np.testing.assert_allclose(moved[:, 7:-7], 3 * records[:, :-14], atol=1e-5)
-
-
-def test_decays_may_have_times_of_their_own():
-    fixed = layer((55.0, 35.0))
-    free = ElectronicsResponse(fixed.config.model_copy(update={"free_decays": True}), 16.0)
-    free.fill(free.arrays() | fixed.arrays())
-    pulses = windows(fine_pulses(20))
-    np.testing.assert_array_equal(free(pulses), fixed(pulses))
-    free.decay_weights[...] = 0.03
-    free.log_fast_decays_us[...] = np.log([3.0, 30.0])
-    said = free.describe()
-    assert said["fast_decay_1_us"] == pytest.approx(3)
-    assert said["fast_decay_2_share"] == pytest.approx(0.03)
 
 
 END = 400

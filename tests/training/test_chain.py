@@ -37,7 +37,7 @@ ONE_START = (
     "training.start_factors=[1]",
     "training.steps=14",
 )
-SHORT = ("training.steps=4", "training.ringing_mhz=[]")
+SHORT = ("training.steps=4",)
 RECIPE = load_recipe("fast", ONE_START)
 
 

@@ -14,12 +14,12 @@ from cpunet.networks.response_layer import (
     late_lags,
     padding,
 )
+from cpunet.training.chain_fit import Fitter
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
 from cpunet.training.comparison import Comparison, Sides, hats
 from cpunet.training.derivatives import Basis
 from cpunet.training.deviations import with_deviations
-from cpunet.training.fitter import Fitter
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
 from cpunet.training.verdict import PARTS, Verdict, verdict

@@ -28,10 +28,7 @@ from synthetic import (
 )
 
 SHORT = (
-    "training.components=4",
-    "training.squares=2",
     "training.start_factors=[1]",
-    "training.ringing_mhz=[]",
     "generator.slow_ns=[]",
     "generator.fast_decays_us=[]",
 )

@@ -15,10 +15,9 @@ from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
-from cpunet.training.chain_fit import POOR, differences
+from cpunet.training.chain_fit import POOR, Fitter, differences
 from cpunet.training.chain_parameters import SmoothParameters
 from cpunet.training.comparison import Difference
-from cpunet.training.fitter import Fitter
 from cpunet.training.joint import Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import Fit, amplitude_shift, fit_response
@@ -53,9 +52,7 @@ class Problem(Unpaired):
     def fit(self, seed: int, *overrides: str, sim: Pulses | None = None) -> Told:
         recipe, rng = load_recipe("fast", [*FEW, *overrides]), np.random.default_rng(seed)
         sides, steps = (self.sim if sim is None else sim, self.data), []
-        fitter = Fitter(
-            recipe.matching.training, listener=lambda *step: steps.append(step), seed=seed
-        )
+        fitter = Fitter(recipe.matching.training, listener=lambda *step: steps.append(step))
         sets = PulseSets(*sides, self.noise, recipe, rng)
         return Told(*fit_response(sets, fitter), steps)
 
@@ -138,7 +135,6 @@ def test_what_a_fit_tells(near: Told) -> None:
 @pytest.mark.thorough
 def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
     short = ("training.steps=1", "training.search_pulses=250", "training.start_factors=[1]")
-    short += ("training.ringing_mhz=[]",)
     few = Problem(problem.sim[:250], problem.data[:250], problem.noise)
     first, again, other = (few.fit(seed, *short) for seed in (5, 5, 6))
     assert first[0].describe() == again[0].describe()
@@ -146,7 +142,7 @@ def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
     assert first[0].describe() != other[0].describe()
 
 
-DRIFT = ("training.drift_terms=2", "training.start_factors=[1]", "training.ringing_mhz=[]")
+DRIFT = ("training.drift_terms=2", "training.start_factors=[1]")
 
 
 @pytest.mark.thorough
@@ -256,7 +252,3 @@ def test_the_shift_of_amplitudes_is_told(shift: float) -> None:
     found, error = amplitude_shift([quantiles])
     assert found == pytest.approx(shift)
     assert error == pytest.approx((1e-6 * (1 / 16 + 0.5)) ** 0.5)
-
-
-def test_no_ringing_is_found_where_there_is_none(near: Told) -> None:
-    assert "ringing_mhz" not in near.response.describe()

@@ -103,22 +103,18 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
         ("{training: {low: 0.1, high: 0.2}}", "training"),
         ("{peaks.FEP.energy_kev: {low: 1, high: 2}}", "search.peaks.FEP.energy_kev: only"),
         (
-            "{training.ridge: {low: 0.1, high: 2}}",
-            "search.training.ridge: settings: training.ridge: Input",
-        ),
-        (
-            "{training.clip: {low: -1, high: 2}}",
-            "search.training.clip: settings: training.clip: Input",
+            "{training.before_ns: {low: -1, high: 2}}",
+            "search.training.before_ns: settings: training.before_ns: Input",
         ),
         (
             "{training.steps: {choices: [10, many]}}",
             "search.training.steps: settings: training.steps: Input",
         ),
-        ("{training.ridge: {low: 0.1}}", "search.training.ridge: "),
-        ("{training.ridge: {low: 0.2, high: 0.1}}", "search.training.ridge: "),
-        ("{training.ridge: {low: 0, high: 0.1, log: true}}", "search.training.ridge: "),
-        ("{training.ridge: {choices: [0.1]}}", "search.training.ridge"),
-        ("{training.ridge: {from: 0.1, to: 1}}", "search.training.ridge"),
+        ("{training.level_ns: {low: 0.1}}", "search.training.level_ns: "),
+        ("{training.level_ns: {low: 0.2, high: 0.1}}", "search.training.level_ns: "),
+        ("{training.level_ns: {low: 0, high: 0.1, log: true}}", "search.training.level_ns: "),
+        ("{training.level_ns: {choices: [0.1]}}", "search.training.level_ns"),
+        ("{training.level_ns: {from: 0.1, to: 1}}", "search.training.level_ns"),
         ("null", "has no search space; add one"),
     ],
 )
@@ -149,12 +145,12 @@ class Scored:
         monkeypatch.setattr(HeldOut, "score", lambda _self, recipe: self.score(recipe))
 
     def score(self, recipe: Any) -> float:
-        self.tried.append(recipe.training.ridge)
-        return 1 + abs(recipe.training.ridge - 0.1)
+        self.tried.append(recipe.training.level_ns)
+        return 1 + abs(recipe.training.level_ns - 1000)
 
 
-RIDGE = "training.ridge: {low: 0.01, high: 0.2, log: true}"
-FIT = f"search={{{RIDGE}, training.clip: {{choices: [7, 4]}}}}"
+LEVEL = "training.level_ns: {low: 100, high: 2000, log: true}"
+FIT = f"search={{{LEVEL}, training.before_ns: {{choices: [2048, 2000]}}}}"
 
 
 @pytest.fixture
@@ -170,10 +166,10 @@ def states(study: Any) -> list[str]:
 def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
     files, scored, tmp_path
 ):
-    recipe = load_recipe("fast", [FIT, "training.clip=4"])
+    recipe = load_recipe("fast", [FIT, "training.before_ns=2000"])
     study = tune(*files, tmp_path / "tune", recipe=recipe, trials=2)
     assert study.trials[0].user_attrs == {UNCHANGED: True}
-    own = {"training.ridge": recipe.training.ridge, "training.clip": "4"}
+    own = {"training.level_ns": recipe.training.level_ns, "training.before_ns": "2000"}
     assert study.trials[0].params == own
     tune(*files, tmp_path / "tune", recipe=recipe, trials=10)
     assert len(scored.tried) == 10
@@ -188,8 +184,8 @@ def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
     best = min(rows, key=lambda row: float(row["value"]))
     tuned = load_recipe(str(tmp_path / "tune" / "best.yaml"))
     assert tuned.search is None
-    assert tuned.training.ridge == float(best["params_training.ridge"])
-    assert tuned.training.clip == float(best["params_training.clip"])
+    assert tuned.training.level_ns == float(best["params_training.level_ns"])
+    assert tuned.training.before_ns == float(best["params_training.before_ns"])
     assert tuned.scores == recipe.scores
 
     with pytest.raises(CpunetError, match="begun with other settings or pulses: "):

@@ -28,10 +28,7 @@ RECIPE = load_recipe(
     [
         "scores.bootstraps=10",
         "training.steps=2",
-        "training.components=4",
-        "training.squares=2",
         "training.start_factors=[1]",
-        "training.ringing_mhz=[]",
     ],
 )
 KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
@@ -290,7 +287,7 @@ def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_pa
     sim = PulseFile(reference_data / "closure" / "sim.lh5")
     data = PulseFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
     # the simulation is of another detector, which no start of a fit would cure
-    recipe = load_recipe("fast", ["training.start_factors=[1]", "training.ringing_mhz=[]"])
+    recipe = load_recipe("fast", ["training.start_factors=[1]"])
     made = train(sim, data, tmp_path / "run", recipe=recipe, peak="300-", device="cpu")
     assert 200 < made.data.used < 1000
     metrics = validate(tmp_path / "run", sim, data, tmp_path / "report").metrics

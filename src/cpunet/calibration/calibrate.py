@@ -57,9 +57,9 @@ from cpunet.settings import require_seed, yaml_text
 from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.simulate import simulate
+from cpunet.training.chain_parameters import with_settings
 from cpunet.training.job import TrainingJob, train_chain
-from cpunet.training.moments import MIN_PULSES
-from cpunet.training.pulse_sets import PulseSets
+from cpunet.training.pulse_sets import MIN_PULSES, PulseSets
 from cpunet.training.run import RUN
 
 log = logging.getLogger(__name__)
@@ -249,7 +249,7 @@ class _Job:
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
         recipe = self.recipe.model_copy(update={"training": training})
         job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.data, folder)
-        run = train_chain(job, calibrated.response)
+        run = train_chain(job, with_settings(calibrated.response, deviations=False))
         seconds = round(time.perf_counter() - clock, 1)
         assert run.fit is not None  # of a chain
         content |= {
@@ -322,7 +322,7 @@ class _Job:
 
     def _content(self, calibrated: Calibrated) -> dict[str, Any]:
         """Content of ``calibration.json``, but for the last fit."""
-        compared = calibrated.problem.bands
+        compared = [functions.sides for functions in calibrated.problem.functions]
         content = {
             "cpunet": cpunet.__version__,
             "detector": self.stored.detector.name,
@@ -330,8 +330,8 @@ class _Job:
             "peak": self.peak,
             "seed": self.seed,
             "events": {
-                "sim": sum(len(band.sim) for band in compared),
-                "data": sum(len(band.moments.data) for band in compared),
+                "sim": sum(len(sides) for sides in compared),
+                "data": sum(len(sides.data) for sides in compared),
             },
             **described(calibrated),
         }

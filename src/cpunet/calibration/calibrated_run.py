@@ -296,7 +296,7 @@ def profiles_figure(content: Mapping[str, Any]) -> Figure:
 
 @styled
 def pulls_figure(content: Mapping[str, Any]) -> Figure:
-    """Pulls of all moments before and after the calibration.
+    """Pulls of all functions before and after the calibration.
 
     Parameters
     ----------
@@ -361,10 +361,10 @@ def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _group(name: str) -> str:
-    """Group to which a moment belongs."""
+    """Group to which a function belongs."""
     plain = name.split(": ")[-1]
-    if plain.endswith("squared"):
-        return "squares"
+    if plain.startswith("component") and "amplitude" in plain:
+        return "components with current amplitude"
     for group in ("samples", "drift time"):
         if plain.startswith(group):
             return group

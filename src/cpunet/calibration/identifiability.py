@@ -114,7 +114,7 @@ class Information:
         left = whole[n:, n:] - mixed @ np.linalg.solve(of_chain, mixed.T)
         physics = problem.nearby.simulator.physics
         nuisances = tuple(physics.nuisances[i] for i in parameters.free)
-        pairs = sum(band.pairs for band in problem.bands)
+        pairs = sum(functions.pairs for functions in problem.functions)
         known = jacobian[problem.moments + len(widths) :, n:]
         return cls(nuisances, 0.5 * (left + left.T), widths[n:], pairs, known)
 

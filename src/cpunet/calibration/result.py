@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from cpunet.calibration.alternatives import BEYOND_CHANCE
 from cpunet.calibration.identifiability import Information, together
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.levenberg_marquardt import descend
 
 OFFSETS = (-1.5, 0.0, 1.5)  # of a profile, in errors
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
+# Chi-square beyond chance, in its standard deviations, that is too much.
+BEYOND_CHANCE = 4.0
 # Advice where a parameter is unexpected, besides the general one.
 ADVICE = {
     "self_repulsion": "it acts within each hit, so hits that are not merged within "
@@ -260,14 +260,13 @@ def _together(calibrated: Calibrated) -> list[dict[str, dict[str, float] | float
 
 
 def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
-    """Chi-square including priors along each free coordinate, all others at their best.
+    """Chi-square including priors along the valley of each free coordinate.
 
-    Derivatives are those of the minimum, since the valley is nearly a parabola.
+    All others are where they are best if the valley is a parabola.
     """
     problem, physics = calibrated.problem, calibrated.physics
     parameters = problem.parameters
     here, n = parameters.vector(), parameters.n_chain
-    jacobian = problem.jacobian(here)
     found = {}
     for k, i in enumerate(parameters.free, n):
         error = float(np.sqrt(calibrated.covariance[k, k]))
@@ -279,10 +278,9 @@ def _profiles(calibrated: Calibrated) -> dict[str, dict[str, list[float]]]:
             x = float(here[k] + offset * error)
             added = nuisance.kind == "added"  # told without bounds
             values.append(nominal + x if added else nuisance.value(nominal, x))
-            low, high = parameters.low.copy(), parameters.high.copy()
-            low[k] = high[k] = x
-            there = here + offset * valley
-            costs.append(descend(problem.residuals, there, jacobian, low, high)[1])
+            there = np.clip(here + offset * valley, parameters.low, parameters.high)
+            residuals = problem.residuals(there)
+            costs.append(float(residuals @ residuals))
         found[nuisance.name] = {"value": values, "chi_square": costs}
     parameters.set(here)
     return found

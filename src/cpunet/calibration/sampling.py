@@ -16,8 +16,6 @@ Phys. Rev. D 88 (2013) 063537; Percival et al., MNRAS 439 (2014) 2531).
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from cpunet.calibration.joint_problem import JointProblem
@@ -34,17 +32,15 @@ def of_events(problem: JointProblem, scale: float) -> tuple[Values, Values]:
 
     The errors of the functions are larger by `scale`, those of the priors are not.
     """
-    vector = problem.parameters.vector()
-    jacobian = problem.jacobian(vector)
+    vector, functions = problem.parameters.vector(), problem.functions
+    _, jacobian = problem.both(vector)
     deviations, slopes = [], []
     for k in range(PARTS):
-        some = slice(k, None, PARTS)
-        part = problem.of_bands(
-            [replace(b, sim=b.sim.of(some), rows=b.rows[some]) for b in problem.bands]
-        )
-        deviations.append(part.residuals(vector)[: problem.moments])
-        slopes.append(part.jacobian(vector)[: problem.moments])
-    n = sum(len(band.sim) + len(band.moments.data) for band in problem.bands)
+        part = problem.of_parts([one.of_events(slice(k, None, PARTS)) for one in functions])
+        residuals, derivatives = part.both(vector)
+        deviations.append(residuals[: problem.moments])
+        slopes.append(derivatives[: problem.moments])
+    n = sum(len(one.sides) + len(one.sides.data) for one in functions)
     factor = scale**2 * of_weights(n, problem.by_chance[0], len(vector))
     return of_parts(jacobian, np.array(slopes), np.array(deviations), factor)
 

@@ -14,25 +14,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cpunet.calibration.alternatives import OTHER_CHAINS, other_chain
 from cpunet.calibration.identifiability import Information, Selection
-from cpunet.calibration.joint_problem import JointParameters, JointProblem, fewest
+from cpunet.calibration.joint_problem import JointParameters, JointProblem, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
-from cpunet.calibration.result import Calibrated
+from cpunet.calibration.result import BEYOND_CHANCE, Calibrated
 from cpunet.calibration.sampling import of_events
-from cpunet.calibration.sliced_functions import SlicedFunctions
+from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
-from cpunet.training.chain_parameters import with_decay
-from cpunet.training.levenberg_marquardt import Minimum, levenberg_marquardt
+from cpunet.training.chain_fit import POOR, WIDER, Fitter, Parabola, fit_chain
+from cpunet.training.chain_parameters import SmoothParameters, with_decay, with_settings
+from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_problem import Band, ResponseProblem
 
 log = logging.getLogger(__name__)
 
-ROUNDS, STEPS, FIRST_STEPS = 8, 12, 20
+ROUNDS = 8
 # The search ends when all coordinates move by less than this fraction of their error.
 SETTLED = 0.4
 # Maximum move of a coordinate in one round, in units of the reach of its derivative, and number
@@ -45,6 +44,7 @@ NEEDED, MAX_MORE = 25.0, 3
 # forecast, and are alternatives if it does so by less than the second; most, and their rounds.
 LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
 USUAL_ROUNDS = 4  # of most searches, for the remaining time
+MAX_DEVIATED = 2  # times that deviations of the step response are learned
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
 
@@ -78,22 +78,23 @@ class Search:
     chosen: bool = False
 
     def __post_init__(self) -> None:
-        self._bands = self.sets.bands()
-        self._functions = [SlicedFunctions(band.moments) for band in self._bands]
+        self._sides = self.sets.sides()
+        several = len(self._sides) > 1
+        self._bands = [name if several else "" for name in self.sets.names]
+        self._functions = self._wide(1.0)
         nuisances = self.simulator.physics.nuisances
         self._all = list(range(len(nuisances)))
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
         dt_ns = self.simulator.physics.settings.dt_ns
         self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
-        with_decay(self._start, float(np.mean([b.moments.slope for b in self._bands])))
+        with_decay(self._start, self.sets.tail_slope)
 
     def plan(self) -> Information:
         """Information of the pulses on all parameters that may become free, before a fit."""
-        few = fewest(self._bands)
-        nearby = Nearby.about(self.simulator, np.zeros(self._n), []).again(self._all, few)
-        problem = self._problem(self._chain(), nearby, self._all)
-        problem.few = few
-        return self._looked(problem)[0]
+        few = first(self._functions)
+        nearby = Nearby.about(self.simulator, np.zeros(self._n), [])
+        nearby = nearby.again(self._all, events(few))
+        return self._looked(self._problem(self._chain(), nearby, self._all, few))[0]
 
     def run(self) -> Calibrated:
         """Search until the physics no longer changes.
@@ -108,17 +109,21 @@ class Search:
         before = self._problem(response, nearby, [], held=True)
         self._tell("as simulated", before)
         free = self._first_free(response, nearby)
-        kinds, more, last = dict(OTHER_CHAINS), 0, np.zeros(self._n)
+        deviated, more, last = 0, 0, np.zeros(self._n)
         for number in range(1, ROUNDS + 1):
-            problem = self._problem(response, nearby, free, held=number == 1)
-            found = levenberg_marquardt(problem, STEPS, None, coarse=number == 1)
+            if number == 1:
+                problem, found = self._from_far(response, nearby, free)
+            else:
+                problem = self._problem(response, nearby, free)
+                found = problem.fitted()
             self._tell(f"round {number}", problem, found)
             response = problem.parameters.chain.response
             moved = problem.parameters.coordinates - nearby.centre
             settled = number > 1 and _settled(problem, found, moved)
-            matching = self.recipe.matching.training
-            other = other_chain(problem, self.sets, matching, kinds, number, settled=settled)
-            response, settled = other or response, settled and other is None
+            rings = number == 1 and problem.chi_square() > POOR * problem.moments
+            if (rings or settled) and deviated < MAX_DEVIATED:
+                other, deviated = self._deviated(problem), deviated + 1
+                response, settled = other or response, settled and other is None
             added = self._needed(problem) if settled and more < MAX_MORE else None
             if number == ROUNDS or (settled and added is None):
                 break
@@ -127,6 +132,18 @@ class Search:
             last = _relaxed(moved, last)
             nearby = self._moved(nearby, last, free)
         return self._ended(problem, found, before, number, settled=settled)
+
+    def _from_far(
+        self, response: ElectronicsResponse, nearby: Nearby, free: Sequence[int]
+    ) -> tuple[JointProblem, Parabola]:
+        """First fit, to some of the pulses, with wider functions first."""
+        at = None
+        for wider in (*WIDER, 1.0):
+            functions = first(self._wide(wider))
+            problem = self._problem(response, nearby, free, functions, held=True, at=at)
+            found = problem.fitted()
+            response, at = problem.parameters.chain.response, problem.parameters.coordinates
+        return problem, found
 
     @property
     def simulations(self) -> int:
@@ -142,35 +159,55 @@ class Search:
         return len(self.simulator.physics.nuisances)
 
     def _chain(self) -> ElectronicsResponse:
-        """Fit of the chain alone to some of the pulses, with the physics as simulated."""
-        bands = self.sets.bands(self.recipe.matching.training.search_pulses)
-        problem = ResponseProblem(copy.deepcopy(self._start), bands, draws=1)
-        levenberg_marquardt(problem, FIRST_STEPS, None)
-        chain: ElectronicsResponse = problem.response
-        return chain
+        """Fit of the chain alone, with the physics as simulated."""
+        fitter = Fitter(self.recipe.matching.training)
+        few = [sides.of(fitter.training.search_pulses) for sides in self._sides]
+        return fit_chain(copy.deepcopy(self._start), few, fitter).response
+
+    def _wide(self, wider: float) -> list[SlicedJoint]:
+        both = zip(self._sides, self._bands, strict=True)
+        return [SlicedJoint(sides, wider, band) for sides, band in both]
 
     def _problem(
         self,
         response: ElectronicsResponse,
         nearby: Nearby,
         free: Sequence[int],
+        functions: Sequence[SlicedJoint] = (),
         *,
         held: bool = False,
+        at: Values | None = None,
+        weights: Sequence[Values] = (),
     ) -> JointProblem:
         """Comparison near the point at which pulses were simulated."""
         response, physics = copy.deepcopy(response), self.simulator.physics
-        parameters = JointParameters(
-            response, physics, nearby.centre, free, self.given, self._start
-        )
-        sets = parameters, self._bands, self._functions, nearby
-        return JointProblem(*sets, self.recipe, self.known, held)
+        at = nearby.centre if at is None else at
+        parameters = JointParameters(response, physics, at, free, self.given, self._start)
+        sets = parameters, functions or self._functions, nearby
+        return JointProblem(*sets, self.recipe, self.known, held, weights)
+
+    def _deviated(self, problem: JointProblem) -> ElectronicsResponse | None:
+        """The chain with deviations of its step response, if physics leave too much.
+
+        They absorb what the chain does not describe; physics would absorb a part of it: an
+        early decay between the fixed ones looks like more self-repulsion.
+        """
+        mean, spread = problem.by_chance
+        if problem.chi_square() < mean + BEYOND_CHANCE * spread:
+            return None
+        chain = with_settings(problem.parameters.chain.response, deviations=False)
+        sides = [functions.sides for functions in problem.here()]
+        response = with_deviations(chain, sides, lambda _: None).response
+        parameters = copy.copy(problem.parameters)
+        parameters.chain = SmoothParameters(response, self._start)
+        other = replace(problem, parameters=parameters)
+        return response if other.chi_square() < problem.chi_square() - NEEDED else None
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
         """Parameters that are free initially."""
         if self.chosen:
             return self._all
-        problem = self._problem(response, nearby, self._first)
-        problem.few = fewest(self._bands)
+        problem = self._problem(response, nearby, self._first, first(self._functions))
         information, selection = self._looked(problem)
         return [self._first[i] for i in selection.begin(information)]
 
@@ -214,12 +251,11 @@ class Search:
         parameters = problem.parameters
         fixed = [i for i in self._all if i not in parameters.free]
         missing = problem.nearby.unknown(fixed)
-        few = fewest(self._bands, LOOKED_AT_WITH)
+        few = first(self._functions, LOOKED_AT_WITH)
         if missing:
-            problem.nearby = problem.nearby.again(missing, few)
-        whole = self._problem(parameters.chain.response, problem.nearby, self._all)
-        whole.few = few
-        whole.parameters.coordinates = parameters.coordinates.copy()
+            problem.nearby = problem.nearby.again(missing, events(few))
+        chain, at = parameters.chain.response, parameters.coordinates
+        whole = self._problem(chain, problem.nearby, self._all, few, at=at)
         information, selection = self._looked(whole)
         here, _ = selection.cost(parameters.free)
         falls = {i: here - selection.cost([*parameters.free, i])[0] for i in fixed}
@@ -228,12 +264,11 @@ class Search:
     def _looked(self, problem: JointProblem) -> tuple[Information, Selection]:
         """What all pulses, and each half of them, tell of the free parameters."""
         parameters, vector = problem.parameters, problem.parameters.vector()
-        residuals = problem.residuals(vector)
-        jacobian = problem.jacobian(vector)
-        halves = [
-            problem.of_bands([_half(band, k) for band in problem.bands]).residuals(vector)
-            for k in range(2)
-        ]
+        residuals, jacobian = problem.both(vector)
+        halves = []
+        for k in range(2):
+            half = [functions.some(slice(k, None, 2)) for functions in problem.functions]
+            halves.append(problem.of_parts(half).residuals(vector))
         selection = Selection(
             jacobian,
             residuals,
@@ -244,7 +279,7 @@ class Search:
 
     def _alternatives(
         self, problem: JointProblem, selection: Selection
-    ) -> list[tuple[JointProblem, Minimum]]:
+    ) -> list[tuple[JointProblem, Parabola]]:
         """Fits of other sets of parameters that may explain the pulses as well."""
         if self.chosen:
             return []
@@ -262,9 +297,9 @@ class Search:
                 for _ in range(OTHER_ROUNDS):
                     move = np.where(kept, there, 0) - nearby.centre
                     nearby = self._moved(nearby, move, other)
-                    fit = self._problem(fit.parameters.chain.response, nearby, other)
-                    fit.weigh_like(problem)
-                    minimum = levenberg_marquardt(fit, STEPS, None, coarse=False)
+                    chain = fit.parameters.chain.response
+                    fit = self._problem(chain, nearby, other, weights=problem.weights)
+                    minimum = fit.fitted()
                     there = fit.parameters.coordinates
                     if _settled(fit, minimum, there - nearby.centre):
                         break
@@ -277,7 +312,7 @@ class Search:
     def _ended(
         self,
         problem: JointProblem,
-        found: Minimum,
+        found: Parabola,
         before: JointProblem,
         rounds: int,
         *,
@@ -289,7 +324,7 @@ class Search:
         if best[1].cost < found.cost - NEEDED:
             problem, found = best
             promised, information, _ = self._examined(problem)
-        before.weigh_like(problem)
+        before = replace(before, weights=problem.weights)
         mean, spread = problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
         scale = float(np.sqrt(max(1.0, problem.chi_square() / (mean + 2 * spread))))
@@ -313,21 +348,21 @@ class Search:
             alternatives=[one for one in rises if one[1] < SAME],
         )
 
-    def _tell(self, when: str, problem: JointProblem, found: Minimum | None = None) -> None:
+    def _tell(self, when: str, problem: JointProblem, found: Parabola | None = None) -> None:
         parameters, physics = problem.parameters, self.simulator.physics
         told = [f"{when}: chi-square {problem.chi_square() / problem.moments:.2f} per moment"]
-        errors: Values = np.empty(0) if found is None else np.sqrt(found.covariance.diagonal())
-        for i, error in zip(parameters.free, errors[parameters.n_chain :], strict=True):
+        errors = np.empty(0) if found is None else _errors(problem, found)
+        for i, error in zip(parameters.free, errors, strict=True):
             value, own = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
             told.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
         log.info(", ".join(told))
 
 
-def _half(band: Band, k: int) -> Band:
-    """Every other pulse of both sides, beginning with the first or the second."""
-    some = slice(k, None, 2)
-    moments = replace(band.moments, data=band.moments.data[some])
-    return replace(band, sim=replace(band.sim.of(some), moments=moments), rows=band.rows[some])
+def _errors(problem: JointProblem, found: Parabola) -> Values:
+    """Standard deviations of the free coordinates."""
+    parameters = problem.parameters
+    covariance = np.linalg.inv(found.information + np.diag(parameters.widths**-2.0))
+    return np.asarray(np.sqrt(covariance.diagonal())[parameters.n_chain :])
 
 
 def _relaxed(moved: Values, last: Values) -> Values:
@@ -341,8 +376,7 @@ def _relaxed(moved: Values, last: Values) -> Values:
     return share * moved
 
 
-def _settled(problem: JointProblem, found: Minimum, moved: Values) -> bool:
+def _settled(problem: JointProblem, found: Parabola, moved: Values) -> bool:
     """Whether all coordinates have moved by a small fraction of their errors."""
-    parameters = problem.parameters
-    errors = np.sqrt(found.covariance.diagonal()[parameters.n_chain :])
-    return bool((np.abs(moved[parameters.free]) < SETTLED * errors).all())
+    moves = np.abs(moved[problem.parameters.free])
+    return bool((moves < SETTLED * _errors(problem, found)).all())

@@ -1,110 +1,125 @@
-"""Functions of single pulses whose means a calibration compares.
+r"""Functions of single pulses whose means a calibration compares.
 
-Pulses are aligned at half maximum. The first principal component of their shapes is then how
-early their charge begins to move: their drift time. Velocities and impurities change its
-density, above all at its end. The other components and the current amplitude are evaluated in
-slices of drift time. They distinguish what depends on drift time, such as the growth of the
-charge cloud, from what does not: the readout.
+The first principal component of aligned pulses is how early their charge begins to move: their
+drift time :math:`t`.  Velocities and impurities change its density, above all at its end.  The
+other components :math:`c_i` and the current amplitude :math:`A` are evaluated in slices of the
+drift time: what depends on it, such as the growth of the charge cloud, is thus distinguished
+from what does not, the readout.  With Gaussian bins :math:`g_k` the functions are those of
+`cpunet.training.joint`, :math:`g_k(t)`, :math:`c_i\, g_k(t)`, and
+:math:`g_j(\ln A)\, g_k(t)`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from cpunet.training.moments import (
-    Moments,
-    Readings,
-    Values,
-    gaussian_bins,
-    joined,
-    products,
-)
+from cpunet.training.aligned import Aligned, Values
+from cpunet.training.comparison import Sides
+from cpunet.training.derivatives import Changes, Derivatives
+from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
 
 # Bins of the drift time; slices of drift time; components and current amplitude bins in each.
 # For few pulses, half as many.
-DENSITY, SLICES, COMPONENTS, AMPLITUDES = 24, 8, 6, 8
+DENSITY, SLICES, OTHERS, AMPLITUDES = 24, 8, 6, 8
 FEW = 700
 # Widths in units of the spacing, and minimum widths: twice the effect of noise.
 NARROW, WIDE = 1.0, 0.8
 MIN_DENSITY, MIN_SLICE, MIN_AMPLITUDE = 0.02, 0.05, 0.008
 
 
-class SlicedFunctions:
-    r"""The functions of `Moments`, and further ones in slices of drift time.
-
-    With the drift time :math:`t` and Gaussian bins of centre :math:`c_k` and width
-    :math:`w_k`,
-
-    .. math:: g_k(t) = \exp\left[-\frac{1}{2} \Big(\frac{t - c_k}{w_k}\Big)^2\right],
-
-    the further functions are the bins of drift time, :math:`g_k(t)`, the other components in
-    slices, :math:`a_i\, g_k(t)`, and the bins of the current amplitude in slices,
-    :math:`g_j(\ln A)\, g_k(t)`.
+class SlicedJoint(Joint):
+    """Differences of both sides in slices of drift time, for any response.
 
     Parameters
     ----------
-    moments
-        Moments defined by the data.
+    sides, wider
+        See `cpunet.training.joint.Joint`.
+    band
+        Energies of the pulses, if there are several bands.
     """
 
-    def __init__(self, moments: Moments) -> None:
-        self.moments = moments
-        self._first = len(moments.config.segments) - 1
-        drift, amplitude = moments.data.linear[:, self._first], moments.data.log_amplitude
-        parts = 2 if len(moments.data) < FEW else 1
-        self._components = min(COMPONENTS, moments.config.components - 1)
+    def __init__(self, sides: Sides, wider: float = 1.0, band: str = "") -> None:
+        super().__init__(sides, wider)
+        self.band = band
+        drift = self._shape(sides.data)[:, -1]
+        parts = 2 if len(drift) < FEW else 1
         # the density ends abruptly at the longest drift times
-        self._density = _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, MIN_DENSITY)
-        self._slices = _points(drift, SLICES // parts, (0.03, 0.97), WIDE, MIN_SLICE)
-        self._amplitudes = _points(
-            amplitude, AMPLITUDES // parts, (0.05, 0.98), NARROW, MIN_AMPLITUDE
-        )
+        self._bands = [
+            (centres, wider * widths)
+            for centres, widths in (
+                _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, MIN_DENSITY),
+                _points(drift, SLICES // parts, (0.03, 0.97), WIDE, MIN_SLICE),
+                _points(
+                    sides.data.log_amplitude,
+                    AMPLITUDES // parts,
+                    (0.05, 0.98),
+                    NARROW,
+                    MIN_AMPLITUDE,
+                ),
+            )
+        ]
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the functions."""
-        slices = range(1, len(self._slices[0]) + 1)
-        return (
-            *self.moments.names,
-            *(f"drift time, bin {i + 1}" for i in range(len(self._density[0]))),
-            *(f"component {c + 2}, slice {s}" for c in range(self._components) for s in slices),
+        times, components = self.sides.time_ns, self.matrix.shape[1] - SEGMENTS
+        density, slices, amplitudes = (range(1, len(c) + 1) for c, _ in self._bands)
+        names = (
             *(
-                f"current amplitude, bin {a + 1}, slice {s}"
-                for a in range(len(self._amplitudes[0]))
-                for s in slices
+                f"samples about {t[len(t) // 2]:.0f} ns"
+                for t in np.array_split(times, SEGMENTS)
             ),
+            *(f"component {components - i}" for i in range(components)),
+            *(f"current amplitude, bin {k + 1}" for k in range(len(self.places))),
+            *(
+                f"component {components - i}, current amplitude, bin {k + 1}"
+                for k in range(len(self.places) if self.products else 0)
+                for i in range(components)
+            ),
+            *(f"drift time, bin {k}" for k in density),
+            *(f"component {c + 2}, slice {k}" for c in range(OTHERS) for k in slices),
+            *(f"current amplitude, bin {j}, slice {k}" for j in amplitudes for k in slices),
         )
+        return tuple(f"{self.band}: {name}" if self.band else name for name in names)
 
-    def __call__(self, readings: Readings, clip: float | None = None) -> Values:
-        """Functions of each pulse, shape (pulses, functions).
+    @property
+    def pairs(self) -> float:
+        """Number of pulses that errors refer to: half of the harmonic mean of both sides."""
+        return 1 / (1 / len(self.sides) + 1 / len(self.sides.data))
 
-        Parameters
-        ----------
-        readings
-            Readings of the pulses.
-        clip
-            Replaces the clip of the recipe. A wider one, for simulations far from the data,
-            also widens all bins.
-        """
-        values = self.moments.functions(readings, clip)
-        wider = 1.0 if clip is None else max(1.0, clip / self.moments.config.clip)
-        density, of_drift, of_amplitude = (
-            (centres, wider * widths)
-            for centres, widths in (self._density, self._slices, self._amplitudes)
-        )
-        drift, begin = values[:, self._first], self._first + 1
-        slices = gaussian_bins(drift, *of_drift)
-        components = values[:, begin : begin + self._components]
-        amplitudes = gaussian_bins(readings.log_amplitude, *of_amplitude)
-        all_of_them: Values = joined(
-            [
-                values,
-                gaussian_bins(drift, *density),
-                products(components, slices),
-                products(amplitudes, slices),
-            ]
-        )
-        return all_of_them
+    def _functions(self, pulses: Aligned) -> Values:
+        shape = self._shape(pulses)
+        (density, _), (slices, _), (amplitudes, _) = self._sliced(shape, pulses)
+        columns = [super()._functions(pulses), density]
+        for values in (shape[:, -2 : -2 - OTHERS : -1], amplitudes):
+            columns.append(
+                (values[:, :, np.newaxis] * slices[:, np.newaxis]).reshape(len(shape), -1)
+            )
+        return np.concatenate(columns, axis=1)
+
+    def _slopes(self, pulses: Aligned, moves: Derivatives | Changes) -> Values:
+        shape, changes = self._shape(pulses), moves.each(self.matrix)
+        changes[np.abs(shape) >= self.clipped] = 0
+        n, coordinates = len(shape), changes.shape[2]
+        (_, density), (slices, sliding), (amplitudes, turned) = self._sliced(shape, pulses)
+        drift, others = changes[:, -1], slice(-2, -2 - OTHERS, -1)
+        found = [n * super()._slopes(pulses, moves), density.T @ drift]
+        moved = (turned[:, :, np.newaxis] * moves.log_amplitude[:, np.newaxis]).reshape(n, -1)
+        for values, own in (
+            (shape[:, others], changes[:, others].reshape(n, -1)),
+            (amplitudes, moved),
+        ):
+            along = (values[:, :, np.newaxis] * drift[:, np.newaxis]).reshape(n, -1)
+            each = slices.T @ own + sliding.T @ along  # (slices, values * coordinates)
+            each = each.reshape(len(each), -1, coordinates).swapaxes(0, 1)
+            found.append(each.reshape(-1, coordinates))
+        return np.concatenate(found) / n
+
+    def _sliced(self, shape: Values, pulses: Aligned) -> list[tuple[Values, Values]]:
+        """Bins of density, slices of drift time, and bins of the amplitude in these."""
+        drift = shape[:, -1]
+        own = (drift, drift, pulses.log_amplitude)
+        return [gaussian_bins(of, *band) for of, band in zip(own, self._bands, strict=True)]
 
 
 def _points(

@@ -1,9 +1,9 @@
 """The response of a readout chain: a few physical parameters, and what deviates from these.
 
-Charge becomes signal through bandwidth poles, slow components (or overshoot, if negative), an
-optional ringing, and decays.  All act on the current of a pulse in the frequency domain, so
-that a set of pulses costs two Fourier transforms.  Before it, the drift of the simulated pulses
-may be stretched in time.
+Charge becomes signal through bandwidth poles, slow components (or overshoot, if negative), and
+decays.  All act on the current of a pulse in the frequency domain, so that a set of pulses
+costs two Fourier transforms.  Before it, the drift of the simulated pulses may be stretched in
+time.
 """
 
 from __future__ import annotations
@@ -209,11 +209,6 @@ class ElectronicsResponse(Stored):
         self.fast_decays_us = np.array(config.fast_decays_us, float)
         self.slow_weights = np.zeros(len(self.slow_ns))
         self.decay_weights = np.zeros(len(self.fast_decays_us))
-        if config.free_decays:
-            self.log_fast_decays_us = np.log(self.fast_decays_us)
-        rings = [] if config.ringing_mhz is None else [config.ringing_mhz, config.ringing_ns]
-        # weights of sine and cosine; frequency in MHz and damping in ns
-        self.ringing, self.log_ringing = np.zeros(len(rings)), np.log(rings)
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
         self.by_height = ByHeight() if config.by_height else None
         if config.deviations:
@@ -310,12 +305,6 @@ class ElectronicsResponse(Stored):
         # a sample is the mean over its period
         return (place + 0.5 - lead) * dt_ns
 
-    @property
-    def fast_times_us(self) -> Values:
-        """Times of the faster decays, fixed or free."""
-        free = self.config.free_decays
-        return np.exp(self.log_fast_decays_us) if free else self.fast_decays_us
-
     def bandwidth(self, s: Spectrum) -> Spectrum:
         """Transfer function of all but the decays at `s` in 1/ns."""
         transfer = np.ones_like(s)
@@ -324,19 +313,13 @@ class ElectronicsResponse(Stored):
         slow = np.ones_like(s)
         for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True):
             slow = slow + weight * (1 / (1 + s * tau) - 1)
-        if len(self.ringing):
-            frequency_mhz, damping = np.exp(self.log_ringing)
-            omega = 2e-3 * math.pi * frequency_mhz
-            damped = s + 1 / damping
-            wave = self.ringing[0] * omega + self.ringing[1] * damped
-            slow = slow * (1 + s * wave / (damped**2 + omega**2))
         return transfer * slow
 
     def decay(self, time_us: Values) -> Values:
         """Response of the decays alone to a step of 1 at time 0, at times from 0 on in µs."""
         main = np.exp(-time_us / np.exp(self.log_decay_us))
         step = main
-        for weight, tau in zip(self.decay_weights, self.fast_times_us, strict=True):
+        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
             step = step + weight * (np.exp(-time_us / tau) - main)
         return step
 
@@ -352,20 +335,9 @@ class ElectronicsResponse(Stored):
         for i, (tau, weight) in enumerate(slow, 1):
             told[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
         told["decay_us"] = "log_decay_us.1", float(np.exp(self.log_decay_us[0]))
-        fast = zip(self.fast_times_us.tolist(), self.decay_weights.tolist(), strict=True)
+        fast = zip(self.fast_decays_us.tolist(), self.decay_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(fast, 1):
-            share = f"decay_{tau:g}_us"
-            if self.config.free_decays:
-                told[f"fast_decay_{i}_us"] = f"log_fast_decays_us.{i}", tau
-                share = f"fast_decay_{i}_share"
-            told[share] = f"decay_weights.{i}", weight
-        if len(self.ringing):
-            mhz, damping_ns = np.exp(self.log_ringing).tolist()
-            sine, cosine = self.ringing.tolist()
-            told["ringing_mhz"] = "log_ringing.1", mhz
-            told["ringing_damping_ns"] = "log_ringing.2", damping_ns
-            told["ringing_sine"] = "ringing.1", sine
-            told["ringing_cosine"] = "ringing.2", cosine
+            told[f"decay_{tau:g}_us"] = f"decay_weights.{i}", weight
         stretch = {} if self.drift is None else self.drift.describe()
         for i, (name, value) in enumerate(stretch.items(), 1):
             told[name] = f"drift.stretch.{i}", value

@@ -69,11 +69,9 @@ class ResponseConfig(Config):
 
     ``poles_ns`` and ``decay_us`` are initial values of free times.  ``slow_ns`` and
     ``fast_decays_us`` are fixed times whose weights are free: sums of exponentials with free
-    times have long valleys in which a fit gets lost, weights have none.  ``ringing_mhz`` and
-    ``ringing_ns`` are initial values of the frequency and the damping of a ringing; there is
-    none if ``ringing_mhz`` is null.  With ``free_decays`` the ``fast_decays_us`` are initial
-    values of free times, too.  ``drift_terms`` is the number of parameters that stretch the
-    simulated drift, see `cpunet.networks.response_layer`; 0 for the drift as simulated.
+    times have long valleys in which a fit gets lost, weights have none.  ``drift_terms`` is
+    the number of parameters that stretch the simulated drift, see
+    `cpunet.networks.response_layer`; 0 for the drift as simulated.
     ``deviations`` are those of the step response from that of the chain, which are added where
     the pulses ask for them; ``by_height`` is what the electronics do by the height of a pulse,
     see `cpunet.networks.by_height`.
@@ -84,9 +82,6 @@ class ResponseConfig(Config):
     slow_ns: Annotated[tuple[Positive, ...], Field(max_length=100)]
     decay_us: Positive
     fast_decays_us: Annotated[tuple[Positive, ...], Field(max_length=100)]
-    free_decays: bool
-    ringing_mhz: Positive | None
-    ringing_ns: Positive
     drift_terms: DriftTerms
     deviations: bool
     by_height: bool
@@ -290,23 +285,17 @@ class TrainingConfig(Config):
 
 
 class MatchingConfig(Timed):
-    """A response matched to data by moments, see `cpunet.training.moments`.
+    """A response matched to data, see `cpunet.training.response_fit`.
 
     Pulses are compared from ``before_ns`` before their half maximum to ``after_ns`` after it,
     with the mean of ``baseline_ns`` (range of times before it) shifted to 0 and that of the
-    last ``level_ns`` scaled to the level of the preparation.  ``segments_ns`` are the edges of
-    stretches whose means are compared, in ns from the half maximum; ``components`` is the
-    number of principal components of the data, and the first ``squares`` of them are also
-    squared; ``amplitude_bins`` is the number of bins of the logarithm of the current amplitude,
-    no narrower than ``amplitude_width``.  Each deviation is clipped at ``clip`` robust standard
-    deviations.  ``ridge`` is the fraction of the identity in the correlation matrix of all of
-    these.  The valley is searched for with ``search_pulses`` of each side, in fits of at most
-    ``steps`` iterations.  A fit that ends in the wrong valley is started again with the
-    response's poles times the next of ``start_factors``; the best of all is kept.  Each pulse
-    is compared with ``noise_sets`` draws of the noise.  If a fit is bad and pulses begin
-    differently than simulated, up to ``drift_terms`` parameters that stretch the drift are
-    tried, and kept if held-out pulses gain.  A calibration tries a ringing at one of
-    ``ringing_mhz``.
+    last ``level_ns`` scaled to the level of the preparation.  The valley is searched for with
+    ``search_pulses`` of each side, in fits of at most ``steps`` iterations.  A fit that ends in
+    the wrong valley is started again with the response's poles times the next of
+    ``start_factors``; the best of all is kept.  Each pulse is compared with ``noise_sets``
+    draws of the noise.  If a fit is bad and pulses begin differently than simulated, up to
+    ``drift_terms`` parameters that stretch the drift are tried, and kept if held-out pulses
+    gain.
     """
 
     method: Literal["matching"]
@@ -314,17 +303,9 @@ class MatchingConfig(Timed):
     after_ns: Positive
     baseline_ns: tuple[Positive, Positive]
     level_ns: Positive
-    segments_ns: Annotated[tuple[float, ...], Field(min_length=2, max_length=1000)]
-    components: _Number
-    squares: _Number
-    amplitude_bins: _Number
-    amplitude_width: Positive
-    clip: Positive
-    ridge: Fraction
     search_pulses: Annotated[int, Field(ge=200, le=10_000_000)]
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
-    ringing_mhz: Annotated[tuple[Positive, ...], Field(max_length=100)]
     drift_terms: DriftTerms
     noise_sets: _Number
 
@@ -349,23 +330,12 @@ class MatchingConfig(Timed):
         """Samples whose mean becomes the level."""
         return self.samples(self.level_ns)
 
-    @property
-    def segments(self) -> tuple[int, ...]:
-        """Edges of the stretches in samples from the half maximum."""
-        return tuple(self.samples(edge) for edge in self.segments_ns)
-
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:
-        if sorted({*self.segments_ns}) != [*self.segments_ns]:
-            raise ValueError("segments_ns must be in rising order")
-        if self.segments_ns[0] < -self.before_ns or self.segments_ns[-1] > self.after_ns:
-            raise ValueError("segments_ns must lie within before_ns and after_ns")
         if not self.baseline_ns[0] > self.baseline_ns[1]:
             raise ValueError("baseline_ns goes from a longer time before the edge to a shorter")
         if self.level_ns >= self.after_ns:
             raise ValueError("level_ns must be less than after_ns")
-        if self.squares > self.components:
-            raise ValueError("squares must be no more than components")
         return self
 
 

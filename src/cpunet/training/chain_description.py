@@ -35,7 +35,7 @@ from cpunet.training.run import FitInfo, Run
 # fixed: a true part between two of them is split, which the errors do not contain.
 PARTS = re.compile(r"slow_|decay_|fast_decay_")
 # The parts of a chain that deviates are not what its step response consists of.
-HIDDEN = ("slow_", "pole_", "decay_", "fast_decay_", "ringing")
+HIDDEN = ("slow_", "pole_", "decay_", "ringing")
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
 
 
@@ -86,8 +86,6 @@ def describe_chain(run: Run) -> DescribedChain:
     if int(network.n_baselines):
         chain = with_noise(chain, network, preparation)
     parameters = response.describe()
-    if len(response.ringing):
-        parameters["ringing"] = float(np.linalg.norm(response.ringing))
 
     def derived(moved: ElectronicsResponse) -> Numbers:
         numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
@@ -104,6 +102,8 @@ def describe_chain(run: Run) -> DescribedChain:
     if fit.chi_square_per_moment is not None:
         values["chi_square_per_moment"] = fit.chi_square_per_moment
     doubts = beyond(parameters) + stretched(parameters, fit.gains)
+    if response.by_height is not None:
+        doubts.append("the electronics act by the height of a pulse; this is their linear part")
     if fit.causes:
         told = "these numbers stand in for what is wrong with the simulation, too"
         doubts.insert(0, f"the fit is {fit.verdict}; {told}: {fit.causes[0]}")
@@ -196,7 +196,7 @@ def _parameters(values: Mapping[str, float]) -> str:
         stem, _, unit = name.rpartition("_")
         shown = f" {UNITS[unit]}" if unit in UNITS else ""
         called = (stem if shown else name).replace("_", " ")
-        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|ringing_(sine|cosine)|deviation", name):
+        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation", name):
             words.append(f"{called}{shown} {percent(100 * value)}")
         else:
             words.append(f"{called} {value:.4g}{shown}")

@@ -13,18 +13,20 @@ pulses by wider functions, which do not saturate far from the data.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.aligned import Values
 from cpunet.training.chain_parameters import SmoothParameters
 from cpunet.training.comparison import Comparison, Difference, Sides
-from cpunet.training.fitter import Fitter
 from cpunet.training.joint import Joint, SingleSites
 
 WIDER = (16.0, 4.0)  # functions with which the valley is searched
@@ -38,6 +40,40 @@ DAMPING, MORE, TRIES = 0.03, 8.0, 5
 POOR = 5.0
 SLOW = 0.03  # share by which a step must lower a chi-square that is as poor as that
 STRETCHED = 0.004  # change of the stretch of the drift, for its derivatives
+
+
+Listener = Callable[[int, float], None]
+
+
+@dataclass(eq=False)
+class Fitter:
+    """Fit responses with the same settings, and count the steps of all fits.
+
+    Parameters
+    ----------
+    training
+        Settings of the fits.
+    decay
+        Main decay as known from pile-up tails, if it is.
+    listener
+        Called with the number of steps so far, and chi-square.
+    steps
+        Number of steps so far.
+    gains
+        What held-out pulses say of each part that was tried.
+    """
+
+    training: MatchingConfig
+    decay: KnownDecay | None = None
+    listener: Listener | None = None
+    steps: int = 0
+    gains: dict[str, str] = field(default_factory=dict)
+
+    def count(self, chi_square: float) -> None:
+        """Count a step, and report it."""
+        self.steps += 1
+        if self.listener is not None:
+            self.listener(self.steps, chi_square)
 
 
 class Fitted(NamedTuple):
@@ -95,8 +131,8 @@ def fit_chain(
     parameters = SmoothParameters(response)
 
     def fitted(compared: list[Joint], fall: float) -> Fitted:
-        end = _minimum(parameters, compared, fitter, fall)
-        parameters.set(end.place)
+        evaluate = partial(_parabola, parameters, compared)
+        end = minimum(parameters, evaluate, fitter.training.steps, fall, fitter.count)
         covariance = parameters.covariance(end.information)
         return Fitted(response, end.chi_square, end.functions, covariance)
 
@@ -121,8 +157,20 @@ def chi_square(response: ElectronicsResponse, bands: Sequence[Sides]) -> tuple[f
     return sum(n * d.chi_square for n, d in zip(shares, found, strict=True)), sum(shares)
 
 
-class _Parabola(NamedTuple):
-    """Chi-square to second order about a place, without and with the priors."""
+class Parabola(NamedTuple):
+    """Chi-square to second order about a place, without and with the priors.
+
+    Parameters
+    ----------
+    place
+        Coordinates.
+    chi_square, functions
+        Of the differences, and how many there are.
+    information
+        Products of the derivatives of all uncorrelated residuals but those of the priors.
+    cost, gradient
+        Sum of the squares of all residuals, and half of its derivatives.
+    """
 
     place: Values
     chi_square: float
@@ -132,22 +180,59 @@ class _Parabola(NamedTuple):
     gradient: Values
 
 
-def _minimum(
-    parameters: SmoothParameters, compared: Sequence[Joint], fitter: Fitter, fall: float
-) -> _Parabola:
-    low, high = parameters.low, parameters.high
-    prior, damping = np.diag(parameters.widths**-2.0), 0.0
-    best = _parabola(parameters, compared, parameters.vector())
-    for _ in range(fitter.training.steps):
+class Unknowns(Protocol):
+    """Coordinates with the widths of their priors, longest steps, and bounds."""
+
+    widths: Values
+    longest: Values
+    low: Values
+    high: Values
+
+    def vector(self) -> Values: ...
+
+    def set(self, vector: Values) -> None: ...
+
+
+def minimum(
+    unknowns: Unknowns,
+    evaluate: Callable[[Values], Parabola],
+    steps: int,
+    fall: float,
+    count: Callable[[float], None],
+) -> Parabola:
+    """Go to the minimum of the cost, and set the coordinates to it.
+
+    Parameters
+    ----------
+    unknowns
+        Coordinates, at the start.
+    evaluate
+        Chi-square about a place, to which it sets the coordinates.
+    steps
+        Most steps.
+    fall
+        Expected fall of the cost below which there is no other step.
+    count
+        Called with chi-square after each evaluation.
+
+    Raises
+    ------
+    CpunetError
+        If the cost is not finite at the end.
+    """
+    low, high = unknowns.low, unknowns.high
+    prior, damping = np.diag(unknowns.widths**-2.0), 0.0
+    best = evaluate(unknowns.vector())
+    for _ in range(steps):
         step = _within(best, prior, low, high)
         if -(best.gradient @ step) < fall:
             break
         for _ in range(TRIES):
             damped = prior + damping * np.diag(best.information.diagonal())
             step = _within(best, damped, low, high)
-            step = np.clip(step, -parameters.longest, parameters.longest)
-            tried = _parabola(parameters, compared, np.clip(best.place + step, low, high))
-            fitter.count(tried.chi_square)
+            step = np.clip(step, -unknowns.longest, unknowns.longest)
+            tried = evaluate(np.clip(best.place + step, low, high))
+            count(tried.chi_square)
             if tried.cost < best.cost or not np.isfinite(best.cost):
                 break
             damping = max(DAMPING, MORE * damping)
@@ -162,10 +247,11 @@ def _minimum(
             "the fit of the response diverged; check that the sets hold single pulses of one "
             "detector (cpunet info), or train on other energies (`peak`)"
         )
+    unknowns.set(best.place)
     return best
 
 
-def _within(at: _Parabola, prior: Values, low: Values, high: Values) -> Values:
+def _within(at: Parabola, prior: Values, low: Values, high: Values) -> Values:
     """Step to the minimum; coordinates at a bound do not cross it, the others know of that."""
     free, curvature = np.ones(len(low), bool), at.information + prior
     while free.any():
@@ -180,7 +266,7 @@ def _within(at: _Parabola, prior: Values, low: Values, high: Values) -> Values:
 
 def _parabola(
     parameters: SmoothParameters, compared: Sequence[Joint], place: Values
-) -> _Parabola:
+) -> Parabola:
     parameters.set(place)
     n = len(place)
     information, gradient, chi_square, functions = np.zeros((n, n)), np.zeros(n), 0.0, 0
@@ -193,16 +279,15 @@ def _parabola(
     off = (place - parameters.centre) / parameters.widths
     cost = chi_square + float(off @ off)
     gradient += off / parameters.widths
-    return _Parabola(place, chi_square, functions, information, cost, gradient)
+    return Parabola(place, chi_square, functions, information, cost, gradient)
 
 
 def differences(parameters: SmoothParameters, comparison: Joint) -> Difference:
     """Differences of both sides, with derivatives in the coordinates of a chain."""
     response, padded = parameters.response, comparison.sides.padded
-    entering = comparison.entering(response)
-    found = entering.difference(response.transfer(padded), parameters.basis(padded))
-    slopes = [found.slopes]
-    for ends in parameters.stretches(STRETCHED):  # the last coordinates
-        low, high = (comparison.entering(end).difference(end.transfer(padded)) for end in ends)
-        slopes.append((high.values - low.values)[:, np.newaxis] / (2 * STRETCHED))
-    return replace(found, slopes=np.concatenate(slopes, axis=1))
+    sim, changes = comparison.sides.sim, []
+    for low, high in parameters.stretches(STRETCHED):  # the last coordinates
+        apart = (high.drifted(sim) - low.drifted(sim)) / (2 * STRETCHED)
+        changes.append(np.asarray(apart, np.float32))
+    transfer, basis = response.transfer(padded), parameters.basis(padded)
+    return comparison.entering(response).difference(transfer, basis, changes)

@@ -35,12 +35,12 @@ from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
-from cpunet.training.moments import spread
+from cpunet.training.pulse_sets import MIN_PULSES, spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MIN_PULSES, FEW = 200, 1000  # pulses per side needed for a fit, and for a precise one
+FEW = 1000  # pulses per side needed for a precise fit
 # Ratios beyond which the detectors differ by more than a calibration can correct
 SPREAD_RATIO, SHARPER = 1.2, 1.08
 # Differences due to rounding, in sampling periods, and to chance, in standard deviations; and

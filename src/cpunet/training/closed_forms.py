@@ -220,7 +220,7 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     """The closed form of a fitted chain: a sum of exponentials, like a true chain."""
     poles, main = np.exp(response.log_poles_ns).tolist(), np.exp(response.log_decay_us).item()
     slow, fast = response.slow_weights.tolist(), response.decay_weights.tolist()
-    fast_ns = [1e3 * tau for tau in response.fast_times_us.tolist()]
+    fast_ns = [1e3 * tau for tau in response.fast_decays_us.tolist()]
     taus = moved_apart([*poles, *response.slow_ns.tolist(), 1e3 * main, *fast_ns])
     n, n_slow = len(poles), len(slow)
     slow_taus = taus[n : n + n_slow]
@@ -231,13 +231,6 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     )
     for tau in taus[:n]:
         undecayed = undecayed * Exponentials.low_pass(tau)
-    if len(response.ringing):  # a step response 1 + exp(-t/damping) (a sin + b cos)
-        frequency_mhz, damping_ns = np.exp(response.log_ringing).tolist()
-        sine, cosine = response.ringing.tolist()
-        pole = complex(-1 / damping_ns, 2e-3 * np.pi * frequency_mhz)
-        residue = 0.5 * complex(cosine, -sine) * pole
-        pair = (np.array([of, of.conjugate()]) for of in (pole, residue))
-        undecayed = undecayed * Exponentials(1 + cosine, *pair)
     shares, decays = [1 - sum(fast), *fast], taus[n + n_slow :]
     if response.config.deviations:  # those of samples, whose decays are half a period late
         late = np.exp(0.5 * float(response.dt_ns) / np.array(decays))
@@ -368,12 +361,9 @@ def _half_ranges(ends: Sequence[Numbers]) -> Numbers:
 
 
 def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
-    """Errors of the fit under the names of `ElectronicsResponse.describe`.
-
-    The two weights of a ringing, which are told by its size, have none.
-    """
+    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
     return {
         name: (value if label.startswith("log_") else 1.0) * float(errors[label])
         for name, (label, value) in response.named().items()
-        if label in errors and not label.startswith("ringing")
+        if label in errors
     }

@@ -33,15 +33,16 @@ from cpunet.electronics.finishing import padding
 from cpunet.networks.by_height import ByHeight
 from cpunet.networks.response_layer import ElectronicsResponse, padded_length
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Aligned, Floats, Frame, Values, read
+from cpunet.training.aligned import Aligned, Floats, Frame, Samples, Values, read
 from cpunet.training.derivatives import Basis, Derivatives
-from cpunet.training.translated import PLATEAU_NS, Noise
+from cpunet.training.drawn_noise import Noise
 
 Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
 # Derivatives of pulses that are aligned, in coordinates of whatever moves these.
 Moved = Callable[["Sides", Aligned], Any]
 
 MOST = 4096  # pulses of each side that are compared
+PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
 # Times in ns from the half height between which every sample is compared, shortest and longest
 # stretches there and elsewhere, and samples compared per pulse at most.
 DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 0.5
@@ -77,6 +78,8 @@ class Sides:
         Height of the plateau of a prepared pulse, which the noise refers to.
     energy_kev
         Energies of the simulated pulses.
+    rows
+        Their rows in the set that they were taken from.
 
     Attributes
     ----------
@@ -100,9 +103,10 @@ class Sides:
         frame: Frame,
         tail_level: float,
         energy_kev: Values,
+        rows: Samples,
     ) -> None:
         self.frame, self.noise, self.tail_level = frame, noise, tail_level
-        self.energy_kev = energy_kev
+        self.energy_kev, self.rows = energy_kev, rows
         self.before, self.behind = padding(frame.dt_ns)
         self.length = sim.shape[1] + self.before + self.behind
         self.padded = padded_length(self.length)
@@ -137,10 +141,15 @@ class Sides:
         """The same pulses around a readout: drift stretched, and what acts by their height."""
         if response.drift is None and response.by_height is self.by_height:
             return self
-        other = copy.copy(self)
+        drift = response.drift
+        other = copy.copy(self) if drift is None else self.taking(response.drifted(self.sim))
         other.by_height = response.by_height
-        if response.drift is not None:
-            other.take(response.drifted(self.sim))
+        return other
+
+    def taking(self, sim: FloatArray) -> Sides:
+        """The same with other simulated pulses of the same events."""
+        other = copy.copy(self)
+        other.take(sim)
         return other
 
     def of(self, most: int) -> Sides:
@@ -150,14 +159,20 @@ class Sides:
         return self.some(slice(most))
 
     def some(self, rows: slice) -> Sides:
-        """Some pulses of both sides."""
+        """Some pulses of both sides, in stretches of their own."""
+        some = self.of_events(rows)
+        some.data = self.data[rows]
+        some.divide()
+        return some
+
+    def of_events(self, rows: slice | Samples | npt.NDArray[np.bool_]) -> Sides:
+        """Some of the simulated pulses, and all measured ones."""
         some = copy.copy(self)
         some.sim, some.current, some.charge, some.spectra = (
             part[rows] for part in (self.sim, self.current, self.charge, self.spectra)
         )
-        some.energy_kev = self.energy_kev[rows]
-        some.noise, some.data = self.noise.of(rows), self.data[rows]
-        some.divide()
+        some.energy_kev, some.rows = self.energy_kev[rows], self.rows[rows]
+        some.noise = self.noise.of(rows)
         return some
 
     @property
@@ -193,10 +208,21 @@ class Sides:
         heights = records[:, plateau].mean(axis=1) / np.float32(self.tail_level)
         return np.asarray(records / heights[:, np.newaxis], np.float32), heights
 
+    def changed(self, sim: FloatArray, transfer: Spectrum, heights: Floats) -> FloatArray:
+        """What a change of the simulated pulses does to the records."""
+        change = np.diff(sim, axis=1, prepend=np.float32(0))
+        spectra = scipy.fft.rfft(change, self.padded) * transfer.astype(np.complex64)
+        records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)
+        behind = self.length - self.before
+        found = np.empty((len(sim), self.length), np.float32)
+        found[:, self.before :] = records[:, :behind]
+        found[:, : self.before] = records[:, self.padded - self.before :]
+        return np.asarray(found / heights[:, np.newaxis], np.float32)
+
     def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
         """Records with each draw of the noise, read."""
         draws = range(len(self.noise.factor))
-        return [self.read(self.noise.add(clean, draw, 0), heights) for draw in draws]
+        return [self.read(self.noise.add(clean, draw), heights) for draw in draws]
 
     def read(self, records: FloatArray, heights: Floats) -> Aligned:
         """Records of prepared height, read as they leave the electronics."""

@@ -1,7 +1,8 @@
-"""How aligned pulses and what is read of them change with a step response."""
+"""How aligned pulses and what is read of them change with their records."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -187,3 +188,62 @@ class Derivatives:
         found += (self.slopes @ matrix)[:, :, np.newaxis] * self.time[:, np.newaxis]
         found -= (self.values @ matrix)[:, :, np.newaxis] * span[:, np.newaxis]
         return np.asarray(found)
+
+
+class Changes:
+    """The same in coordinates of which each changes every record in a way of its own.
+
+    Parameters
+    ----------
+    sides
+        Pulses.
+    aligned
+        The translated pulses.
+    records
+        Derivatives of their records of prepared height, each of shape (pulses, samples).
+
+    Attributes
+    ----------
+    log_amplitude
+        Derivatives of the logarithm of the current amplitude, shape (pulses, coordinates).
+    """
+
+    def __init__(self, sides: Sides, aligned: Aligned, records: Sequence[Floats]) -> None:
+        self.sides, self.aligned = sides, aligned
+        self.changes = [self._aligned(change) for change in records]
+        self.log_amplitude = np.column_stack([
+            self._amplitude(change, span)
+            for change, (_, span) in zip(records, self.changes, strict=True)
+        ])  # fmt: skip
+
+    def _aligned(self, record: Floats) -> tuple[Floats, Floats]:
+        """Change of the aligned pulses, and relative change of their height."""
+        frame, aligned = self.sides.frame, self.aligned
+        height = aligned.height.astype(SINGLE)[:, np.newaxis]
+        base, top = (
+            stretch(record, aligned.sample + first, last - first).mean(axis=1, keepdims=True)
+            for first, last in (frame.base, frame.level)
+        )
+        weights, _ = cubic(aligned.part)
+        around = stretch(record, aligned.sample - frame.before - 2, frame.length + 3)
+        moved = (between(around, weights) - base) / height
+        span = (top - base) / height
+        slopes, middle = aligned.slopes, slice(frame.before, frame.before + 1)
+        time = (SINGLE(0.5) * span - moved[:, middle]) / slopes[:, middle]
+        # samples of the level follow the half height, by whole ones
+        level = aligned.pulses[:, frame.before + frame.level[0] : frame.before + frame.level[1]]
+        span += time * SINGLE(np.gradient(level.mean(axis=0)).mean())
+        return moved - aligned.pulses * span + slopes * time, span[:, 0]
+
+    def _amplitude(self, record: Floats, span: Floats) -> Floats:
+        """Change of the logarithm of the current amplitude."""
+        taps, aligned = self.sides.frame.taps, self.aligned
+        first = aligned.steepest - self.sides.frame.reach
+        current = np.diff(stretch(record, first, taps.shape[1] + 1), axis=1)
+        smooth = (current * taps[aligned.step]).sum(axis=1) / aligned.height
+        return np.asarray(smooth / np.exp(aligned.log_amplitude) - span)
+
+    def each(self, matrix: Values) -> Floats:
+        """Change of linear functions of each pulse, shape (pulses, functions, coordinates)."""
+        views = [self.sides.view(change) @ matrix.astype(SINGLE) for change, _ in self.changes]
+        return np.stack(views, axis=2)

@@ -158,9 +158,9 @@ def _solve(
             put(place + step * (np.arange(len(place)) == i))
             if i < n:
                 new, of = sides.translated(own.transfer(padded))
-                moved.append(sides.read(sides.noise.add(new, 0, 0), of))
+                moved.append(sides.read(sides.noise.add(new, 0), of))
             else:
-                moved.append(sides.read(sides.noise.add(clean, 0, 0), heights))
+                moved.append(sides.read(sides.noise.add(clean, 0), heights))
         put(place)
         return Moves(sides, aligned, moved, steps)
 

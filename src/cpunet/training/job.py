@@ -35,13 +35,12 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import PunetConfig, Recipe
+from cpunet.training.chain_fit import Fitter, Listener
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import beyond, stretched
-from cpunet.training.fitter import Fitter, Listener
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.moments import MIN_PULSES
-from cpunet.training.pulse_sets import Continuum, PulseSets, continuum
+from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import DRIFT, Fit, fit_response
 from cpunet.training.run import (
     INFO,
@@ -120,7 +119,7 @@ class TrainingJob:
         parts
             ``ren``, ``iren`` and others to store.
         recipe
-            Recipe as trained; a ringing may have been added to its chain.
+            Recipe as trained; a stretch or deviations may have been added to its chain.
         started, seconds
             When the training began, and the time that it took.
         more
@@ -274,7 +273,7 @@ def match(
     rng, drawn = np.random.default_rng(job.seed), noise.tails
     sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)
     decay = None if drawn is None else drawn.known_decay
-    fitter = Fitter(recipe.matching.training, decay, listen, job.seed)
+    fitter = Fitter(recipe.matching.training, decay, listen)
     response, fit = fit_response(sets, fitter, known)
     parameters = response.describe()
     stretches = stretched(parameters, fit.gains)
@@ -343,7 +342,7 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
         chain, info = match(job, known, listen)
-    # a ringing or a stretch may have been added
+    # a stretch or deviations may have been added
     recipe = job.recipe.model_copy(update={"generator": chain.response.config})
     sim = job.sim.prepared.pulses
     iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)

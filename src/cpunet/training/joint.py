@@ -15,14 +15,19 @@ the simulated shapes, and see no small differences that all pulses share.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.aligned import Aligned, Values
+from cpunet.pulses.container import FloatArray
+from cpunet.training.aligned import Aligned, Samples, Values
 from cpunet.training.comparison import NONE, Difference, Sides, Spectrum
-from cpunet.training.derivatives import Basis, Derivatives
+from cpunet.training.derivatives import Basis, Changes, Derivatives
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
 CLIPPED = 4.0  # robust standard deviations at which components and segments are clipped
@@ -74,7 +79,11 @@ class Joint:
         self.places = np.array(centres[::-1])
         first = 2 * self.places[0] - self.places[min(1, len(centres) - 1)]
         self.widths = wider * np.maximum(np.diff(self.places, prepend=first), NARROWEST)
-        self.data = self._functions(sides.data)
+
+    @cached_property
+    def data(self) -> Values:
+        """Functions of the measured pulses, shape (pulses, functions)."""
+        return self._functions(self.sides.data)
 
     def entering(self, response: ElectronicsResponse) -> Joint:
         """The same of pulses after what stands before a readout."""
@@ -82,8 +91,41 @@ class Joint:
         other.sides = self.sides.entering(response)
         return other
 
-    def difference(self, transfer: Spectrum, basis: Basis | None = None) -> Difference:
-        """Compare the pulses translated by a response, with derivatives in a basis if given."""
+    def taking(self, sim: FloatArray) -> Self:
+        """The same with other simulated pulses of the same events."""
+        other = copy.copy(self)
+        other.sides = self.sides.taking(sim)
+        return other
+
+    def of_events(self, rows: slice | Samples | npt.NDArray[np.bool_]) -> Self:
+        """The same of some of the simulated pulses, and all measured ones."""
+        other = copy.copy(self)
+        other.sides = self.sides.of_events(rows)
+        return other
+
+    def some(self, rows: slice) -> Self:
+        """The same functions of some pulses of both sides."""
+        other = self.of_events(rows)
+        other.sides.data, other.data = self.sides.data[rows], self.data[rows]
+        return other
+
+    def difference(
+        self,
+        transfer: Spectrum,
+        basis: Basis | None = None,
+        changes: Sequence[FloatArray] = (),
+    ) -> Difference:
+        """Compare the pulses translated by a response, with derivatives if asked.
+
+        Parameters
+        ----------
+        transfer
+            Spectrum of the response.
+        basis
+            Coordinates of the response.
+        changes
+            Derivatives of the simulated pulses in other coordinates, which follow.
+        """
         clean, heights = self.sides.translated(transfer)
         noisy = self.sides.noisy(clean, heights)
         # without those on the tail of another, as the data; far from the data all
@@ -91,16 +133,22 @@ class Joint:
         kept = kept if kept.mean() > MOSTLY else np.ones_like(kept)
         values = [self._functions(one[kept]) for one in noisy]
         mean = np.mean([one.mean(axis=0) for one in values], axis=0)
-        covariance = 0.5 * (np.cov(values[0].T) + np.cov(self.data.T))
-        covariance *= 1 / len(self.sides) + 1 / len(self.data)
-        covariance *= 1 - SHRUNK
-        variances = covariance.diagonal() * SHRUNK / (1 - SHRUNK) + TINY**2
-        covariance = covariance + np.diag(variances)
+        covariance = self.covariance(0.5 * (np.cov(values[0].T) + np.cov(self.data.T)))
         slopes = NONE
         if basis is not None:
             moves = Derivatives(self.sides, self.sides.first, noisy[0], heights, basis)
             slopes = self._slopes(noisy[0], moves)
+        if changes:
+            records = [self.sides.changed(one, transfer, heights) for one in changes]
+            own = self._slopes(noisy[0], Changes(self.sides, noisy[0], records))
+            slopes = np.concatenate([slopes, own], axis=1)
         return Difference("joint", mean - self.data.mean(axis=0), covariance, slopes)
+
+    def covariance(self, of_each: Values) -> Values:
+        """Covariance of a difference of means from that of single pulses."""
+        of_means = of_each * (1 / len(self.sides) + 1 / len(self.data))
+        variances = SHRUNK * of_means.diagonal() + TINY**2
+        return np.asarray((1 - SHRUNK) * of_means + np.diag(variances))
 
     def _functions(self, pulses: Aligned) -> Values:
         """Of each pulse, shape (pulses, functions)."""
@@ -119,11 +167,9 @@ class Joint:
 
     def _bins(self, pulses: Aligned) -> tuple[Values, Values]:
         """Bins of the amplitude, and their derivatives, shape (pulses, bins)."""
-        place = (pulses.log_amplitude[:, np.newaxis] - self.places) / self.widths
-        bins = np.exp(-0.5 * place**2)
-        return bins, -place / self.widths * bins
+        return gaussian_bins(pulses.log_amplitude, self.places, self.widths)
 
-    def _slopes(self, pulses: Aligned, moves: Derivatives) -> Values:
+    def _slopes(self, pulses: Aligned, moves: Derivatives | Changes) -> Values:
         """Derivatives of the means, shape (functions, coordinates)."""
         shape, (bins, turned) = self._shape(pulses), self._bins(pulses)
         changes = moves.each(self.matrix)
@@ -156,11 +202,17 @@ class SingleSites(Joint):
         shares = self._bins(sides.data)[0].mean(axis=0)
         # the last follows from the others
         self.balance = (np.eye(len(shares)) - shares / shares.sum())[:, :-1]
-        self.data = self._functions(sides.data)
 
     def _functions(self, pulses: Aligned) -> Values:
         return np.asarray(self._bins(pulses)[0] @ self.balance)
 
-    def _slopes(self, pulses: Aligned, moves: Derivatives) -> Values:
+    def _slopes(self, pulses: Aligned, moves: Derivatives | Changes) -> Values:
         moved = self._bins(pulses)[1].T @ moves.log_amplitude / len(pulses)
         return np.asarray(self.balance.T @ moved)
+
+
+def gaussian_bins(values: Values, centres: Values, widths: Values) -> tuple[Values, Values]:
+    """Smooth bins, and their derivatives, shape (values, centres)."""
+    place = (values[:, np.newaxis] - centres) / widths
+    bins = np.exp(-0.5 * place**2)
+    return bins, -place / widths * bins

@@ -8,7 +8,6 @@ sides differ within such a band, the simulated pulses are weighted to match the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -22,18 +21,9 @@ from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
-from cpunet.training.aligned import Frame
+from cpunet.training.aligned import Frame, Samples, Values
 from cpunet.training.comparison import MOST, Sides
-from cpunet.training.moments import (
-    DRAWN,
-    MIN_PULSES,
-    Moments,
-    Rows,
-    Values,
-    spread,
-)
-from cpunet.training.response_problem import Band
-from cpunet.training.translated import Noise, SimulatedSide
+from cpunet.training.drawn_noise import Noise
 
 # Ratio of the limits of a band; the next is used only if no band of the one before is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
@@ -42,7 +32,9 @@ SLICES, IN_SLICE = 32, 50
 # The continuum begins where noise is small, and ends well before a line and its sidebands.
 CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
 HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
-MIN_OF_BAND = 400  # minimum number of pulses of a band if only some of a set are taken
+MIN_PULSES = 200  # of a side, for a covariance
+# Pulses that give the slope of the tails
+DRAWN = 8192
 
 SINGLE = "single sites of the continuum"
 
@@ -58,14 +50,14 @@ class EnergyBand:
     name
         A line, or a range in keV.
     sim, data
-        Rows of the two sides.
+        Samples of the two sides.
     weights
         Weights of the simulated pulses, with a mean of 1.
     """
 
     name: str
-    sim: Rows
-    data: Rows
+    sim: Samples
+    data: Samples
     weights: Values
 
 
@@ -121,7 +113,7 @@ def energy_bands(
 
 
 def _continuum(
-    sim_kev: Values, data_kev: Values, sim: Rows, data: Rows, widest: float
+    sim_kev: Values, data_kev: Values, sim: Samples, data: Samples, widest: float
 ) -> list[EnergyBand]:
     """Bands of the pulses that are not in a line, from the highest energy down."""
     bands, energies = [], (sim_kev, data_kev)
@@ -223,19 +215,6 @@ class PulseSets:
             for band in parted
         ]
 
-    def bands(self, most: int | None = None) -> list[Band]:
-        """All pulses, or about `most` of each side, in the same proportions."""
-        totals = np.sum([[len(order) for order in orders] for _, orders in self.parted], axis=0)
-        some = []
-        for band, orders in self.parted:
-            chosen = []
-            for order, n in zip(orders, totals.tolist(), strict=True):
-                share = 1.0 if most is None else min(1.0, most / n)
-                kept = max(math.ceil(share * len(order)), min(MIN_OF_BAND, len(order)))
-                chosen.append(np.sort(order[:kept]))
-            some.append(self._band(band, *chosen))
-        return some
-
     @property
     def names(self) -> list[str]:
         """Names of the bands."""
@@ -270,7 +249,7 @@ class PulseSets:
         weights = spectrum_weights(sim.energy_kev[rows], data.energy_kev[of_data])
         return [self._sides(sim, rows, data.waveforms[of_data], weights)]
 
-    def _sides(self, sim: Pulses, rows: Rows, data: FloatArray, weights: Values) -> Sides:
+    def _sides(self, sim: Pulses, rows: Samples, data: FloatArray, weights: Values) -> Sides:
         preparation, training = self.recipe.preparation, self.recipe.matching.training
         if np.ptp(weights) > 0:  # each as often as its weight says, to a whole number
             share = np.cumsum(weights) / weights.sum()
@@ -279,22 +258,10 @@ class PulseSets:
         length = record_length(sim.waveforms.shape[1], sim.dt_ns)
         drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)
         noise, frame = Noise.draw(self.noise, *drawn), Frame.of(training)
-        return Sides(sim.waveforms, data, noise, frame, preparation.tail_level, sim.energy_kev)
+        level, kev = preparation.tail_level, sim.energy_kev
+        return Sides(sim.waveforms, data, noise, frame, level, kev, rows)
 
-    def _band(self, band: EnergyBand, sim: Rows, data: Rows) -> Band:
-        _, training = self.recipe.matching
-        measured, taken = self.data.waveforms, band.data[data]
-        if len(taken) < len(measured):  # else without a copy, which may take gigabytes
-            measured = measured[taken]
-        moments = Moments.of_data(measured, training, self.recipe.preparation)
-        rows = band.sim[sim]
-        pulses = self.sim if len(rows) == len(self.sim) else self.sim[rows]
-        weights, draws = band.weights[sim], training.noise_sets
-        return Band(band.name, self._translated(pulses, moments, weights, draws), rows)
 
-    def _translated(
-        self, sim: Pulses, moments: Moments, weights: Values, draws: int
-    ) -> SimulatedSide:
-        length = record_length(sim.waveforms.shape[1], sim.dt_ns)
-        drawn = Noise.draw(self.noise, sim.energy_kev, length, draws, self.rng, self.tails)
-        return SimulatedSide(sim.waveforms, drawn, moments, weights)
+def spread(n: int, most: int) -> Samples:
+    """Samples of at most `most` of `n` pulses, spread over all: files can be in any order."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)

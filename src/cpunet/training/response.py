@@ -43,7 +43,6 @@ ROWS = {
     r"slow_share": ("slow share of the charge", "%"),
     r"slow_time_ns": ("its mean time", "ns"),
     r"ringing": ("ringing", "%"),
-    r"ringing_(sine|cosine)": (r"its \1", "%"),
     r"ringing_mhz": ("ringing frequency", "MHz"),
     r"ringing_damping_ns": ("ringing damping", "ns"),
     r"deviation": ("largest deviation from a chain", "%"),

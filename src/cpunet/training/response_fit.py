@@ -22,11 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.chain_fit import Fitted, chi_square, fit_chain
+from cpunet.training.chain_fit import Fitted, Fitter, chi_square, fit_chain
 from cpunet.training.chain_parameters import Parameters, with_decay, with_settings
 from cpunet.training.comparison import AMPLITUDE, Comparison, Difference, Sides
 from cpunet.training.deviations import with_deviations
-from cpunet.training.fitter import Fitter
 from cpunet.training.heights import with_heights
 from cpunet.training.pulse_sets import SINGLE, PulseSets
 from cpunet.training.verdict import WIDTH, Verdict, verdict
