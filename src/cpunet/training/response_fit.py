@@ -30,10 +30,9 @@ from cpunet.training.heights import with_heights
 from cpunet.training.pulse_sets import SINGLE, PulseSets
 from cpunet.training.verdict import WIDTH, Verdict, verdict
 
-# What stretches the drift must lower chi-square of held-out pulses by this much, and is taken
-# out again if it is 0 within so many of its errors.  Drift that is longer or shorter by more
-# than a third is that of another detector.
-NEEDED, SURE, MAX_STRETCH = 16.0, 3.0, 1 / 3
+# What stretches the drift must lower chi-square of held-out pulses by this much.  Drift that is
+# longer or shorter by more than a third is that of another detector.
+NEEDED, MAX_STRETCH = 16.0, 1 / 3
 BY_HEIGHT = "slew rate and curve"
 DRIFT = {1: "a stretch of the drift", 2: "its change with time"}  # by number of terms
 
