@@ -99,6 +99,8 @@ def lh5_rows(
 def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
     """A text attribute, ``""`` if it is missing; some programs write it as an array of one."""
     value = item.attrs.get(name, "")
+    if isinstance(value, h5py.Empty):  # as netCDF writes an empty text
+        return ""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
@@ -110,7 +112,9 @@ def units_of(item: h5py.Group | h5py.Dataset) -> str:
 
 def is_column(item: object) -> bool:
     """Whether an object of a file is a one-dimensional array of numbers, or one number."""
-    return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
+    if not isinstance(item, h5py.Dataset) or item.shape is None:  # with a type, without values
+        return False
+    return item.ndim <= 1 and item.dtype.kind in "iufb"
 
 
 def is_text(item: object) -> bool:

@@ -111,9 +111,10 @@ def open_arrays(options: PulseFile) -> ArraySource:
             f"{options.path}: array {name or 'in it'} is of {kind}; save plain numbers"
         )
     columns = {
-        name: Column.of(values)
-        for name, values in arrays.items()
-        if values.ndim <= 1 and values.dtype.kind in "iufb"
+        column: Column.of(values.ravel() if values.ndim else values)
+        for column, values in arrays.items()
+        if (values.ndim <= 1 or (1 in values.shape and column != name))
+        and values.dtype.kind in "iufb"
     }
     return ArraySource(options, "NumPy", name, arrays[name], columns)
 

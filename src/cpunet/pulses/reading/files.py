@@ -187,6 +187,15 @@ NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "open_arrays")
 PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "open_pickles")
 SPECTRUM = Format("spectrum", (".spe",), "arrays", "open_spectrum")
 
+_AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
+_FOREIGN = {  # what cannot be read, by its first bytes, and what to do
+    b"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
+    b"MATLAB 5.0": ("MATLAB 5", "save it with -v7.3"),
+    b"PAR1": ("Parquet", f"write it with {_AS_NPZ}"),
+} | dict.fromkeys(
+    (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd"), ("compressed", "unpack it")
+)
+
 _HEAD_BYTES = 520
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _PICKLE_MAGIC, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
@@ -304,6 +313,11 @@ def recognise(path: Path) -> Format:
     found = _by_content(head, path)
     if found is not None:
         return found
+    foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
+    if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
+        foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
+    if foreign is not None:
+        raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
     formats = (HDF5, FLASHCAM, NUMPY, PICKLE, SPECTRUM)
     if claimed := next((one for one in formats if path.suffix.lower() in one.suffixes), None):
         raise CpunetError(

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import h5py
 import numpy as np
@@ -49,6 +49,7 @@ def open_hdf5(options: PulseFile) -> PulseSource:
             return Lh5Source(options, chosen)
         values = StoredRows(options.path, chosen.path, file[chosen.path].shape)
         columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
+        columns.pop(chosen.name, None)  # one pulse is a row, as MATLAB writes a vector
     return ArraySource(options, "HDF5", chosen.path, values, columns)
 
 
@@ -214,7 +215,11 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     )
 
 
-def _is_array(item: object) -> bool:
+def _is_row(item: object) -> bool:
+    return _is_array(item) and 1 in item.shape
+
+
+def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
     return isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
 
 
@@ -335,12 +340,12 @@ def _column(item: h5py.Group | h5py.Dataset, table: str, name: str) -> WaveformC
 def columns_of(path: Path, group: h5py.Group, table: str) -> dict[str, Column]:
     """Columns of a group: its numeric datasets of one dimension, and its scalars.
 
-    Text counts where it separates channels.
+    Text counts where it separates channels; MATLAB has no vectors, but writes a row.
     """
     return {
         name: _stored(path, item, f"{table}/{name}")
         for name, item in members(group).items()
-        if is_column(item) or (divides(name) and is_text(item))
+        if is_column(item) or _is_row(item) or (divides(name) and is_text(item))
     }
 
 
@@ -356,7 +361,7 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
         place = name.strip("/").rpartition("/")[0]
         parent, found = item_at(file, place), item_at(file, name)
         others = columns_of(path, parent, place) if isinstance(parent, h5py.Group) else {}
-        if is_column(found):
+        if is_column(found) or _is_row(found):
             return _stored(path, found, name), others
         there = list(others or file)
     raise CpunetError(f"{path}: no column {name}; there are {shortened(there)}")
@@ -364,12 +369,14 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
 
 def _stored(path: Path, dataset: h5py.Dataset, name: str) -> Column:
     """A dataset as a column, by its name in this file; the file is open only while reading."""
-    is_constant = dataset.ndim == 0
+    is_constant, dataset_shape = dataset.ndim == 0, dataset.shape
 
     def read(start: int, stop: int) -> npt.NDArray[Any]:
         with opened(path) as file:
             if is_constant:
                 return np.full(stop - start, file[name][()])
+            if dataset_shape[1:]:
+                return np.ravel(file[name][()])[start:stop]
             return np.asarray(file[name][start:stop])
 
     return Column(read, dataset.size, units_of(dataset), is_constant)
