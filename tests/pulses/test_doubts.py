@@ -172,14 +172,14 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
         open_pulses(path)
     with pytest.raises(CpunetError, match=r"no chnid 3; it holds 1, 2"):
         open_pulses(path, table="chnid=3")
-    source = open_pulses(path, table=table)
-    assert source.n_pulses == N - n_first
-    for size in (7, N):
-        blocks = list(source.blocks(size))
-        found = np.concatenate([block.waveforms for block in blocks])
-        np.testing.assert_array_equal(found, values[n_first:])
-        kev_found = np.concatenate([block.energy_kev for block in blocks])
-        np.testing.assert_array_equal(kev_found, energies[n_first:])
+    with open_pulses(path, table=table) as source:
+        assert source.n_pulses == N - n_first
+        for size in (7, N):
+            blocks = list(source.blocks(size))
+            found = np.concatenate([block.waveforms for block in blocks])
+            np.testing.assert_array_equal(found, values[n_first:])
+            kev_found = np.concatenate([block.energy_kev for block in blocks])
+            np.testing.assert_array_equal(kev_found, energies[n_first:])
     with h5py.File(path, "a") as file:
         file["sim/chnid"][...] = np.arange(N) % 2
     mixed = open_pulses(path, table="chnid=1").read()

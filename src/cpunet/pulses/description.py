@@ -184,7 +184,7 @@ def describe_pulses(
     ends = [samples.min(), samples.max()] if len(samples) else None
     return [
         ("file", str(source.path)),
-        ("format", f"{source.layout.format}, table {source.layout.table}"),
+        ("format", f"{source.table.format}, table {source.table.name}"),
         ("traces", f"{n_pulses} of {source.length} samples, every {source.dt_ns:g} ns"),
         ("columns", ", ".join(sorted(source.columns))),
         *provenance(source).items(),

@@ -193,8 +193,13 @@ class Seen:
         self._baselines = list[Baselines]()
         self._whole, self._rows = list[Pulses](), list[npt.NDArray[np.int64]]()
 
-    def __call__(self, block: Pulses, usable: Prepared) -> None:
-        """Keep what is needed of a block, of which some pulses can be used."""
+    @property
+    def more_baselines(self) -> bool:
+        """Whether further traces are to be prepared for their baselines."""
+        return self._side == "measured" and sum(map(len, self._baselines)) < TRACES
+
+    def keep(self, block: Pulses, whole: Prepared | None, usable: Prepared) -> None:
+        """Keep what is needed of a block: baselines of all of it, and whole usable pulses."""
         if self._first is None:
             if self._guess:
                 found = apparent_side(block.waveforms)
@@ -207,9 +212,9 @@ class Seen:
             return
         good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
         self._ends += [float(good.min()), float(good.max())] if len(good) else []
-        if sum(map(len, self._baselines)) < TRACES:
+        if whole is not None:
             like = self._baselines[:1]
-            self._baselines.append(Baselines.of_block(block, self._config, *like))
+            self._baselines.append(Baselines.of_block(block, whole, self._config, *like))
         if (wanted := WHOLE - sum(map(len, self._whole))) > 0:
             self._rows.append(start + usable.index[:wanted])
             self._whole.append(block[usable.index[:wanted]])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,8 +18,9 @@ from cpunet.tables import shortened
 from cpunet.units import factor, unit_names
 
 if TYPE_CHECKING:
+    from cpunet.hdf5_files import Read
     from cpunet.pulses.reading.files import PulseFile
-    from cpunet.pulses.reading.source import Layout
+    from cpunet.pulses.reading.source import RawTable
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ class Column:
         Whether a single value applies to all events.
     """
 
-    read: Callable[[int, int], npt.NDArray[Any]]
+    read: Read
     size: int
     units: str = ""
     constant: bool = False
@@ -58,14 +60,17 @@ class Column:
         """The values of some rows, which ascend; one value for all stays."""
         if self.constant or len(self) == 1:
             return self
+        return replace(self, read=partial(some_of, self.read, rows), size=len(rows))
 
-        def read(start: int, stop: int) -> npt.NDArray[Any]:
-            some = rows[start:stop]
-            if not len(some):
-                return self.read(0, 0)
-            return np.asarray(self.read(int(some[0]), int(some[-1]) + 1)[some - some[0]])
 
-        return replace(self, read=read, size=len(rows))
+def some_of(read: Read, rows: npt.NDArray[np.int64], start: int, stop: int) -> npt.NDArray[Any]:
+    """Rows of a first to one before a last of those chosen, never more at once than these."""
+    wanted, parts = rows[start:stop], list[npt.NDArray[Any]]()
+    while len(wanted):
+        n = int(np.searchsorted(wanted, wanted[0] + stop - start))
+        parts.append(read(int(wanted[0]), int(wanted[n - 1]) + 1)[wanted[:n] - wanted[0]])
+        wanted = wanted[n:]
+    return np.concatenate(parts) if parts else read(0, 0)
 
 
 def require_length(path: Path, name: str, column: Column, n_pulses: int | None) -> None:
@@ -135,7 +140,7 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         return np.asarray(waveforms.max(axis=1) - baseline)
 
 
-def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
+def resolve_energies(options: PulseFile, table: RawTable) -> Energies:
     """Choose where the energies of a file's pulses come from.
 
     Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
@@ -150,13 +155,13 @@ def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
         If the column is missing, differs in length from the waveforms, or was requested but is
         neither in energy units nor calibrated.
     """
-    path, kev_per_adc, columns = options.path, options.kev_per_adc, layout.columns
+    path, kev_per_adc, columns = options.path, options.kev_per_adc, table.columns
     name = options.energy or next((name for name in _USUAL if name in columns), "")
-    column = _named_column(path, layout, name) if name else None
+    column = _named_column(path, table, name) if name else None
     if column is not None:
         rule = _calibrated(path, name, column, kev_per_adc)
         if rule is not None:
-            require_length(path, name, column, layout.n_pulses)
+            require_length(path, name, column, table.n)
             return rule
         if options.energy is not None:
             units = f"in {column.units}" if column.units else "without units"
@@ -188,8 +193,8 @@ def _calibrated(
     return None
 
 
-def _named_column(path: Path, layout: Layout, energy: str) -> Column:
-    columns = layout.columns
+def _named_column(path: Path, table: RawTable, energy: str) -> Column:
+    columns = table.columns
     if energy in columns:
         return columns[energy]
     file, colon, inner = energy.rpartition(":")
@@ -201,7 +206,7 @@ def _named_column(path: Path, layout: Layout, energy: str) -> Column:
     from cpunet.pulses.reading.hdf5 import column_of
 
     column, others = column_of(Path(file), inner)
-    if (rows := layout.rows) is not None and len(column) == layout.n_rows:
+    if (rows := table.chosen) is not None and len(column) == table.n_all:
         others = {n: c.at(rows) for n, c in others.items() if len(c) == len(column)}
         column = column.at(rows)
     return _joined(path, columns, energy, column, others)
@@ -263,7 +268,7 @@ class Sampling:
             )
 
 
-def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
+def resolve_sampling(options: PulseFile, table: RawTable) -> Sampling:
     """Take the period from the column of the file or from the user's ``dt_ns``.
 
     A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
@@ -276,7 +281,7 @@ def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
         If neither gives the period, or if it is not a positive number.
     """
     path, dt_ns = options.path, options.dt_ns
-    name, column, hint = layout.period_name, layout.period, layout.period_hint
+    name, column, hint = table.period_name, table.period, table.period_hint
     try:
         ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
     except CpunetError:
@@ -291,7 +296,7 @@ def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
             )
         return Sampling(path, dt_ns)
     if len(column) != 1:
-        require_length(path, name, column, layout.n_pulses)
+        require_length(path, name, column, table.n)
     found = float(column.read(0, 1)[0]) * ns_per_unit
     if dt_ns is not None and not np.isclose(found, dt_ns, rtol=_TOLERANCE, atol=0):
         log.warning(

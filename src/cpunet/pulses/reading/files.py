@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
@@ -137,8 +138,19 @@ class PulseFile:
         return {name: value for name, value in given.items() if value is not None}
 
     def open(self) -> PulseSource:
-        """Open the file."""
-        return open_file(self)
+        """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
+        from cpunet.pulses.reading.arrays import read_memory
+        from cpunet.pulses.reading.source import PulseSource
+
+        if self.pulses is not None:
+            return PulseSource(self, read_memory(self.path, self.pulses))
+        module, _, name = FORMATS[recognise(self.path)].reader.partition(".")
+        table = getattr(import_module(f"{__package__}.{module}"), name)(self)
+        try:
+            return PulseSource(self, table)
+        except BaseException:
+            table.close()
+            raise
 
 
 Source: TypeAlias = str | Path | PulseFile | Pulses
@@ -173,20 +185,41 @@ def pulse_file(
 
 
 class Format(NamedTuple):
-    """A format of files: its name, its suffixes, and what opens it, in a module beside this."""
+    """A format of files: its suffixes, its first bytes, and the module and function it has."""
 
-    name: str
     suffixes: tuple[str, ...]
-    module: str
-    opens: str
+    begins: Callable[[bytes], bool]
+    reader: str
 
 
-HDF5 = Format("HDF5", (".lh5", ".h5", ".hdf5", ".hdf"), "hdf5", "open_hdf5")
-FLASHCAM = Format("FlashCam", (".fcio",), "flashcam", "FlashCamSource")
-NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "open_arrays")
-PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "open_pickles")
-SPECTRUM = Format("spectrum", (".spe",), "arrays", "open_spectrum")
-
+# readers are imported when needed: HDF5 and FlashCam take a fifth of a second each
+FORMATS = {
+    # MATLAB writes 512 bytes of its own before the HDF5 part
+    "HDF5": Format(
+        (".lh5", ".h5", ".hdf5", ".hdf"),
+        lambda head: b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:520]),
+        "hdf5.read_hdf5",
+    ),
+    "FlashCam": Format(
+        (".fcio",), lambda head: head[4:12] == b"FlashCam", "flashcam.read_flashcam"
+    ),
+    "NumPy": Format(
+        (".npz", ".npy"),
+        lambda head: head.startswith((b"\x93NUMPY", b"PK\x03\x04")),
+        "arrays.read_numpy",
+    ),
+    "pickle": Format(
+        (".pickle", ".pkl"),
+        lambda head: head[0] == 0x80 and head[1:2] in (b"\2", b"\3", b"\4", b"\5"),
+        "published.read_pickles",
+    ),
+    # Fortran record marks around the 24 bytes of a Radware header
+    "spectrum": Format(
+        (".spe",),
+        lambda head: len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24),
+        "arrays.read_spectrum",
+    ),
+}
 _AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
 _FOREIGN = {  # what cannot be read, by its first bytes, and what to do
     b"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
@@ -197,8 +230,6 @@ _FOREIGN = {  # what cannot be read, by its first bytes, and what to do
 )
 
 _HEAD_BYTES = 520
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_PICKLE_MAGIC, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
 
 
 def open_pulses(
@@ -244,21 +275,7 @@ def open_pulses(
         If the file is missing, of an unknown format, damaged or without pulses, if `table` or
         `energy` is missing or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
     """
-    return open_file(PulseFile(Path(path), table, energy, kev_per_adc, dt_ns))
-
-
-def open_file(options: PulseFile) -> PulseSource:
-    """Like `open_pulses`; a file of pulses in memory is a source, too."""
-    if options.pulses is not None:
-        from cpunet.pulses.reading.arrays import open_memory
-
-        return open_memory(options, options.pulses)
-    # readers are imported when needed: the LH5 library alone takes seconds to load
-    found = recognise(options.path)
-    source: PulseSource = getattr(import_module(f"{__package__}.{found.module}"), found.opens)(
-        options
-    )
-    return source
+    return PulseFile(Path(path), table, energy, kev_per_adc, dt_ns).open()
 
 
 def tables_of(path: str | Path) -> list[str]:
@@ -285,11 +302,11 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
     """
     path = Path(path)
     found = recognise(path)
-    if found is FLASHCAM:
+    if found == "FlashCam":
         from cpunet.pulses.reading.flashcam import channel_sizes
 
         return channel_sizes(path)
-    if found is not HDF5:
+    if found != "HDF5":
         return {}
     from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import channel_tables
@@ -300,8 +317,8 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         return dict.fromkeys(tables)
 
 
-def recognise(path: Path) -> Format:
-    """Return the format of a file, from its content.
+def recognise(path: Path) -> str:
+    """Return the name of the format of a file, from its content.
 
     Raises
     ------
@@ -310,20 +327,23 @@ def recognise(path: Path) -> Format:
         format than its suffix says.
     """
     head = _head(path)
-    found = _by_content(head, path)
-    if found is not None:
-        return found
+    # the FCIO library unpacks these two itself, by their suffix
+    if path.name.endswith((".fcio.gz", ".fcio.zst")):
+        return "FlashCam"
+    for name, one in FORMATS.items():
+        if one.begins(head):
+            return name
     foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
     if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
         foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
     if foreign is not None:
         raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
-    formats = (HDF5, FLASHCAM, NUMPY, PICKLE, SPECTRUM)
-    if claimed := next((one for one in formats if path.suffix.lower() in one.suffixes), None):
-        raise CpunetError(
-            f"{path}: not a {claimed.name} file, despite its name; "
-            "give a file of pulses or correct its suffix"
-        )
+    for name, one in FORMATS.items():
+        if path.suffix.lower() in one.suffixes:
+            raise CpunetError(
+                f"{path}: not a {name} file, despite its name; "
+                "give a file of pulses or correct its suffix"
+            )
     raise CpunetError(
         f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
         "pickled pulses, or siggen's .spe"
@@ -343,20 +363,3 @@ def _head(path: Path) -> bytes:
     if not head:
         raise CpunetError(f"{path}: is empty; copy or write it again")
     return head
-
-
-def _by_content(head: bytes, path: Path) -> Format | None:
-    # MATLAB writes 512 bytes of its own before the HDF5 part
-    if _HDF5_MAGIC in (head[:8], head[512:520]):
-        return HDF5
-    if head.startswith((b"\x93NUMPY", b"PK\x03\x04")):
-        return NUMPY
-    # the FCIO library unpacks these two itself, by their suffix
-    if head[4:12] == b"FlashCam" or path.name.endswith((".fcio.gz", ".fcio.zst")):
-        return FLASHCAM
-    # Fortran record marks around the 24 bytes of a Radware header
-    if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
-        return SPECTRUM
-    if head[0] == _PICKLE_MAGIC and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
-        return PICKLE
-    return None

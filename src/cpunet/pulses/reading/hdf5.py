@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -14,22 +16,23 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import (
-    StoredRows,
     is_column,
     is_text,
     item_at,
     lh5_rows,
     members,
-    opened,
+    one_line,
+    open_hdf5,
+    reading,
     text_attribute,
+    texts_of,
     units_of,
 )
-from cpunet.pulses.reading.arrays import ArraySource
 from cpunet.pulses.reading.division import divides, dividing, labels
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.published import is_majorana, open_majorana
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces
+from cpunet.pulses.reading.published import is_majorana, read_majorana
+from cpunet.pulses.reading.source import RawTable
 from cpunet.tables import shortened
 
 # preference among several waveform columns of a table: full record, then full-rate window
@@ -39,83 +42,84 @@ log = logging.getLogger(__name__)
 _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
-def open_hdf5(options: PulseFile) -> PulseSource:
-    """Open the waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    with opened(options.path) as file:
-        if is_majorana(file):
-            return open_majorana(options, file)
-        chosen = choose_waveforms(options.path, file, options.place)
-        if chosen.is_lh5:
-            return Lh5Source(options, chosen)
-        values = StoredRows(options.path, chosen.path, file[chosen.path].shape)
-        columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
-        columns.pop(chosen.name, None)  # one pulse is a row, as MATLAB writes a vector
-    return ArraySource(options, "HDF5", chosen.path, values, columns)
+def read_hdf5(options: PulseFile) -> RawTable:
+    """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
+    path = options.path
+    with one_line(path), ExitStack() as unless_read:
+        file = unless_read.enter_context(open_hdf5(path))
+        table = _read(options, file)
+        unless_read.pop_all()
+        return replace(table, close=file.close)
 
 
-class Lh5Source(PulseSource):
+def _read(options: PulseFile, file: h5py.File) -> RawTable:
+    path = options.path
+    if is_majorana(file):
+        return read_majorana(options, file)
+    chosen = choose_waveforms(path, file, options.place)
+    columns = columns_of(path, file[chosen.table or "/"])
+    attrs = texts_of(file) | texts_of(file[chosen.table or "/"])
+    if chosen.is_lh5:
+        return _read_lh5(path, file, chosen, columns, attrs)
+    columns.pop(chosen.name, None)  # one pulse is a row, as MATLAB writes a vector
+    values = file[chosen.path]
+    table = RawTable.of_array(path, "HDF5", chosen.path, values, columns, attrs)
+    return replace(table, rows=reading(path, values, table.rows))
+
+
+def _read_lh5(
+    path: Path,
+    file: h5py.File,
+    chosen: WaveformColumn,
+    columns: dict[str, Column],
+    attrs: dict[str, str],
+) -> RawTable:
     """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
+    own, values = columns_of(path, file[chosen.path]), file[f"{chosen.path}/values"]
+    n = _n_rows(values)
+    first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
+    shortest, longest = _lengths(values) or first.shape[1:] * 2
+    if shortest < longest and first.dtype.kind == "f":
+        log.info(
+            f"{path.name}: pulses of {shortest} to {longest} samples are continued with their "
+            "last value"
+        )
+    rows = reading(path, values, partial(_lh5_traces, values, longest))
+    return RawTable(
+        "LH5", chosen.path, n, longest, rows, columns, attrs,
+        f"{chosen.path}/dt", own.get("dt"), t0=own.get("t0"),
+    )  # fmt: skip
 
-    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
-        self._values = f"{chosen.path}/values"
-        with opened(options.path) as file:
-            columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
-            own = columns_of(options.path, file[chosen.path], chosen.path)
-            self._size = n_pulses = _n_rows(file[self._values])
-            first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
-            shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
-            if shortest < longest and first.dtype.kind == "f":
-                log.info(
-                    f"{options.path.name}: pulses of {shortest} to {longest} samples are "
-                    "continued with their last value"
-                )
-            layout = Layout(
-                format="LH5",
-                table=chosen.path,
-                n_pulses=n_pulses,
-                length=longest,
-                columns=columns,
-                period_name=f"{chosen.path}/dt",
-                period=own.get("dt"),
-                t0=own.get("t0"),
-            )
-        super().__init__(options, layout)
 
-    def _traces(self, size: int) -> Iterator[Traces]:
-        with opened(self.path) as file:
-            for start in range(0, self._size, size):
-                n = min(size, self._size - start)
-                yield Traces(self._rows(file, start, n, self.length))
-
-    def _rows(
-        self, file: h5py.File, start: int, size: int, length: int | None
-    ) -> npt.NDArray[Any]:
-        item = file[self._values]
-        plain = isinstance(item, h5py.Dataset)
-        values = item[start : start + size] if plain else lh5_rows(item, start, size)
-        if not hasattr(values, "cumulative_length"):
-            traces = np.asarray(getattr(values, "nda", values))
-            if traces.ndim != 2 or traces.dtype.kind not in "iuf":
-                raise CpunetError(
-                    f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
-                    f"{traces.shape}; give a file of traces"
-                )
-            return traces
-        lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
-        expected = int(lengths[0]) if length is None else length
-        flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
-        if not (other := lengths != expected).any():
-            return flat.reshape(len(lengths), expected)
-        first = int(other.argmax())
-        if flat.dtype.kind != "f":
+def _lh5_traces(
+    item: h5py.Group | h5py.Dataset, length: int | None, start: int, stop: int
+) -> npt.NDArray[Any]:
+    """Rows of LH5 traces; vectors of their own lengths are continued to `length` samples."""
+    plain = isinstance(item, h5py.Dataset)
+    values = item[start:stop] if plain else lh5_rows(item, start, stop - start)
+    if not hasattr(values, "cumulative_length"):
+        traces = np.asarray(getattr(values, "nda", values))
+        if traces.ndim != 2 or traces.dtype.kind not in "iuf":
             raise CpunetError(
-                f"{file.filename}: event {start + first}: {lengths[first]} samples, others "
-                f"have {expected}",
-                "split the file by length; only ideal pulses are continued with their last one",
+                f"{item.file.filename}: {item.name.strip('/')} has values of {traces.dtype} "
+                f"and shape {traces.shape}; give a file of traces"
             )
-        last = np.cumsum(lengths) - 1
-        at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
-        return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
+        return traces
+    lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
+    expected = int(lengths[0]) if length is None else length
+    flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
+    if not (other := lengths != expected).any():
+        return flat.reshape(len(lengths), expected)
+    first = int(other.argmax())
+    if flat.dtype.kind != "f":
+        raise CpunetError(
+            f"{item.file.filename}: event {start + first}: {lengths[first]} samples, others "
+            f"have {expected}",
+            "split the file by length; only ideal pulses are continued with their last one",
+        )
+    last = np.cumsum(lengths) - 1
+    at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
+    return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
 
 
 def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
@@ -249,7 +253,7 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
     for table in waveform_tables(file):
         try:
             group = item_at(file, table) or file
-            columns = columns_of(path, group, table) if isinstance(group, h5py.Group) else {}
+            columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
         rows = max(map(len, columns.values()), default=0)
@@ -337,13 +341,13 @@ def _column(item: h5py.Group | h5py.Dataset, table: str, name: str) -> WaveformC
     return WaveformColumn(table, name, is_lh5) if is_lh5 or _is_array(item) else None
 
 
-def columns_of(path: Path, group: h5py.Group, table: str) -> dict[str, Column]:
+def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numeric datasets of one dimension, and its scalars.
 
     Text counts where it separates channels; MATLAB has no vectors, but writes a row.
     """
     return {
-        name: _stored(path, item, f"{table}/{name}")
+        name: _stored(path, item)
         for name, item in members(group).items()
         if is_column(item) or _is_row(item) or (divides(name) and is_text(item))
     }
@@ -357,26 +361,25 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
     CpunetError
         If there is no such file or column; the message lists the other columns of the group.
     """
-    with opened(path) as file:
-        place = name.strip("/").rpartition("/")[0]
+    file, place = open_hdf5(path), name.strip("/").rpartition("/")[0]
+    with one_line(path):
         parent, found = item_at(file, place), item_at(file, name)
-        others = columns_of(path, parent, place) if isinstance(parent, h5py.Group) else {}
+        others = columns_of(path, parent) if isinstance(parent, h5py.Group) else {}
         if is_column(found) or _is_row(found):
-            return _stored(path, found, name), others
+            return _stored(path, found), others
         there = list(others or file)
     raise CpunetError(f"{path}: no column {name}; there are {shortened(there)}")
 
 
-def _stored(path: Path, dataset: h5py.Dataset, name: str) -> Column:
-    """A dataset as a column, by its name in this file; the file is open only while reading."""
-    is_constant, dataset_shape = dataset.ndim == 0, dataset.shape
+def _stored(path: Path, dataset: h5py.Dataset) -> Column:
+    """A dataset as a column."""
+    is_constant = dataset.ndim == 0
 
     def read(start: int, stop: int) -> npt.NDArray[Any]:
-        with opened(path) as file:
-            if is_constant:
-                return np.full(stop - start, file[name][()])
-            if dataset_shape[1:]:
-                return np.ravel(file[name][()])[start:stop]
-            return np.asarray(file[name][start:stop])
+        if is_constant:
+            return np.full(stop - start, dataset[()])
+        if dataset.ndim > 1:
+            return np.ravel(dataset[()])[start:stop]
+        return np.asarray(dataset[start:stop])
 
-    return Column(read, dataset.size, units_of(dataset), is_constant)
+    return Column(reading(path, dataset, read), dataset.size, units_of(dataset), is_constant)
