@@ -235,8 +235,8 @@ class SideInfo(InfoPart):
 
     Parameters
     ----------
-    file, read_as, dt_ns
-        File, its reading options, and its sampling period in ns.
+    file, place, read_as, dt_ns
+        File as given and its full path, its reading options, and its sampling period in ns.
     read, used, rejections
         Number of pulses read, of those used (text if unknown), and of others by reason.
     cuts
@@ -245,9 +245,12 @@ class SideInfo(InfoPart):
         Lowest and highest count of measured traces.
     sha256
         Fingerprint of the pulses used.
+    detector
+        Name of the simulated detector, if the file contains it.
     """
 
     file: str | None = None
+    place: str | None = None
     read_as: dict[str, Any] = {}
     dt_ns: float | None = None
     read: int | None = None
@@ -256,11 +259,12 @@ class SideInfo(InfoPart):
     cuts: Annotated[CutWindows | None, Field(strict=False)] = None
     counts: Annotated[tuple[int, int] | None, Field(strict=False)] = None
     sha256: str | None = None
+    detector: str | None = None
 
     def reading(self, file: PulseFile) -> PulseFile:
         """A file with the reading options that the training had for it as defaults."""
         told = self.read_as
-        if self.file is None or Path(self.file).resolve() != file.path.resolve():
+        if self.place != str(file.path.resolve()):
             return file
         if any(told.get(name) != value for name, value in file.options.items()):
             return file
@@ -292,6 +296,7 @@ class InputSet:
         waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
         return SideInfo(
             file=str(self.path),
+            place=str(self.path.resolve()),
             read_as=self.read_as,
             dt_ns=self.dt_ns,
             read=self.prepared.n_read,
@@ -300,6 +305,7 @@ class InputSet:
             cuts=self.cuts,
             counts=self.counts,
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
+            detector=self.detector,
         )
 
     def fingerprint(self) -> dict[str, str | float]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import FloatArray, Pulses
 
 if TYPE_CHECKING:
     from cpunet.pulses.reading.source import PulseSource
@@ -112,6 +113,43 @@ class PulseFile:
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise CpunetError(f"{self.path}: {name} is {value}; expected more than 0")
+
+    def __repr__(self) -> str:
+        options = "".join(f", {name} {value}" for name, value in self.options.items())
+        return f"<PulseFile {self.path}{options}>"
+
+    def __bool__(self) -> bool:
+        return True  # without a look at the file
+
+    def __len__(self) -> int:
+        with self.open() as source:
+            n = source.n_pulses
+            return sum(map(len, source.blocks())) if n is None else n
+
+    def __iter__(self) -> Iterator[Pulses]:
+        """Blocks of a few thousand pulses."""
+        with self.open() as source:
+            yield from source.blocks()
+
+    def __getitem__(self, rows: slice) -> Pulses:
+        """The pulses of some rows; others are not read, where the format allows it."""
+        with self.open() as source:
+            if (n := source.n_pulses) is None:
+                return source.read()[rows]
+            if not (picked := range(n)[rows]):
+                return source.read(0, 1)[:0]
+            first, last = sorted((picked[0], picked[-1]))
+            return source.read(first, last + 1)[:: picked.step]
+
+    @property
+    def waveforms(self) -> FloatArray:
+        """Waveforms of all pulses, shape ``(n, samples)``, read on every access."""
+        return self[:].waveforms
+
+    @property
+    def energy_kev(self) -> npt.NDArray[np.float64]:
+        """Energies of all pulses in keV, read on every access."""
+        return self[:].energy_kev
 
     @property
     def place(self) -> str | None:

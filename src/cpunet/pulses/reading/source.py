@@ -278,9 +278,11 @@ class PulseSource:
                 "give the energies of the same events"
             )
 
-    def read(self) -> Pulses:
-        """Read all pulses of the file at once; they must fit in memory."""
-        return Pulses.concatenate(list(self.blocks()))
+    def read(self, start: int = 0, stop: int | None = None) -> Pulses:
+        """Read all pulses of the file, or some rows, at once; they must fit in memory."""
+        if stop is None:
+            return Pulses.concatenate(list(self.blocks()))
+        return self._pulses(start, self.table.rows(start, stop))
 
     @property
     def columns(self) -> Mapping[str, Column]:
