@@ -93,7 +93,7 @@ _BASELINE_FRACTION = 0.05
 _BASELINE_SAMPLES = 10
 
 # Files store periods in single precision.
-_TOLERANCE = 1e-5
+TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -243,37 +243,19 @@ def _joined(
     return Column.of(values, column.units)
 
 
-@dataclass(frozen=True)
-class Sampling:
-    """The sampling period in ns, and the column that must agree with it."""
-
-    path: Path
-    dt_ns: float
-    column: Column | None = None
-    ns_per_unit: float = 1.0
-
-    def check(self, start: int, event_number: npt.NDArray[np.int64]) -> None:
-        """Raise a `CpunetError` that names the first event with another sampling period."""
-        if self.column is None:
-            return
-        values = self.column.read(start, start + len(event_number))
-        periods = self.ns_per_unit * np.asarray(values, np.float64)
-        other = ~np.isclose(periods, self.dt_ns, rtol=_TOLERANCE, atol=0)
-        if other.any():
-            first = int(other.argmax())
-            raise CpunetError(
-                f"{self.path}: event {event_number[first]}: sampling period "
-                f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
-                "split the file by sampling period"
-            )
-
-
-def resolve_sampling(options: PulseFile, table: RawTable) -> Sampling:
+def resolve_sampling(options: PulseFile, table: RawTable) -> tuple[float, Read | None]:
     """Take the period from the column of the file or from the user's ``dt_ns``.
 
     A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
     and ``dt_ns`` is required; the error message contains the hint of the format.  A file that
     says another period than the user is corrected, with a warning.
+
+    Returns
+    -------
+    dt_ns
+        Sampling period in ns.
+    periods
+        Reads that of each trace in ns, if the file has it for each.
 
     Raises
     ------
@@ -294,26 +276,26 @@ def resolve_sampling(options: PulseFile, table: RawTable) -> Sampling:
             raise CpunetError(
                 f"{path}: the sampling period {why}; give `dt_ns`{hint and f' ({hint})'}"
             )
-        return Sampling(path, dt_ns)
+        return dt_ns, None
     if len(column) != 1:
         require_length(path, name, column, table.n)
     found = float(column.read(0, 1)[0]) * ns_per_unit
-    if dt_ns is not None and not np.isclose(found, dt_ns, rtol=_TOLERANCE, atol=0):
+    if dt_ns is not None and not np.isclose(found, dt_ns, rtol=TOLERANCE, atol=0):
         log.warning(
             f"{path.name}: says that it is sampled every {found:g} ns; taken as {dt_ns:g} ns, "
             "as given (`dt_ns`)"
         )
         if not (np.isfinite(found) and found > 0):
-            return Sampling(path, dt_ns)
+            return dt_ns, None
         ns_per_unit *= dt_ns / found
         found = dt_ns
     if not (np.isfinite(found) and found > 0):
         raise CpunetError(
             f"{path}: event 0: the sampling period ({name}) is {found:g} ns", "give `dt_ns`"
         )
-    # A single value, a scalar or an array of length 1, applies to all events.
-    varying = None if len(column) == 1 else column
-    return Sampling(path, found, varying, ns_per_unit)
+    if len(column) == 1:  # a scalar or an array of length 1 applies to all events
+        return found, None
+    return found, lambda start, stop: ns_per_unit * np.asarray(column.read(start, stop), float)
 
 
 def _ns_per_unit(path: Path, name: str, column: Column) -> float | None:

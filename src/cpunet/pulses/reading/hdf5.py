@@ -56,26 +56,15 @@ def _read(options: PulseFile, file: h5py.File) -> RawTable:
     path = options.path
     if is_majorana(file):
         return read_majorana(options, file)
-    chosen = choose_waveforms(path, file, options.place)
-    columns = columns_of(path, file[chosen.table or "/"])
-    attrs = texts_of(file) | texts_of(file[chosen.table or "/"])
-    if chosen.is_lh5:
-        return _read_lh5(path, file, chosen, columns, attrs)
-    columns.pop(chosen.name, None)  # one pulse is a row, as MATLAB writes a vector
-    values = file[chosen.path]
-    table = RawTable.of_array(path, "HDF5", chosen.path, values, columns, attrs)
-    return replace(table, rows=reading(path, values, table.rows))
-
-
-def _read_lh5(
-    path: Path,
-    file: h5py.File,
-    chosen: WaveformColumn,
-    columns: dict[str, Column],
-    attrs: dict[str, str],
-) -> RawTable:
-    """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
-    own, values = columns_of(path, file[chosen.path]), file[f"{chosen.path}/values"]
+    name = choose_waveforms(path, file, options.place)
+    table, _, own_name = name.rpartition("/")
+    group, values = file[table or "/"], file[name]
+    columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+    if isinstance(values, h5py.Dataset):
+        columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
+        found = RawTable.of_array(path, "HDF5", name, values, columns, attrs)
+        return replace(found, rows=reading(path, values, found.rows))
+    own, values = columns_of(path, values), values["values"]
     n = _n_rows(values)
     first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
     shortest, longest = _lengths(values) or first.shape[1:] * 2
@@ -86,8 +75,8 @@ def _read_lh5(
         )
     rows = reading(path, values, partial(_lh5_traces, values, longest))
     return RawTable(
-        "LH5", chosen.path, n, longest, rows, columns, attrs,
-        f"{chosen.path}/dt", own.get("dt"), t0=own.get("t0"),
+        "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
+        t0=own.get("t0"),
     )  # fmt: skip
 
 
@@ -137,33 +126,8 @@ def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
     return int(values.shape[0]) if values is not None and values.ndim else 0
 
 
-@dataclass(frozen=True)
-class WaveformColumn:
-    """Waveforms in a file.
-
-    Parameters
-    ----------
-    table
-        Path of the group that contains the waveforms and the other columns.
-    name
-        Name of the waveforms in it.
-    is_lh5
-        Whether they are an LH5 waveform table (t0, dt, values), not a plain dataset of shape
-        ``(events, samples)``.
-    """
-
-    table: str
-    name: str
-    is_lh5: bool
-
-    @property
-    def path(self) -> str:
-        """Path of the waveform column in the file."""
-        return f"{self.table}/{self.name}".strip("/")
-
-
-def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> WaveformColumn:
-    """Choose the waveforms at `table`: a table, a waveform column, or a group around one.
+def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
+    """Path of the waveforms at `table`: a table, a waveform column, or a group around one.
 
     Raises
     ------
@@ -175,17 +139,30 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
     if item is None:
         there = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
         raise CpunetError(f"{path}: no table {place}; there are {shortened(there)}")
-    above, _, name = place.rpartition("/")
-    column = _column(item, above, name)
-    if column is not None:
-        return column
-    folders = _folders(item, place) if isinstance(item, h5py.Group) else ()
-    found = [column for folder in folders for column in folder.waveforms()]
-    if broken := next((column.table for column in found if not column.name), None):
+    if _is_lh5(item) or _is_array(item):
+        return place
+    folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
+    for broken in (link for folder in folders for link in folder.broken):
         item_at(file, broken)  # which says what is wrong
-    if found:
-        return _only(path, found)
-    raise _no_waveforms(path, file, place)
+    found = [one for folder in folders for one in folder.waveforms]
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise _no_waveforms(path, file, place)
+    tables = sorted({one.rpartition("/")[0] for one in found})
+    names = {one.rpartition("/")[2]: one for one in found}
+    best = next((name for name in _PREFERRED if name in names), None)
+    if len(tables) == 1 and best is not None:
+        others = ", ".join(sorted(names.keys() - {best}))
+        log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
+        return names[best]
+    what, which = "tables of waveforms", tables
+    if len(tables) == 1:
+        what, which = "waveform columns", found
+    raise CpunetError(
+        f"{path}: {len(which)} {what} ({shortened(which)}); choose one with `table` "
+        "(`sim_table`, `data_table`)"
+    )
 
 
 def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
@@ -244,7 +221,13 @@ def _no_array(item: object) -> str:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    return sorted({one.table for folder in _folders(file) for one in folder.waveforms()})
+    return sorted(
+        {
+            place
+            for f in _folders(file)
+            for place in f.broken or ([f.path] if f.waveforms else [])
+        }
+    )
 
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
@@ -268,47 +251,18 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
     return found
 
 
-def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
-    tables = sorted({column.table for column in found})
-    if len(tables) > 1:
-        raise CpunetError(
-            f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
-            "choose one with `table` (`sim_table`, `data_table`)"
-        )
-    if len(found) == 1:
-        return found[0]
-    by_name = {column.name: column for column in found}
-    for name in _PREFERRED:
-        if name in by_name:
-            others = ", ".join(sorted(by_name.keys() - {name}))
-            log.info(f"{path.name}: {name} is read, at the full rate, not {others} (`table`)")
-            return by_name[name]
-    raise CpunetError(
-        f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "
-        "choose one with `table` (`sim_table`, `data_table`)"
-    )
-
-
 @dataclass(frozen=True)
 class _Folder:
-    """A group of a file: its path, what it holds, and links in it that lead nowhere."""
+    """A group of a file: its path, what it holds, waveforms in it, and links that lead nowhere.
+
+    The waveforms are those of LH5, or else the first of the usual names.
+    """
 
     path: str
     members: dict[str, h5py.Group | h5py.Dataset]
-    broken: list[str]
     is_table: bool
-
-    def waveforms(self) -> list[WaveformColumn]:
-        """Waveforms in it, those of LH5 before others; of broken links, with no name."""
-        if self.is_table and {"dt", "values"} <= self.members.keys():
-            return []  # the inside of waveforms
-        columns = [_column(item, self.path, name) for name, item in self.members.items()]
-        there = [column for column in columns if column is not None]
-        plain = [column for name in _PLAIN for column in there if column.name == name]
-        found = [column for column in there if column.is_lh5] or plain[:1]
-        if found or self.is_table:
-            return found
-        return [WaveformColumn(f"{self.path}/{n}".strip("/"), "", False) for n in self.broken]
+    waveforms: list[str]
+    broken: list[str]
 
 
 def _folders(
@@ -327,18 +281,23 @@ def _folders(
         except CpunetError:
             broken.append(name)
     is_table = text_attribute(group, "datatype").startswith("table")
-    yield _Folder(path, found, broken, is_table)
+    names = [name for name, item in found.items() if _is_lh5(item)]
+    names = names or [name for name in _PLAIN if _is_array(found.get(name))][:1]
+    if is_table and {"dt", "values"} <= found.keys():
+        names = []  # the inside of waveforms
+    of = f"{path}/".lstrip("/")
+    lost = [] if names or is_table else [of + name for name in broken]
+    yield _Folder(path, found, is_table, [of + name for name in names], lost)
     for name, item in found.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
-            yield from _folders(item, f"{path}/{name}".strip("/"), seen)
+            yield from _folders(item, of + name, seen)
 
 
-def _column(item: h5py.Group | h5py.Dataset, table: str, name: str) -> WaveformColumn | None:
-    """Return an item of a table as waveforms; None if it is none."""
-    is_lh5 = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
-    is_lh5 = is_lh5 and text_attribute(item, "datatype").startswith("table")
-    return WaveformColumn(table, name, is_lh5) if is_lh5 or _is_array(item) else None
+def _is_lh5(item: object) -> bool:
+    """Whether an item is an LH5 waveform table (t0, dt, values)."""
+    is_group = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
+    return is_group and text_attribute(item, "datatype").startswith("table")
 
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:

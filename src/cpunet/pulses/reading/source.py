@@ -17,6 +17,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.division import divides, dividing, labels, texts
 from cpunet.pulses.reading.energies import (
     EVENT_KEYS,
+    TOLERANCE,
     Column,
     require_length,
     resolve_energies,
@@ -237,8 +238,7 @@ class PulseSource:
         self.n_pulses = table.n
         self.length = table.length
         self.table = table
-        self._sampling = resolve_sampling(options, table)
-        self.dt_ns = self._sampling.dt_ns
+        self.dt_ns, self._periods = resolve_sampling(options, table)
         self.energies = resolve_energies(options, table)
         self._number_column = next((n for n in _EVENT_NUMBERS if n in table.columns), None)
         if self._number_column is not None:
@@ -305,7 +305,16 @@ class PulseSource:
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
-        self._sampling.check(start, event_number)
+        if self._periods is not None:
+            periods = self._periods(start, stop)
+            other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
+            if other.any():
+                first = int(other.argmax())
+                raise CpunetError(
+                    f"{self.path}: event {event_number[first]}: sampling period "
+                    f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
+                    "split the file by sampling period"
+                )
         t0, t0_ns = self.table.t0, np.zeros(len(waveforms))
         if t0 is not None and (ns_per_unit := factor(t0.units, "ns")) is not None:
             t0_ns = ns_per_unit * np.asarray(t0.read(start, stop), np.float64)
