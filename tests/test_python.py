@@ -75,11 +75,13 @@ def run(home, opens) -> cpunet.Run:
     return run
 
 
-def test_a_file_that_is_looked_at_is_opened_once(home, opens):
+def test_a_file_is_opened_once(home, run, opens, tmp_path):
     for name in ("sim.lh5", "raw.lh5"):
         opens.clear()
         assert str(N) in str(cpunet.info(home / name))
         assert opens == {str(home / name): 1}
+        cpunet.translate(run, home / name, tmp_path / name, inverse=name == "raw.lh5")
+        assert opens[str(home / name)] == 2
 
 
 def test_importing_is_light_and_all_is_there():

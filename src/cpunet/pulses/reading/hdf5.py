@@ -63,7 +63,7 @@ def _read(options: PulseFile, file: h5py.File) -> RawTable:
     if isinstance(values, h5py.Dataset):
         columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
         found = RawTable.of_array(path, "HDF5", name, values, columns, attrs)
-        return replace(found, rows=reading(path, values, found.rows))
+        return replace(found, rows=reading(path, values, found.rows), group=group)
     own, values = columns_of(path, values), values["values"]
     n = _n_rows(values)
     first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
@@ -76,7 +76,7 @@ def _read(options: PulseFile, file: h5py.File) -> RawTable:
     rows = reading(path, values, partial(_lh5_traces, values, longest))
     return RawTable(
         "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
-        t0=own.get("t0"),
+        t0=own.get("t0"), group=group,
     )  # fmt: skip
 
 

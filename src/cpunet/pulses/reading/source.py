@@ -29,6 +29,8 @@ from cpunet.tables import shortened
 from cpunet.units import factor
 
 if TYPE_CHECKING:  # of a library that other formats do not need
+    import h5py
+
     from cpunet.hdf5_files import Read
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
@@ -68,8 +70,8 @@ class RawTable:
         Times of the first samples, if they are in the file.
     numbers
         Event numbers of the traces read last, if they are in no column.
-    close
-        Closes the file.
+    group, close
+        Group of an HDF5 file with columns of any kind; closes the file.
     chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
     """
@@ -86,6 +88,7 @@ class RawTable:
     period_hint: str = ""
     t0: Column | None = None
     numbers: Read | None = None
+    group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
     chosen: npt.NDArray[np.int64] | None = None
     n_all: int | None = None
