@@ -332,13 +332,8 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
 
 def _stored(path: Path, dataset: h5py.Dataset) -> Column:
     """A dataset as a column."""
-    is_constant = dataset.ndim == 0
-
-    def read(start: int, stop: int) -> npt.NDArray[Any]:
-        if is_constant:
-            return np.full(stop - start, dataset[()])
-        if dataset.ndim > 1:
-            return np.ravel(dataset[()])[start:stop]
-        return np.asarray(dataset[start:stop])
-
-    return Column(reading(path, dataset, read), dataset.size, units_of(dataset), is_constant)
+    if dataset.ndim != 1:  # a number, or a row of MATLAB's
+        values = np.asarray(dataset[()])
+        return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
+    read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
+    return Column(read, dataset.size, units_of(dataset))
