@@ -12,7 +12,7 @@ import pytest
 
 from cpunet import info
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading import open_pulses, tables_of
+from cpunet.pulses.reading import open_pulses, table_sizes
 from synthetic import decay, phased_edges
 
 KEV = 2614.511
@@ -44,7 +44,7 @@ def write_majorana(path: Path, n: int = 2 * N, *, labels: bool = True, length: i
 def test_one_detector_of_the_majorana_release(tmp_path):
     file = tmp_path / "MJD_Train_0.hdf5"
     traces = write_majorana(file, 50, length=40)
-    assert tables_of(file) == ["5", "9"]
+    assert [*table_sizes(file)] == ["5", "9"]
     source = open_pulses(file, table="9", dt_ns=10)
     rows = np.arange(1, 50, 3)
     assert (source.n_pulses, source.length, source.dt_ns) == (len(rows), 40, 10)
@@ -222,13 +222,13 @@ def test_channels_with_traces_are_listed_and_counted(tmp_path):
     records = [config(4), event(0, {0: trace(0), 3: trace(1)}, sparse=True)]
     records.append(event(1, {3: trace(2)}, sparse=True))
     path = write(tmp_path / "run.fcio", *records)
-    assert tables_of(path) == ["0", "3"]
+    assert [*table_sizes(path)] == ["0", "3"]
     rows = [line.split()[:2] for line in str(info(path)).splitlines()]
     assert rows[1:3] == [["0", "1"], ["3", "2"]]
     one = write(tmp_path / "one.fcio", config(1), event(0, {0: trace(0)}))
-    assert tables_of(one) == ["0"]
+    assert [*table_sizes(one)] == ["0"]
     path.write_bytes(path.read_bytes()[:-30])
-    assert tables_of(path) == ["0", "3"]  # what reads the traces tells that it is cut off
+    assert [*table_sizes(path)] == ["0", "3"]  # what reads the traces tells that it is cut off
 
 
 @pytest.mark.parametrize(("bits", "dt_ns"), [(16, 16.0), (12, 4.0)])

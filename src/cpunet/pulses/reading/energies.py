@@ -179,18 +179,18 @@ def _calibrated(
 ) -> Energies | None:
     units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
     kev_per_unit = factor(units, "keV")
-    if kev_per_unit is not None and kev_per_adc is None:
-        return Energies(f"column {name} [{units}]", kev_per_unit, column)
-    if kev_per_unit is not None and kev_per_adc is not None:
-        log.warning(
-            f"{path.name}: column {name} is in {units}; its energies are multiplied by "
-            f"{kev_per_adc:g}, as given (`kev_per_adc`)"
-        )
-        rule = f"column {name} [{units}] x {kev_per_adc:g}"
-        return Energies(rule, kev_per_unit * kev_per_adc, column)
-    if kev_per_adc is not None:
+    if kev_per_unit is None:
+        if kev_per_adc is None:
+            return None
         return Energies(f"column {name} x {kev_per_adc:g} keV/ADC", kev_per_adc, column)
-    return None
+    if kev_per_adc is None:
+        return Energies(f"column {name} [{units}]", kev_per_unit, column)
+    log.warning(
+        f"{path.name}: column {name} is in {units}; its energies are multiplied by "
+        f"{kev_per_adc:g}, as given (`kev_per_adc`)"
+    )
+    rule = f"column {name} [{units}] x {kev_per_adc:g}"
+    return Energies(rule, kev_per_unit * kev_per_adc, column)
 
 
 def _named_column(path: Path, table: RawTable, energy: str) -> Column:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -182,7 +182,7 @@ class PulseFile:
 
         if self.pulses is not None:
             return PulseSource(self, read_memory(self.path, self.pulses))
-        module, _, name = FORMATS[recognise(self.path)].reader.partition(".")
+        module, _, name = FORMATS[recognise(self.path)][1].partition(".")
         table = getattr(import_module(f"{__package__}.{module}"), name)(self)
         try:
             return PulseSource(self, table)
@@ -222,42 +222,32 @@ def pulse_file(
     )
 
 
-class Format(NamedTuple):
-    """A format of files: its suffixes, its first bytes, and the module and function it has."""
-
-    suffixes: tuple[str, ...]
-    begins: Callable[[bytes], bool]
-    reader: str
-
-
-# readers are imported when needed: HDF5 and FlashCam take a fifth of a second each
-FORMATS = {
+# Suffixes, reader and first bytes of each format.  Readers are imported when needed: HDF5 and
+# FlashCam take a fifth of a second each.
+FORMATS: dict[str, tuple[str, str, Callable[[bytes], bool]]] = {
     # MATLAB writes 512 bytes of its own before the HDF5 part
-    "HDF5": Format(
-        (".lh5", ".h5", ".hdf5", ".hdf"),
+    "HDF5": (
+        ".lh5 .h5 .hdf5 .hdf", "hdf5.read_hdf5",
         lambda head: b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:520]),
-        "hdf5.read_hdf5",
     ),
-    "FlashCam": Format(
-        (".fcio",), lambda head: head[4:12] == b"FlashCam", "flashcam.read_flashcam"
+    "FlashCam": (
+        ".fcio", "flashcam.read_flashcam", lambda head: head[4:12] == b"FlashCam",
     ),
-    "NumPy": Format(
-        (".npz", ".npy"),
+    "NumPy": (
+        ".npz .npy", "arrays.read_numpy",
         lambda head: head.startswith((b"\x93NUMPY", b"PK\x03\x04")),
-        "arrays.read_numpy",
     ),
-    "pickle": Format(
-        (".pickle", ".pkl"),
+    "pickle": (
+        ".pickle .pkl", "published.read_pickles",
         lambda head: head[0] == 0x80 and head[1:2] in (b"\2", b"\3", b"\4", b"\5"),
-        "published.read_pickles",
     ),
     # Fortran record marks around the 24 bytes of a Radware header
-    "spectrum": Format(
-        (".spe",),
+    "spectrum": (
+        ".spe", "arrays.read_spectrum",
         lambda head: len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24),
-        "arrays.read_spectrum",
     ),
-}
+}  # fmt: skip
+
 _AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
 _FOREIGN = {  # what cannot be read, by its first bytes, and what to do
     b"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
@@ -316,22 +306,16 @@ def open_pulses(
     return PulseFile(Path(path), table, energy, kev_per_adc, dt_ns).open()
 
 
-def tables_of(path: str | Path) -> list[str]:
-    """List the waveform tables of an LH5 or other HDF5 file; empty for formats without tables.
+def table_sizes(path: str | Path) -> dict[str, int | None]:
+    """Waveform tables of an LH5 or other HDF5 file; none of formats without tables.
 
     For the Majorana release these are the detectors, for FlashCam files the channels with
     traces.
 
-    Raises
-    ------
-    CpunetError
-        If the file is missing or cannot be read.
-    """
-    return list(table_sizes(path))
-
-
-def table_sizes(path: str | Path) -> dict[str, int | None]:
-    """Tables as in `tables_of`, with the number of pulses if it had to be counted, else None.
+    Returns
+    -------
+    dict
+        Number of pulses of each if it had to be counted, else None.
 
     Raises
     ------
@@ -368,16 +352,16 @@ def recognise(path: Path) -> str:
     # the FCIO library unpacks these two itself, by their suffix
     if path.name.endswith((".fcio.gz", ".fcio.zst")):
         return "FlashCam"
-    for name, one in FORMATS.items():
-        if one.begins(head):
+    for name, (_, _, begins) in FORMATS.items():
+        if begins(head):
             return name
     foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
     if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
         foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
     if foreign is not None:
         raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
-    for name, one in FORMATS.items():
-        if path.suffix.lower() in one.suffixes:
+    for name, (suffixes, _, _) in FORMATS.items():
+        if path.suffix.lower() in suffixes.split():
             raise CpunetError(
                 f"{path}: not a {name} file, despite its name; "
                 "give a file of pulses or correct its suffix"
