@@ -150,18 +150,19 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     if not found:
         raise _no_waveforms(path, file, place)
     tables = sorted({one.rpartition("/")[0] for one in found})
+    if len(tables) > 1:
+        raise CpunetError(
+            f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
+            "choose one with `table` (`sim_table`, `data_table`)"
+        )
     names = {one.rpartition("/")[2]: one for one in found}
-    best = next((name for name in _PREFERRED if name in names), None)
-    if len(tables) == 1 and best is not None:
+    if best := next((name for name in _PREFERRED if name in names), None):
         others = ", ".join(sorted(names.keys() - {best}))
         log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
         return names[best]
-    what, which = "tables of waveforms", tables
-    if len(tables) == 1:
-        what, which = "waveform columns", found
     raise CpunetError(
-        f"{path}: {len(which)} {what} ({shortened(which)}); choose one with `table` "
-        "(`sim_table`, `data_table`)"
+        f"{path}: {len(found)} waveform columns ({shortened(found)}); "
+        "choose one with `table` (`sim_table`, `data_table`)"
     )
 
 
