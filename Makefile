@@ -43,9 +43,12 @@ lint: install-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# could LEGEND's chain be installed beside it, the newest and the oldest that was tested? (a dry run)
+# could LEGEND's chain be installed beside it, the newest and the oldest that was tested, and all of
+# it for the newest Python? (dry runs)
 RESOLVE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --dry-run .
+NEWEST := --python-version 3.14 --only-binary :all: --ignore-installed --target $(VENV)/newest
 resolve: install
+	$(RESOLVE)[networks] $(NEWEST)
 	$(RESOLVE) --upgrade legend-lh5io legend-pydataobj dspeed pygama reboost
 	$(RESOLVE) legend-lh5io==0.2.3 legend-pydataobj==2.0.1 dspeed==2.1.4 pygama==2.3.10 reboost==1.0.0
 

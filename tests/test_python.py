@@ -6,14 +6,20 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
 import cpunet
 from cpunet import demo
+from cpunet.pulses import baselines, loading
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from synthetic import FACTS, KEV, write_run, write_sides
 
@@ -36,9 +42,43 @@ def home(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(home) -> cpunet.Run:
+def opens() -> Iterator[Counter[str]]:
+    """How often each HDF5 file was opened; under "rows", how many of them were prepared."""
+    counts, opened = Counter[str](), h5py.File.__init__
+
+    def count_file(self: h5py.File, name: object, *args: object, **options: object) -> None:
+        if isinstance(name, str | Path):  # else a file that is open
+            counts[str(name)] += 1
+        opened(self, name, *args, **options)
+
+    def count_rows(pulses: Pulses, *args: Any) -> object:
+        counts["rows"] += len(pulses)
+        return prepare(pulses, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(h5py.File, "__init__", count_file)
+        for module in (loading, baselines):
+            patch.setattr(module, "prepare", count_rows)
+        yield counts
+
+
+@pytest.fixture(scope="module")
+def run(home, opens) -> cpunet.Run:
     sides = home / "sim.lh5", str(home / "raw.lh5")
-    return cpunet.train(*sides, home / "run", settings=SHORT, seed=2, device="cpu")
+    opens.clear()
+    run = cpunet.train(*sides, home / "run", settings=SHORT, seed=2, device="cpu")
+    # one pulse of the simulation has no energy; those of the data have baselines all the same
+    assert opens == {str(side): 1 for side in sides} | {"rows": 2 * N - 1}
+    return run
+
+
+def test_a_file_is_opened_once(home, run, opens, tmp_path):
+    for name in ("sim.lh5", "raw.lh5"):
+        opens.clear()
+        assert str(N) in str(cpunet.info(home / name))
+        assert opens == {str(home / name): 1}
+        cpunet.translate(run, home / name, tmp_path / name, inverse=name == "raw.lh5")
+        assert opens[str(home / name)] == 2
 
 
 def test_importing_is_light_and_all_is_there():
@@ -222,8 +262,13 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert (len(sim), len(sim[:7]), len(sim[sim.energy_kev > 0])) == (N, 7, N - 1)
     assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
     assert list(sim.to_dataframe()) == ["event_number", "energy_kev", "peak"]
-    recipe = cpunet.load(sim.save(tmp_path / "sim.lh5")).open().read()
-    assert len(recipe) == N
+    file = cpunet.load(sim.save(tmp_path / "sim.lh5"))
+    assert (len(file), file.waveforms.shape, file.energy_kev.shape) == (N, (N, 225), (N,))
+    assert repr(file) == f"<PulseFile {tmp_path / 'sim.lh5'}>"
+    assert sum(map(len, file)) == N
+    for rows in (slice(3, 9), slice(-2, None), slice(None, None, -50), slice(9, 3)):
+        np.testing.assert_array_equal(file[rows].waveforms, sim[rows].waveforms)
+        np.testing.assert_array_equal(file[rows].event_number, sim[rows].event_number)
     assert "fast" in cpunet.list_recipes()
 
     assert cpunet.check(sim, data).ok
@@ -239,7 +284,11 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert like_data.waveforms.shape == (N, 800)
     assert {"current_amplitude", "energy_kev"} <= {*like_data.to_dataframe()}
     assert len(cpunet.load(like_data.save(tmp_path / "translated.lh5")).open().read()) == N
-    assert run.ren.translate(sim.waveforms[:2], noise=False).shape == (2, 800)
+    two = run.ren.translate(sim.waveforms[:2], noise=False)
+    assert two.shape == (2, 800)
+    as_set = run.ren.translate(sim[:2], noise=False)
+    np.testing.assert_array_equal(as_set.waveforms, two)
+    np.testing.assert_array_equal(as_set.energy_kev, sim.energy_kev[:2])
     assert run.iren.translate(data.waveforms[:2]).shape == (2, 800)
 
     report = run.validate(sim, data, baselines=False)
@@ -247,7 +296,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert report.scores.loc["FEP", "drift_time", "ren"].iou > 0
     assert report["FEP"].loc["drift_time", "ren"].ceiling > 0
     assert report.plot().axes
-    assert "FEP" in report.metrics["peaks"]
+    assert "FEP" in report.to_dict()["peaks"]
     report.save(tmp_path / "report")
     again = cpunet.load(tmp_path / "report")
     assert again.verdicts == report.verdicts

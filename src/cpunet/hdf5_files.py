@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import h5py
 import hdf5plugin  # noqa: F401 - provides the compression filters of LEGEND's files
@@ -15,12 +15,12 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 
+Read: TypeAlias = Callable[[int, int], npt.NDArray[Any]]  # rows from one to before another
+
 
 @contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading; library errors inside become a `CpunetError`.
-
-    File locking is off, since shared file systems of clusters often lack it.
+def one_line(path: Path) -> Iterator[None]:
+    """Errors of the HDF5 library become a `CpunetError` with the name of the file.
 
     Raises
     ------
@@ -28,8 +28,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
         If the file is missing, truncated or not HDF5.
     """
     try:
-        with h5py.File(path, "r", locking=False) as file:
-            yield file
+        yield
     except CpunetError:
         raise
     except FileNotFoundError:
@@ -40,6 +39,22 @@ def opened(path: Path) -> Iterator[h5py.File]:
             raise CpunetError(f"{path}: not an HDF5 file; give an LH5 or HDF5 file") from error
         what = "is truncated" if "truncated" in text else f"cannot be read ({text[:160]})"
         raise CpunetError(f"{path}: {what}; copy or write it again") from error
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """Open an HDF5 file for reading, until the last reference to it is gone; see `one_line`.
+
+    File locking is off, since shared file systems of clusters often lack it.
+    """
+    with one_line(path):
+        return h5py.File(path, "r", locking=False)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading; library errors inside become one line, too."""
+    with one_line(path), open_hdf5(path) as file:
+        yield file
 
 
 def item_at(group: h5py.Group, path: str) -> h5py.Group | h5py.Dataset | None:
@@ -99,8 +114,15 @@ def lh5_rows(
 def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
     """A text attribute, ``""`` if it is missing; some programs write it as an array of one."""
     value = item.attrs.get(name, "")
+    if isinstance(value, h5py.Empty):  # as netCDF writes an empty text
+        return ""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def texts_of(item: h5py.Group | h5py.Dataset) -> dict[str, str]:
+    """All attributes of an item as text."""
+    return {name: text_attribute(item, name) for name in item.attrs}
 
 
 def units_of(item: h5py.Group | h5py.Dataset) -> str:
@@ -110,7 +132,9 @@ def units_of(item: h5py.Group | h5py.Dataset) -> str:
 
 def is_column(item: object) -> bool:
     """Whether an object of a file is a one-dimensional array of numbers, or one number."""
-    return isinstance(item, h5py.Dataset) and item.ndim <= 1 and item.dtype.kind in "iufb"
+    if not isinstance(item, h5py.Dataset) or item.shape is None:  # with a type, without values
+        return False
+    return item.ndim <= 1 and item.dtype.kind in "iufb"
 
 
 def is_text(item: object) -> bool:
@@ -118,18 +142,11 @@ def is_text(item: object) -> bool:
     return isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
 
 
-@dataclass(frozen=True, eq=False)
-class StoredRows:
-    """Rows of a dataset, all or some of them; the file is open only while they are read."""
+def reading(path: Path, item: h5py.Group | h5py.Dataset, read: Read) -> Read:
+    """A function that reads rows of an item, whose file stays open; see `one_line`."""
+    return partial(_read, item.file, path, read)
 
-    path: Path
-    dataset: str
-    shape: tuple[int, ...]
-    rows: npt.NDArray[np.int64] | None = None
 
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, part: slice) -> Any:
-        with opened(self.path) as file:
-            return file[self.dataset][part if self.rows is None else self.rows[part]]
+def _read(_open: h5py.File, path: Path, read: Read, start: int, stop: int) -> npt.NDArray[Any]:
+    with one_line(path):
+        return read(start, stop)

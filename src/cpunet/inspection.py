@@ -180,23 +180,27 @@ def _look(
     settings: Mapping[str, Any],
     quality: bool,
 ) -> InfoResult:
+    from cpunet.recipes import load_recipe
+    from cpunet.simulation.hit_files import describe_hits, holds_hits
+
+    place, recipe, no_pulses = Path(path), load_recipe("fast"), None
+    if place.is_file() and not settings:  # most are pulses: these are opened once
+        try:
+            return _file(pulse_file(path, read), recipe, quality)
+        except CpunetError as error:
+            no_pulses = error
     if holds_detector(path):
         return _detector(read_detector(path, settings), str(path))
     if settings:
         raise CpunetError(f"{path}: is no detector", "leave out `settings`")
-    if Path(path).is_dir():
+    if place.is_dir():
         return _folder(path)
-    from cpunet.recipes import load_recipe
-    from cpunet.simulation.hit_files import describe_hits, holds_hits
-
-    recipe = load_recipe("fast")
     if holds_hits(path):
-        hits = describe_hits(Path(path), recipe.peaks, units)
         lines = [("file", str(path))]
-        for name, one in hits.items():
+        for name, one in describe_hits(place, recipe.peaks, units).items():
             lines += [("detector", name), *one]
         return InfoResult(str(path), lines)
-    return _file(pulse_file(path, read), recipe, quality)
+    raise no_pulses or CpunetError(f"{path}: no such file; check the name")
 
 
 def _folder(path: str | Path) -> InfoResult:
@@ -245,12 +249,11 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
     rows: list[list[object]] = []
     for name, number in tables.items():
         try:
-            source = replace(file, table=name).open()
+            with replace(file, table=name).open() as source:
+                numbers = [number or source.n_pulses, source.length, f"{source.dt_ns:g}"]
+                rows.append([name, *numbers, source.energies.description])
         except CpunetError as error:
             rows.append([name, "", "", "", str(error).removeprefix(f"{path}: ")])
-        else:
-            numbers = [number or source.n_pulses, source.length, f"{source.dt_ns:g}"]
-            rows.append([name, *numbers, source.energies.description])
     text = text_table(["table", "traces", "samples", "ns", "energies"], rows)
     return InfoResult(
         path, [("", text), ("", "one of them: `table` NAME; each in full: `table` all")]
@@ -262,16 +265,16 @@ def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
     from cpunet.pulses import provenance
     from cpunet.pulses.description import describe_pulses
 
-    source = file.open()
-    blocks = source.blocks()
-    first = next(blocks)  # a few thousand
-    lines = describe_pulses(source, chain([first], blocks), recipe.peaks)
-    found = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
-    # translated windows look measured, but are not raw traces
-    translated = provenance.TRANSLATED_BY in provenance.recorded_attributes(source)
-    if found is None or found.side != "measured" or translated:
-        return lines
-    return [*lines, *_traces(source, first, recipe, quality)]
+    with file.open() as source:
+        blocks = source.blocks()
+        first = next(blocks)  # a few thousand
+        lines = describe_pulses(source, chain([first], blocks), recipe.peaks)
+        found = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
+        # translated windows look measured, but are not raw traces
+        translated = provenance.TRANSLATED_BY in provenance.recorded_attributes(source)
+        if found is None or found.side != "measured" or translated:
+            return lines
+        return [*lines, *_traces(source, first, recipe, quality)]
 
 
 def _traces(source: PulseSource, first: Pulses, recipe: Recipe, quality: bool) -> Lines:

@@ -95,7 +95,11 @@ def start_threads() -> int:
     with suppress(ImportError):  # another threading layer
         importlib.import_module("numba.np.ufunc.omppool")  # loads OpenMP: it has a number now
     with threadpoolctl.ThreadpoolController().select(user_api="openmp").limit(limits=None):
-        numba.get_num_threads()
+        try:
+            numba.get_num_threads()
+        except ValueError:  # NUMBA_THREADING_LAYER asks for one that is not installed
+            config.THREADING_LAYER = "default"
+            numba.get_num_threads()
     asked = os.environ.get("OMP_NUM_THREADS", "")  # which numba does not look at
     if asked.isdecimal() and int(asked) and "NUMBA_NUM_THREADS" not in os.environ:
         numba.set_num_threads(min(int(asked), config.NUMBA_NUM_THREADS))

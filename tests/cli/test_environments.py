@@ -52,6 +52,13 @@ def test_a_script_without_a_guard_is_named(stand, tmp_path):
     assert f"{script}: processes run this script again; put its calls under if __name__" in said
 
 
+def test_a_layer_of_threads_that_is_not_installed_is_replaced():
+    """As clusters ask for TBB: https://github.com/numba/numba/issues/6108."""
+    code = "from cpunet.kernels import threads; print(threads())"
+    said = python("-c", code, NUMBA_THREADING_LAYER="tbb", NUMBA_NUM_THREADS="1")
+    assert said.strip() == "1"
+
+
 def loop(values):
     for i in numba.prange(len(values)):
         values[i] += 1

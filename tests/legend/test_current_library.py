@@ -26,6 +26,10 @@ from cpunet.legend.make_library import make_library
 from cpunet.legend.translate_library import TemplateTranslator, translate_library
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import load_pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.recipes import load_recipe
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.events import simulate_events
 from cpunet.simulation.field_lookup import drift_maps, in_active_volume
@@ -34,7 +38,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.run import Run, SideInfo
+from cpunet.training.run import Run
 from cpunet.translation.translator import REN
 from synthetic import after_pole_and_decay, sampled, write_chain, write_pulses
 
@@ -273,11 +277,15 @@ def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path)
 def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
     sim, known = tmp_path / "sim.lh5", Run.load(chain)
     assert known_detector(known) is None
-    run = known.model_copy(update={"sim": SideInfo(file=str(sim)), "folder": tmp_path})
-    assert known_detector(run) is None
-    pulses = Pulses.of(np.zeros((1, 8)), dt_ns=16)
+    recipe = load_recipe("fast")
+    edges = np.repeat([[0.0, 1.0]], [300, 300], axis=1) + np.linspace(0, 1e-6, 60)[:, None]
+    pulses = Pulses.of(edges, dt_ns=16, energy_kev=np.full(60, 2614.5))
     for told, name in (("no JSON", None), (json.dumps({"detector": {"name": "V01"}}), "V01")):
         write_pulses(sim, pulses, attrs={"simulation": told}, force=True)
+        fep = parse_selection("FEP", recipe.peaks)
+        side = load_pulses(PulseFile(sim), "simulated", recipe, fep).provenance()
+        sim.unlink()  # what was trained is stored with the run, wherever its file is now
+        run = known.model_copy(update={"sim": side, "folder": tmp_path})
         assert known_detector(run) == name
     (tmp_path / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
     assert known_detector(run) == "V02"

@@ -15,7 +15,7 @@ from lh5.compression import ULEB128ZigZagDiff
 from cpunet.errors import CpunetError
 from cpunet.pulses.channels import channels_of
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.reading.files import PulseFile, tables_of
+from cpunet.pulses.reading.files import PulseFile, table_sizes
 from cpunet.pulses.row_columns import other_columns
 from synthetic import one_line, waveform_table
 
@@ -49,7 +49,7 @@ HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
 def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
     path = write(tmp_path / "raw.lh5", **columns, baseline=np.arange(N))
     one_line(lambda: open_pulses(path), "channels or detectors", chosen.split(",")[0][:3])
-    assert f"raw/{chosen}" in tables_of(path)
+    assert f"raw/{chosen}" in table_sizes(path)
     for table in (f"raw/{chosen}", chosen):
         source = open_pulses(path, table=table)
         pulses = source.read()
@@ -75,7 +75,7 @@ def test_channels_that_are_text_and_arrays_of_numpy(tmp_path):
     names = np.array(["V01", "V02"])[PAIRS]
     with h5py.File(tmp_path / "raw.h5", "w") as file:
         file["waveform"], file["dt_ns"], file["detector"] = RAW, 16.0, names.astype("S")
-    assert tables_of(tmp_path / "raw.h5") == ["detector=V01", "detector=V02"]
+    assert [*table_sizes(tmp_path / "raw.h5")] == ["detector=V01", "detector=V02"]
     assert open_pulses(tmp_path / "raw.h5", table="detector=V02").n_pulses == N // 2
     np.savez(tmp_path / "raw.npz", waveform=RAW, dt_ns=16.0, ch=HALF)
     one_line(lambda: open_pulses(tmp_path / "raw.npz"), "`table` ch=3")
@@ -123,7 +123,7 @@ def linked(folder: Path, kind: str, inner: str) -> Path:
 def test_each_link_reads_its_own_table(tmp_path, kind, inner):
     master = linked(tmp_path, kind, inner)
     if kind == "external":
-        assert tables_of(master) == ["ch1/raw", "ch2/raw"]
+        assert [*table_sizes(master)] == ["ch1/raw", "ch2/raw"]
     for number, channel in enumerate(("ch1", "ch2")):
         source = open_pulses(master, table=f"{channel}/raw")
         np.testing.assert_array_equal(source.read().waveforms, RAW + number)
@@ -165,7 +165,7 @@ def test_a_broken_link_is_named_with_its_target(tmp_path, kind, place):
     said = ["is a link to", BROKEN[kind].path, place.rpartition("/")[2]]
     one_line(lambda: open_pulses(tmp_path / "one.lh5"), *said)
     table = "raw" if place.startswith("raw") else place
-    assert table in tables_of(tmp_path / "one.lh5")
+    assert table in table_sizes(tmp_path / "one.lh5")
     one_line(lambda: open_pulses(tmp_path / "one.lh5", table=table), *said)
     if kind != "loop":
         energy = f"{tmp_path}/one.lh5:{place}/energy".replace("energy/energy", "energy")

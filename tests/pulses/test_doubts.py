@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 
 import h5py
 import lh5
@@ -72,6 +73,24 @@ def test_energies_of_other_pulses_are_refused_unless_one_insists(tmp_path):
     with pytest.raises(CpunetError, match=r"% of amplitudes and energies do not go together"):
         load_pulses(file, "measured", RECIPE, FEP)
     load_pulses(PulseFile(file.path, insist=True), "measured", RECIPE, FEP)
+
+
+def test_amplitudes_that_saturate_before_the_digitiser_are_named(tmp_path):
+    """Tops that are noisy, below full scale: https://github.com/XENON1T/pax/issues/211."""
+    energies, rng = kev(), np.random.default_rng(5)
+    counts = np.minimum(traces(energies), 9000) + rng.integers(0, 3, (N, 1400))
+    file = written(tmp_path / "raw.lh5", counts, energies)
+    with pytest.raises(CpunetError, match=r"amplitudes end at 70\d\d, .*select lower energies"):
+        load_pulses(file, "measured", RECIPE, FEP)
+
+
+def test_records_that_begin_with_padding_are_named(tmp_path):
+    """Stretches of zeros: https://github.com/AxFoundation/strax/issues/177."""
+    energies, counts = kev(), traces(kev())
+    counts[::2, :350] = 0
+    file = written(tmp_path / "raw.lh5", counts, energies)
+    with pytest.raises(CpunetError, match="50 % of the traces begin with equal samples"):
+        load_pulses(file, "measured", RECIPE, FEP)
 
 
 @pytest.mark.parametrize("averaged", [2, 4])
@@ -153,14 +172,14 @@ def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
         open_pulses(path)
     with pytest.raises(CpunetError, match=r"no chnid 3; it holds 1, 2"):
         open_pulses(path, table="chnid=3")
-    source = open_pulses(path, table=table)
-    assert source.n_pulses == N - n_first
-    for size in (7, N):
-        blocks = list(source.blocks(size))
-        found = np.concatenate([block.waveforms for block in blocks])
-        np.testing.assert_array_equal(found, values[n_first:])
-        kev_found = np.concatenate([block.energy_kev for block in blocks])
-        np.testing.assert_array_equal(kev_found, energies[n_first:])
+    with open_pulses(path, table=table) as source:
+        assert source.n_pulses == N - n_first
+        for size in (7, N):
+            blocks = list(source.blocks(size))
+            found = np.concatenate([block.waveforms for block in blocks])
+            np.testing.assert_array_equal(found, values[n_first:])
+            kev_found = np.concatenate([block.energy_kev for block in blocks])
+            np.testing.assert_array_equal(kev_found, energies[n_first:])
     with h5py.File(path, "a") as file:
         file["sim/chnid"][...] = np.arange(N) % 2
     mixed = open_pulses(path, table="chnid=1").read()
@@ -179,6 +198,23 @@ def test_counts_that_roll_over_are_named_and_unwrapped(tmp_path, bits, signed):
     selection = parse_selection("1000-", {})
     with pytest.raises(CpunetError, match=rf"jump by {period} = 2\^{bits} .*period={period}"):
         load_pulses(file, "measured", load_recipe("fast"), selection)
+
+
+@pytest.mark.parametrize("kind", ["int16", "uint16", "uint32"])
+def test_the_advice_on_counts_that_roll_over_works_on_integers(tmp_path, kind):
+    """`numpy.unwrap` keeps their type: https://github.com/numpy/numpy/pull/29507."""
+    counts = traces(kev()).astype(np.int64)
+    stored = (3 * counts if kind == "int16" else counts - 5000).astype(kind)
+    if kind == "uint16":  # the baseline was subtracted in the digitiser's own type
+        stored = counts.astype(kind) - counts[:, :1].astype(kind)
+    file = written(tmp_path / "raw.lh5", stored, kev())
+    with pytest.raises(CpunetError, match="roll") as error:
+        load_pulses(file, "measured", RECIPE, FEP)
+    advice = re.search(r"numpy(\.unwrap\(.*\))", str(error.value))
+    whole = eval(f"np{advice[1]}", {"np": np, "values": stored, "float": float})
+    heights = np.ptp(whole, axis=1) / np.ptp(counts, axis=1)
+    np.testing.assert_allclose(heights, 3 if kind == "int16" else 1)
+    assert ("view('uint16')" in str(error.value)) == (kind == "int16")
 
 
 @pytest.mark.parametrize("suffix", ["h5", "npz"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import awkward as ak
 import h5py
 import numpy as np
 import pytest
@@ -112,6 +113,77 @@ def test_the_rows_of_a_spectrum_are_pulses(tmp_path):
     np.testing.assert_array_equal(found, rows)
 
 
+@pytest.mark.parametrize("orient", [np.ravel, np.atleast_2d, np.vstack])
+@pytest.mark.parametrize("suffix", ["npz", "h5"])
+@pytest.mark.parametrize("n", [1, 7])
+def test_columns_of_a_format_without_vectors(tmp_path, suffix, orient, n):
+    """MATLAB writes a row or a column: https://github.com/scipy/scipy/issues/13093."""
+    path, values = tmp_path / f"file.{suffix}", np.random.default_rng(1).normal(size=(n, 40))
+    energies = 1000.0 + np.arange(n)
+    arrays = {"waveform": values, "dt_ns": np.full((1, 1), 8.0), "energy_kev": orient(energies)}
+    if suffix == "npz":
+        np.savez(path, **arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            file.update(arrays)
+    pulses = open_pulses(path).read()
+    np.testing.assert_array_equal(pulses.waveforms, values.astype(np.float32))
+    np.testing.assert_array_equal(pulses.energy_kev, energies)
+    assert pulses.dt_ns == 8
+
+
+def test_datasets_and_attributes_without_values(tmp_path):
+    """HDF5's null dataspaces, as of netCDF: https://github.com/h5py/h5py/issues/279."""
+    path = tmp_path / "null.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["side"] = h5py.Empty("S1")
+        file["waveform"], file["energy"], file["dt"] = np.ones((3, 40)), np.arange(3.0), 16.0
+        file["energy"].attrs["units"], file["dt"].attrs["units"] = "keV", "ns"
+        file["energy"].attrs["unit"] = file["waveform"].attrs["units"] = h5py.Empty("S4")
+        file["event_number"] = file["comment"] = h5py.Empty("i8")
+    pulses = open_pulses(path).read()
+    np.testing.assert_array_equal(pulses.energy_kev, np.arange(3.0))
+    np.testing.assert_array_equal(pulses.event_number, np.arange(3))
+    with h5py.File(path, "r+") as file:
+        file["dt"].attrs["units"] = h5py.Empty("S4")
+    with pytest.raises(CpunetError, match=r"\(dt\) has no units; give `dt_ns`"):
+        open_pulses(path)
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        (b"root\0\0", "is a ROOT file, which is not read; read its traces with uproot"),
+        (b"\xe7\xca", "is a CAEN CoMPASS file, .*; convert it with legend-daq2lh5"),
+        (b"\x1f\x8b\x08", "is a compressed file, which is not read; unpack it"),
+        (b"MATLAB 5.0 MAT-file", "is a MATLAB 5 file, .*; save it with -v7.3"),
+    ],
+)
+def test_files_of_other_programs_are_named(tmp_path, start, words):
+    """As of CoMPASS, https://github.com/legend-exp/pygama/pull/23."""
+    path = tmp_path / "run_1.BIN"
+    path.write_bytes(start + bytes(700))
+    with pytest.raises(CpunetError, match=words):
+        open_pulses(path)
+
+
+def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
+    """NumPy drops masks without a word: https://github.com/numpy/numpy/issues/26669."""
+    masked = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])
+    pulses = Pulses.of(np.ma.masked_less(np.eye(3), 0.5), dt_ns=16, energy_kev=masked)
+    np.testing.assert_array_equal(pulses.energy_kev, [1, np.nan, 3])
+    assert np.isnan(pulses.waveforms).sum() == 6
+    for rows, energies, name in (
+        (np.eye(2), ak.Array([1.0, None]), "energy_kev"),
+        (ak.Array([[1.0, 2.0], [1.0]]), None, "waveforms"),
+        ([[1.0, 2.0], [1.0]], None, "waveforms"),
+    ):
+        with pytest.raises(CpunetError, match=f"{name}: no plain numbers .*; give rows of"):
+            Pulses.of(rows, dt_ns=16, energy_kev=energies)
+    jagged = ak.from_regular(ak.Array(np.eye(3)))  # as uproot reads vectors of equal length
+    np.testing.assert_array_equal(Pulses.of(jagged, dt_ns=16).waveforms, np.eye(3))
+
+
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(600)
 
 
@@ -128,7 +200,7 @@ def test_foreign_files(tmp_path, suffix, content):
 def test_content_counts_more_than_the_name(tmp_path):
     pulses = Pulses.of(np.zeros((2, 20)), dt_ns=16)
     write_pulses(tmp_path / "pulses.npz", pulses)
-    assert open_pulses(tmp_path / "pulses.npz").layout.format == "LH5"
+    assert open_pulses(tmp_path / "pulses.npz").table.format == "LH5"
 
 
 def write_all(folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ import pytest
 
 from cpunet import info
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading import open_pulses, tables_of
+from cpunet.pulses.reading import open_pulses, table_sizes
 from synthetic import decay, phased_edges
 
 KEV = 2614.511
@@ -44,7 +44,7 @@ def write_majorana(path: Path, n: int = 2 * N, *, labels: bool = True, length: i
 def test_one_detector_of_the_majorana_release(tmp_path):
     file = tmp_path / "MJD_Train_0.hdf5"
     traces = write_majorana(file, 50, length=40)
-    assert tables_of(file) == ["5", "9"]
+    assert [*table_sizes(file)] == ["5", "9"]
     source = open_pulses(file, table="9", dt_ns=10)
     rows = np.arange(1, 50, 3)
     assert (source.n_pulses, source.length, source.dt_ns) == (len(rows), 40, 10)
@@ -57,16 +57,16 @@ def test_one_detector_of_the_majorana_release(tmp_path):
     np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), traces[rows])
     labels = source.columns["psd_label_low_avse"].read(0, len(rows))
     np.testing.assert_array_equal(labels, rows % 2)
-    assert (source.layout.format, source.layout.table) == ("Majorana release", "9")
+    assert (source.table.format, source.table.name) == ("Majorana release", "9")
     assert source.energies.description == "column energy [keV]"
 
 
 def test_all_detectors_and_files_without_labels(tmp_path):
     file = tmp_path / "MJD_NPML_0.hdf5"
     write_majorana(file, 6, labels=False, length=40)
-    source = open_pulses(file, table="raw_waveform", dt_ns=10)
-    assert source.n_pulses == 6
-    assert source.energies.description == "not known"
+    with open_pulses(file, table="raw_waveform", dt_ns=10) as source:
+        assert source.n_pulses == 6
+        assert source.energies.description == "not known"
     with h5py.File(file, "r+") as content:
         content["detector"][...] = 5
     assert len(open_pulses(file, dt_ns=10).read()) == 6
@@ -107,7 +107,7 @@ def test_pickled_pulses(tmp_path, lists):
     file = write_pickles(tmp_path / "fep_wf_ornl.pickle", traces, lists=lists, dc_label=0.0)
     source = open_pulses(file, dt_ns=16)
     assert (source.n_pulses, source.length) == (23, 40)
-    assert source.layout.format == "pickled pulses"
+    assert source.table.format == "pickled pulses"
     assert source.energies.description == "column energy [keV]"
     assert sorted(source.columns) == ["dc_label", "energy", "event_number", "tp0"]
     columns = source.columns
@@ -222,13 +222,13 @@ def test_channels_with_traces_are_listed_and_counted(tmp_path):
     records = [config(4), event(0, {0: trace(0), 3: trace(1)}, sparse=True)]
     records.append(event(1, {3: trace(2)}, sparse=True))
     path = write(tmp_path / "run.fcio", *records)
-    assert tables_of(path) == ["0", "3"]
+    assert [*table_sizes(path)] == ["0", "3"]
     rows = [line.split()[:2] for line in str(info(path)).splitlines()]
     assert rows[1:3] == [["0", "1"], ["3", "2"]]
     one = write(tmp_path / "one.fcio", config(1), event(0, {0: trace(0)}))
-    assert tables_of(one) == ["0"]
+    assert [*table_sizes(one)] == ["0"]
     path.write_bytes(path.read_bytes()[:-30])
-    assert tables_of(path) == ["0", "3"]  # what reads the traces tells that it is cut off
+    assert [*table_sizes(path)] == ["0", "3"]  # what reads the traces tells that it is cut off
 
 
 @pytest.mark.parametrize(("bits", "dt_ns"), [(16, 16.0), (12, 4.0)])

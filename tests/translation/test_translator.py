@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,12 @@ def test_arrays_and_tensors_give_the_same(ren, sim):
     assert np.array_equal(from_array, from_tensor.numpy())
     for same in (sim.astype(np.float64), torch.from_numpy(sim).requires_grad_()):
         assert np.array_equal(np.asarray(ren.translate(same, seed=3)), from_array)
+
+
+def test_a_copy_for_another_process_gives_the_same(ren, sim):
+    """Processes are not forked any more: https://github.com/python/cpython/issues/126831."""
+    copy = pickle.loads(pickle.dumps(ren))
+    assert np.array_equal(copy.translate(sim, seed=3), ren.translate(sim, seed=3))
 
 
 def test_a_single_pulse_is_a_batch_of_one(ren, sim):

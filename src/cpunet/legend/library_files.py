@@ -16,8 +16,6 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, opened, units_of
 from cpunet.outputs import refuse_existing
-from cpunet.pulses.provenance import recorded_detector
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import read_values
 from cpunet.training.run import Run
@@ -186,10 +184,7 @@ def known_detector(run: Run) -> str | None:
         with suppress(CpunetError):  # there for a calibrated run
             if name := read_values(run.folder / "detector.yaml").get("name"):
                 return str(name)
-    try:
-        return run.sim.file and recorded_detector(PulseFile(Path(run.sim.file)).open())
-    except CpunetError:
-        return None
+    return run.sim.detector
 
 
 def require_complete(

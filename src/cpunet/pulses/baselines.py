@@ -66,17 +66,21 @@ class Baselines:
         """
         parts: list[Self] = []
         for raw in blocks:
-            parts.append(cls.of_block(raw, config, *parts[:1]))
+            prepared = prepare(raw, config, "measured")
+            parts.append(cls.of_block(raw, prepared, config, *parts[:1]))
             if sum(map(len, parts)) >= TRACES:
                 break
         return cls.concatenate(parts)
 
     @classmethod
     def of_block(
-        cls, raw: Pulses, config: PreparationConfig, like: Baselines | None = None
+        cls,
+        raw: Pulses,
+        prepared: Prepared,
+        config: PreparationConfig,
+        like: Baselines | None = None,
     ) -> Self:
-        """Baselines of some traces, as long as those of the first ones."""
-        prepared = prepare(raw, config, "measured")
+        """Baselines of some traces, raw and prepared, as long as those of the first ones."""
         before = samples_before_pulses(prepared, config)
         if like is not None:
             length, kept = like.length, like.first.length

@@ -16,7 +16,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import MARKER
 from cpunet.processes import outcomes, usable_cores
 from cpunet.progress import stage
-from cpunet.pulses.reading.files import ALL, PulseFile, tables_of
+from cpunet.pulses.reading.files import ALL, PulseFile, table_sizes
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     CpunetError
         If the file cannot be read, or its format has no tables.
     """
-    tables = tables_of(file.path)
+    tables = [*table_sizes(file.path)]
     if not tables:
         raise CpunetError(
             f"{file.path}: holds no tables of waveforms of which to take all; leave out "

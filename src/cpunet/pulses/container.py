@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -92,13 +92,15 @@ class Pulses:
         t0_ns: npt.ArrayLike = 0.0,
     ) -> Pulses:
         """Build a set from array-likes, with defaults for unknown quantities."""
-        values = np.asarray(waveforms, dtype=np.float32)
+        values = _numbers(waveforms, np.float32, "waveforms")
         n = len(values)
         return cls(
             waveforms=values,
             dt_ns=float(dt_ns),
             energy_kev=(
-                np.full(n, np.nan) if energy_kev is None else np.asarray(energy_kev, float)
+                np.full(n, np.nan)
+                if energy_kev is None
+                else _numbers(energy_kev, np.float64, "energy_kev")
             ),
             event_number=(
                 np.arange(n) if event_number is None else np.asarray(event_number, np.int64)
@@ -166,6 +168,20 @@ class Pulses:
                 )
         joined = {n: np.concatenate([getattr(s, n) for s in sets]) for n in _PER_PULSE}
         return Pulses(dt_ns=first.dt_ns, **joined)
+
+
+def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> Any:
+    """Plain numbers of anything like an array; what is masked, which NumPy drops, is NaN."""
+    try:
+        plain = np.asarray(values, kind)
+    except (ValueError, TypeError) as error:  # of awkward as of NumPy
+        raise CpunetError(
+            f"{name}: no plain numbers ({str(error).splitlines()[0][:100]})",
+            "give rows of equal length, and NaN for what is missing",
+        ) from error
+    if isinstance(values, np.ma.MaskedArray):
+        plain = np.where(np.ma.getmaskarray(values), kind(np.nan), plain)
+    return plain
 
 
 def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:

@@ -91,7 +91,7 @@ def rolled_over(traces: FloatArray) -> RolledOver | None:
     --------
     >>> ramp = 30_000 + 50.0 * np.arange(200) + np.arange(5)[:, np.newaxis]
     >>> rolled_over(ramp) is None, rolled_over((ramp + 2**15) % 2**16 - 2**15)
-    (True, RolledOver(period=65536, share=1.0))
+    (True, RolledOver(period=65536, share=1.0, signed=True))
     """
     jumps = np.abs(np.diff(traces, axis=1)).max(axis=1)
     steep = (jumps > np.ptp(traces, axis=1) / 2) & (jumps >= LEAST_PERIOD / 2)
@@ -100,21 +100,24 @@ def rolled_over(traces: FloatArray) -> RolledOver | None:
     period = 2 ** int(np.round(np.log2(np.median(jumps[steep]))))
     left = np.abs(np.diff(np.unwrap(traces[steep], period=period), axis=1)).max(axis=1)
     rolled = (np.abs(jumps[steep] - period) < period / 4) & (left < period / 4)
-    return RolledOver(period, float(steep.mean())) if rolled.mean() > MOSTLY else None
+    signed = period == 2**16 and bool(traces[steep].min() < 0)
+    return RolledOver(period, float(steep.mean()), signed) if rolled.mean() > MOSTLY else None
 
 
 @dataclass(frozen=True)
 class RolledOver:
-    """Counts that jump by a period, and the share of traces in which they do."""
+    """Counts that jump by a period, the share of traces in which they do, and their type."""
 
     period: int
     share: float
+    signed: bool
 
     def __str__(self) -> str:
         return (
             f"{100 * self.share:.0f} % of the traces jump by {self.period} = "
-            f"2^{self.period.bit_length() - 1} counts: unsigned samples stored as signed, or "
-            "counts beyond the range rolled over"
+            f"2^{self.period.bit_length() - 1} counts: "
+            + ("unsigned samples stored as signed, or " if self.signed else "")
+            + "counts beyond the range rolled over"
         )
 
 
@@ -181,7 +184,7 @@ def describe_pulses(
     ends = [samples.min(), samples.max()] if len(samples) else None
     return [
         ("file", str(source.path)),
-        ("format", f"{source.layout.format}, table {source.layout.table}"),
+        ("format", f"{source.table.format}, table {source.table.name}"),
         ("traces", f"{n_pulses} of {source.length} samples, every {source.dt_ns:g} ns"),
         ("columns", ", ".join(sorted(source.columns))),
         *provenance(source).items(),

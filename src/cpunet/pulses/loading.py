@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -75,7 +74,7 @@ def load_prepared(
     *,
     selection: EnergySelection | None = None,
     max_pulses: int | None = None,
-    seen: Callable[[Pulses, Prepared], None] | None = None,
+    seen: Seen | None = None,
 ) -> Prepared:
     """Read, select, prepare and collect the pulses of a file.
 
@@ -91,7 +90,7 @@ def load_prepared(
         Maximum number of accepted pulses to keep.  If there are more, a random sample of them
         is kept, always the same for the same file.  This bounds the memory.
     seen
-        Function that is given each block of the file, and those of its pulses that can be used.
+        Keeps what is needed of the raw traces.
 
     Returns
     -------
@@ -108,10 +107,13 @@ def load_prepared(
     rng, drawn = np.random.default_rng(0), list[FloatColumn]()
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
-            part = _prepare_selected(block, config, kind, selection)
+            whole = None
+            if seen is not None and seen.more_baselines:  # which those of all energies have
+                whole = prepare(block, config, kind)
+            part = _selected(block, config, kind, selection, whole)
             part = part.rejected(_copies(block[part.index], kind, seen_before))
             if seen is not None:
-                seen(block, part)
+                seen.keep(block, whole, part)
             n_kept += len(part)
             sets.append(part)
             drawn.append(rng.random(len(part)))
@@ -167,13 +169,14 @@ def _joined(sets: list[Prepared], n: int) -> Prepared:
     return replace(joined, pulses=joined.pulses.with_waveforms(waveforms))
 
 
-def _prepare_selected(
+def _selected(
     block: Pulses,
     config: PreparationConfig,
     kind: Kind,
     selection: EnergySelection | None,
+    whole: Prepared | None,
 ) -> Prepared:
-    """Prepare the selected pulses of a block; the others are coded as not selected."""
+    """The selected pulses of a block, those of `whole` if all of it is prepared already."""
     codes: Codes = np.zeros(len(block), np.uint8)
     if selection is not None:
         known = np.isfinite(block.energy_kev)
@@ -184,12 +187,17 @@ def _prepare_selected(
         )
         codes[~known] = Rejection.ENERGY_UNKNOWN
     rows = np.flatnonzero(codes == Rejection.ACCEPTED)
-    selected = block[rows]
-    if selection is not None:
-        selected = replace(selected, peak=label_peaks(selected.energy_kev, selection.peaks))
-    part = prepare(selected, config, kind)
-    codes[rows] = part.codes
-    return replace(part, index=rows[part.index], codes=codes)
+    if whole is None:
+        part = prepare(block[rows], config, kind)
+        codes[rows] = part.codes
+        part = replace(part, index=rows[part.index], codes=codes)
+    else:
+        part = whole.rejected(codes[whole.index])
+        part = replace(part, codes=np.where(codes == Rejection.ACCEPTED, part.codes, codes))
+    if selection is None:
+        return part
+    peak = label_peaks(part.pulses.energy_kev, selection.peaks)
+    return replace(part, pulses=replace(part.pulses, peak=peak))
 
 
 def _nothing_left(source: PulseSource, sets: list[Prepared]) -> CpunetError:
@@ -227,8 +235,8 @@ class SideInfo(InfoPart):
 
     Parameters
     ----------
-    file, read_as, dt_ns
-        File, its reading options, and its sampling period in ns.
+    file, place, read_as, dt_ns
+        File as given and its full path, its reading options, and its sampling period in ns.
     read, used, rejections
         Number of pulses read, of those used (text if unknown), and of others by reason.
     cuts
@@ -237,9 +245,12 @@ class SideInfo(InfoPart):
         Lowest and highest count of measured traces.
     sha256
         Fingerprint of the pulses used.
+    detector
+        Name of the simulated detector, if the file contains it.
     """
 
     file: str | None = None
+    place: str | None = None
     read_as: dict[str, Any] = {}
     dt_ns: float | None = None
     read: int | None = None
@@ -248,11 +259,12 @@ class SideInfo(InfoPart):
     cuts: Annotated[CutWindows | None, Field(strict=False)] = None
     counts: Annotated[tuple[int, int] | None, Field(strict=False)] = None
     sha256: str | None = None
+    detector: str | None = None
 
     def reading(self, file: PulseFile) -> PulseFile:
         """A file with the reading options that the training had for it as defaults."""
         told = self.read_as
-        if self.file is None or Path(self.file).resolve() != file.path.resolve():
+        if self.place != str(file.path.resolve()):
             return file
         if any(told.get(name) != value for name, value in file.options.items()):
             return file
@@ -284,6 +296,7 @@ class InputSet:
         waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
         return SideInfo(
             file=str(self.path),
+            place=str(self.path.resolve()),
             read_as=self.read_as,
             dt_ns=self.dt_ns,
             read=self.prepared.n_read,
@@ -292,6 +305,7 @@ class InputSet:
             cuts=self.cuts,
             counts=self.counts,
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
+            detector=self.detector,
         )
 
     def fingerprint(self) -> dict[str, str | float]:
@@ -328,23 +342,23 @@ def load_pulses(
     CpunetError
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
-    source = file.open()
-    recipe = recipe.at(source.dt_ns)
-    seen = Seen(source, side, recipe.preparation, insist=file.insist)
-    try:
-        prepared = load_prepared(
-            source,
-            recipe.preparation,
-            side,
-            selection=selection,
-            max_pulses=max_pulses,
-            seen=seen,
-        )
-    except CpunetError as error:
-        explained = seen.explained(error, selection)
-        if explained is error:
-            raise
-        raise explained from error
+    with file.open() as source:
+        recipe = recipe.at(source.dt_ns)
+        seen = Seen(source, side, recipe.preparation, insist=file.insist)
+        try:
+            prepared = load_prepared(
+                source,
+                recipe.preparation,
+                side,
+                selection=selection,
+                max_pulses=max_pulses,
+                seen=seen,
+            )
+        except CpunetError as error:
+            explained = seen.explained(error, selection)
+            if explained is error:
+                raise
+            raise explained from error
     cuts = None
     if side == "measured":
         seen.require_sense()

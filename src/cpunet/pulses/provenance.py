@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened, text_attribute
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.settings import flat
 
@@ -110,14 +109,8 @@ def recorded_side(source: PulseSource) -> Recognised | None:
 
 def recorded_attributes(source: PulseSource) -> dict[str, str]:
     """Attributes in which this program records how it made the pulses; none in other files."""
-    if source.layout.format not in ("LH5", "HDF5"):
-        return {}
-    with opened(source.path) as file:
-        table = file[source.layout.table.rpartition("/")[0] or "/"]
-        names = (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION)
-        found = {name: text_attribute(table, name) for name in names}
-        found[TRANSLATION] = text_attribute(file, TRANSLATION)
-    return {name: text for name, text in found.items() if text}
+    names = (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION, TRANSLATION)
+    return {name: text for name in names if (text := source.table.attrs.get(name))}
 
 
 def recorded_detector(source: PulseSource) -> str | None:

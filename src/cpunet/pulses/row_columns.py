@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays
 
-from cpunet.hdf5_files import lh5_rows, members, opened, text_attribute, units_of
+from cpunet.hdf5_files import lh5_rows, members, one_line, text_attribute, units_of
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.units import factor
@@ -40,7 +40,7 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     left_out
         The reason for each column that cannot be copied.
     """
-    if source.layout.format not in ("LH5", "HDF5"):
+    if (group := source.table.group) is None:
         columns = {
             name: column
             for name, column in source.columns.items()
@@ -50,11 +50,11 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
         return lambda start, n: {
             shown[name]: _from_column(column, start, n) for name, column in columns.items()
         }, {}
-    table, _, chosen = source.layout.table.rpartition("/")
+    chosen = source.table.name.rpartition("/")[2]
     names, left_out = list[str](), dict[str, str]()
-    rows, size = source.layout.rows, source.layout.n_rows or source.n_pulses or 0
-    with opened(source.path) as file:
-        for name, item in members(file[table or "/"]).items():
+    rows, size = source.table.chosen, source.table.n_all or source.n_pulses or 0
+    with one_line(source.path):
+        for name, item in members(group).items():
             is_plain = isinstance(item, h5py.Dataset)
             units = units_of(item) if is_plain else ""
             if name == chosen or (is_plain and _is_same(name, units, own)):
@@ -66,8 +66,8 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     shown = _renamed(names, own)
 
     def read(start: int, n: int) -> dict[str, LGDO]:
-        with opened(source.path) as file:
-            group, some = file[table or "/"], None if rows is None else rows[start : start + n]
+        some = None if rows is None else rows[start : start + n]
+        with one_line(source.path):
             return {shown[name]: _rows(group[name], start, n, some) for name in names}
 
     return read, left_out

@@ -60,6 +60,35 @@ def apart(kev: Values, amplitudes: Values) -> float:
     return _far_from_median(amplitudes[usable] / kev[usable])
 
 
+def why_apart(kev: Values, amplitudes: Values, traces: Traces) -> tuple[str, str]:
+    """Why amplitudes do not go with energies, and what to do.
+
+    They end at one height where something before the digitiser saturates, and are those of
+    baselines where records begin with padding.
+    """
+    with np.errstate(invalid="ignore"):
+        usable = (kev > LOW_KEV) & (amplitudes > 0)
+    heights, gains = amplitudes[usable], amplitudes[usable] / kev[usable]
+    low = heights[gains < (1 - APART) * np.median(gains)]
+    if len(low) and _far_from_median(low) < ALIKE:
+        top = float(np.quantile(heights, 0.99))
+        if np.median(low) > (1 - APART) * top:
+            return (
+                f"amplitudes end at {top:.0f}, as of a saturated amplifier",
+                "select lower energies (`peak`), or another channel",
+            )
+    padded = float(np.mean(np.ptp(traces[:, : traces.shape[1] // 20], axis=1) == 0))
+    if FEW_APART < padded < 1:
+        return (
+            f"{100 * padded:.0f} % of the traces begin with equal samples, as if padded",
+            "leave out these traces, or cut all where their records begin",
+        )
+    return (
+        "these energies are not those of these traces",
+        "give the energy column of the same channel and events, in their order",
+    )
+
+
 def _far_from_median(values: Values) -> float:
     return float(np.mean(np.abs(values / np.median(values) - 1) > APART))
 
@@ -164,8 +193,13 @@ class Seen:
         self._baselines = list[Baselines]()
         self._whole, self._rows = list[Pulses](), list[npt.NDArray[np.int64]]()
 
-    def __call__(self, block: Pulses, usable: Prepared) -> None:
-        """Keep what is needed of a block, of which some pulses can be used."""
+    @property
+    def more_baselines(self) -> bool:
+        """Whether further traces are to be prepared for their baselines."""
+        return self._side == "measured" and sum(map(len, self._baselines)) < TRACES
+
+    def keep(self, block: Pulses, whole: Prepared | None, usable: Prepared) -> None:
+        """Keep what is needed of a block: baselines of all of it, and whole usable pulses."""
         if self._first is None:
             if self._guess:
                 found = apparent_side(block.waveforms)
@@ -178,9 +212,9 @@ class Seen:
             return
         good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
         self._ends += [float(good.min()), float(good.max())] if len(good) else []
-        if sum(map(len, self._baselines)) < TRACES:
+        if whole is not None:
             like = self._baselines[:1]
-            self._baselines.append(Baselines.of_block(block, self._config, *like))
+            self._baselines.append(Baselines.of_block(block, whole, self._config, *like))
         if (wanted := WHOLE - sum(map(len, self._whole))) > 0:
             self._rows.append(start + usable.index[:wanted])
             self._whole.append(block[usable.index[:wanted]])
@@ -226,10 +260,10 @@ class Seen:
         found = None if self._first is None else rolled_over(self._first)
         if found is None or found.share < share:
             return None
+        view = "as unsigned (values.view('uint16') in NumPy), or " if found.signed else ""
         return CpunetError(
             f"{self._path}: {found}",
-            "write them as unsigned (values.view('uint16') in NumPy), or as "
-            f"numpy.unwrap(values, period={found.period})",
+            f"write them {view}as numpy.unwrap(values.astype(float), period={found.period})",
         )
 
     def require_sense(self) -> None:
@@ -240,15 +274,14 @@ class Seen:
             raise refusal
         if few := self._rolled_over(0):
             log.warning(str(few))
-        share = apart(np.concatenate(self._kev), np.concatenate(self._amplitudes))
+        kev, amplitudes = np.concatenate(self._kev), np.concatenate(self._amplitudes)
+        share = apart(kev, amplitudes)
         told = (
             f"{self._path}: {100 * share:.0f} % of amplitudes and energies do not go together"
         )
         if share > MAX_APART:
-            raise CpunetError(
-                f"{told}: these energies are not those of these traces",
-                "give the energy column of the same channel and events, in their order",
-            )
+            why, remedy = why_apart(kev, amplitudes, self._first)
+            raise CpunetError(f"{told}: {why}", remedy)
         if share > FEW_APART:
             log.warning(told)
         if (found := second_rate(self._first)) is not None:

@@ -151,13 +151,12 @@ class FileTranslation:
         if resume and not force and out.exists():
             return replace(finished(out, provenance), skipped=1)
         refuse_existing(out, force=force)
-        pulses = self.opened(source)
-        read_others, left_out = other_columns(pulses, OWN_COLUMNS)
-        for column, reason in left_out.items():
-            log.warning(f"{source.path.name}: column {column} is left out: {reason}")
         counts = Counts()
         give_back_large_arrays()
-        with self.writer(out, force=force) as writer:
+        with self.opened(source) as pulses, self.writer(out, force=force) as writer:
+            read_others, left_out = other_columns(pulses, OWN_COLUMNS)
+            for column, reason in left_out.items():
+                log.warning(f"{source.path.name}: column {column} is left out: {reason}")
             for block in self._blocks(pulses, noise_key):
                 beside = read_others(counts.read, len(block.codes))
                 writer.append(block.pulses, {**block.columns, **beside})
@@ -181,7 +180,8 @@ class FileTranslation:
         CpunetError
             If the source cannot be used, or no pulse can be translated.
         """
-        blocks = list(self._blocks(self.opened(source), None))
+        with self.opened(source) as pulses:
+            blocks = list(self._blocks(pulses, None))
         counts = sum(map(Counts.of, blocks), Counts())
         self._require_some(source, counts)
         return TranslatedPulses.joined(blocks), counts

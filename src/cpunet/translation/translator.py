@@ -29,7 +29,7 @@ from cpunet.translation.backends import Backend, Drawn, Energies, Translated, ba
 if TYPE_CHECKING:
     import torch
 
-Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], "torch.Tensor")
+Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], "torch.Tensor", Pulses)
 
 Act: TypeAlias = Callable[[FloatArray, Drawn], Translated]
 
@@ -161,13 +161,13 @@ class Translator:
         seed: int | None = None,
         tails_kev: npt.ArrayLike | None = None,
     ) -> Waveforms:
-        """Translate waveforms, given as a NumPy array or a torch tensor.
+        """Translate waveforms, given as a NumPy array, a torch tensor or `cpunet.Pulses`.
 
         Parameters
         ----------
         waveforms
             Waveforms of shape (n, samples), or (samples,) for a single pulse, with the
-            sampling period of the training.
+            sampling period of the training; or pulses with their energies.
         energy_kev
             Energy of each pulse in keV, for electronic noise, which scales as 1/energy; the
             latent noise of a network needs none.
@@ -180,7 +180,7 @@ class Translator:
 
         Returns
         -------
-        array or tensor
+        array, tensor or Pulses
             Translated windows of the type of the input, float32, shape (n, window) or
             (window,).
 
@@ -197,6 +197,9 @@ class Translator:
         """
         torch: Any = sys.modules.get("torch")  # without which there are no tensors
         given: Any = waveforms
+        if isinstance(waveforms, Pulses):
+            energy_kev = waveforms.energy_kev if energy_kev is None else energy_kev
+            given = waveforms.waveforms
         tensor = torch is not None and isinstance(given, torch.Tensor)
         # NumPy has no bfloat16
         array = given.detach().cpu().float().numpy() if tensor else np.asarray(given)
@@ -205,7 +208,8 @@ class Translator:
         self._require_energies(
             Drawn(None if energy_kev is None else np.asarray(energy_kev, float), noise)
         )
-        pulses = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
+        single = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
+        pulses = waveforms if isinstance(waveforms, Pulses) else single
         if energy_kev is not None:
             energies = _one_each("energy_kev", energy_kev, len(pulses))
             pulses = replace(pulses, energy_kev=energies)
@@ -225,6 +229,8 @@ class Translator:
                 RejectionWarning,
                 stacklevel=2,
             )
+        if isinstance(waveforms, Pulses):
+            return done.pulses
         result: Any = done.pulses.waveforms[0] if array.ndim == 1 else done.pulses.waveforms
         translated: Waveforms = torch.from_numpy(result).to(given.device) if tensor else result
         return translated

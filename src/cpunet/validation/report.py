@@ -6,6 +6,7 @@ import gc
 import json
 from collections import UserDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, is_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -119,6 +120,10 @@ class Report:
         peaks = {name: name for name, one in self.metrics["peaks"].items() if one["parameters"]}
         found: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
         return found
+
+    def to_dict(self) -> Metrics:
+        """A copy of the content of ``metrics.json``."""
+        return deepcopy(self.metrics)
 
     @property
     def verdicts(self) -> list[str]:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
+from cpunet.pulses.reading.source import RawTable, choose_table
 from cpunet.tables import shortened
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
@@ -28,7 +26,6 @@ _WAVEFORMS = ("waveform", "waveforms", "values")
 _SPE = struct.Struct("<i8siiiiii")
 
 Arrays = dict[str, npt.NDArray[Any]]
-Columns = dict[str, Column]
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -59,39 +56,18 @@ def read_arrays(path: Path) -> Arrays:
         ) from error
 
 
-class ArraySource(PulseSource):
-    """An array of shape ``(events, samples)``, with columns of values per event."""
-
-    def __init__(
-        self,
-        options: PulseFile,
-        format: str,
-        name: str,
-        waveforms: Any,
-        columns: Columns,
-        period_hint: str = "",
-    ) -> None:
-        self._waveforms = waveforms
-        layout = Layout.of_array(options.path, format, name, waveforms.shape, columns)
-        super().__init__(options, replace(layout, period_hint=period_hint))
-
-    def _traces(self, size: int) -> Iterator[Traces]:
-        for start in range(0, len(self._waveforms), size):
-            yield Traces(self._waveforms[start : start + size])
-
-
-def open_memory(options: PulseFile, pulses: Pulses) -> ArraySource:
-    """Pulses in memory as a source."""
+def read_memory(path: Path, pulses: Pulses) -> RawTable:
+    """Pulses in memory."""
     columns = {
         "energy_kev": Column.of(pulses.energy_kev),
         "event_number": Column.of(pulses.event_number),
         "dt_ns": Column.of(np.array(pulses.dt_ns)),
     }
-    return ArraySource(options, "memory", "", pulses.waveforms, columns)
+    return RawTable.of_array(path, "memory", "", pulses.waveforms, columns)
 
 
-def open_arrays(options: PulseFile) -> ArraySource:
-    """Open a NumPy file.
+def read_numpy(options: PulseFile) -> RawTable:
+    """Read a NumPy file.
 
     The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array
     that the option ``table`` names. Arrays with one value per event, such as ``dt_ns`` (or
@@ -111,14 +87,15 @@ def open_arrays(options: PulseFile) -> ArraySource:
             f"{options.path}: array {name or 'in it'} is of {kind}; save plain numbers"
         )
     columns = {
-        name: Column.of(values)
-        for name, values in arrays.items()
-        if values.ndim <= 1 and values.dtype.kind in "iufb"
+        column: Column.of(values.ravel() if values.ndim else values)
+        for column, values in arrays.items()
+        if (values.ndim <= 1 or (1 in values.shape and column != name))
+        and values.dtype.kind in "iufb"
     }
-    return ArraySource(options, "NumPy", name, arrays[name], columns)
+    return RawTable.of_array(options.path, "NumPy", name, arrays[name], columns)
 
 
-def open_spectrum(options: PulseFile) -> ArraySource:
+def read_spectrum(options: PulseFile) -> RawTable:
     """Open a ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
     path, size = options.path, options.path.stat().st_size
     with path.open("rb") as file:
@@ -131,4 +108,4 @@ def open_spectrum(options: PulseFile) -> ArraySource:
             f"{length * n_rows} samples; write it again"
         )
     values = np.memmap(path, "<f4", "r", _SPE.size, (n_rows, length))
-    return ArraySource(options, "siggen spectrum", "", values, {})
+    return RawTable.of_array(path, "siggen spectrum", "", values, {})

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,8 +18,9 @@ from cpunet.tables import shortened
 from cpunet.units import factor, unit_names
 
 if TYPE_CHECKING:
+    from cpunet.hdf5_files import Read
     from cpunet.pulses.reading.files import PulseFile
-    from cpunet.pulses.reading.source import Layout
+    from cpunet.pulses.reading.source import RawTable
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ class Column:
         Whether a single value applies to all events.
     """
 
-    read: Callable[[int, int], npt.NDArray[Any]]
+    read: Read
     size: int
     units: str = ""
     constant: bool = False
@@ -58,14 +60,17 @@ class Column:
         """The values of some rows, which ascend; one value for all stays."""
         if self.constant or len(self) == 1:
             return self
+        return replace(self, read=partial(some_of, self.read, rows), size=len(rows))
 
-        def read(start: int, stop: int) -> npt.NDArray[Any]:
-            some = rows[start:stop]
-            if not len(some):
-                return self.read(0, 0)
-            return np.asarray(self.read(int(some[0]), int(some[-1]) + 1)[some - some[0]])
 
-        return replace(self, read=read, size=len(rows))
+def some_of(read: Read, rows: npt.NDArray[np.int64], start: int, stop: int) -> npt.NDArray[Any]:
+    """Rows of a first to one before a last of those chosen, never more at once than these."""
+    wanted, parts = rows[start:stop], list[npt.NDArray[Any]]()
+    while len(wanted):
+        n = int(np.searchsorted(wanted, wanted[0] + stop - start))
+        parts.append(read(int(wanted[0]), int(wanted[n - 1]) + 1)[wanted[:n] - wanted[0]])
+        wanted = wanted[n:]
+    return np.concatenate(parts) if parts else read(0, 0)
 
 
 def require_length(path: Path, name: str, column: Column, n_pulses: int | None) -> None:
@@ -88,7 +93,7 @@ _BASELINE_FRACTION = 0.05
 _BASELINE_SAMPLES = 10
 
 # Files store periods in single precision.
-_TOLERANCE = 1e-5
+TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -135,7 +140,7 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         return np.asarray(waveforms.max(axis=1) - baseline)
 
 
-def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
+def resolve_energies(options: PulseFile, table: RawTable) -> Energies:
     """Choose where the energies of a file's pulses come from.
 
     Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
@@ -150,13 +155,13 @@ def resolve_energies(options: PulseFile, layout: Layout) -> Energies:
         If the column is missing, differs in length from the waveforms, or was requested but is
         neither in energy units nor calibrated.
     """
-    path, kev_per_adc, columns = options.path, options.kev_per_adc, layout.columns
+    path, kev_per_adc, columns = options.path, options.kev_per_adc, table.columns
     name = options.energy or next((name for name in _USUAL if name in columns), "")
-    column = _named_column(path, layout, name) if name else None
+    column = _named_column(path, table, name) if name else None
     if column is not None:
         rule = _calibrated(path, name, column, kev_per_adc)
         if rule is not None:
-            require_length(path, name, column, layout.n_pulses)
+            require_length(path, name, column, table.n)
             return rule
         if options.energy is not None:
             units = f"in {column.units}" if column.units else "without units"
@@ -174,22 +179,22 @@ def _calibrated(
 ) -> Energies | None:
     units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
     kev_per_unit = factor(units, "keV")
-    if kev_per_unit is not None and kev_per_adc is None:
-        return Energies(f"column {name} [{units}]", kev_per_unit, column)
-    if kev_per_unit is not None and kev_per_adc is not None:
-        log.warning(
-            f"{path.name}: column {name} is in {units}; its energies are multiplied by "
-            f"{kev_per_adc:g}, as given (`kev_per_adc`)"
-        )
-        rule = f"column {name} [{units}] x {kev_per_adc:g}"
-        return Energies(rule, kev_per_unit * kev_per_adc, column)
-    if kev_per_adc is not None:
+    if kev_per_unit is None:
+        if kev_per_adc is None:
+            return None
         return Energies(f"column {name} x {kev_per_adc:g} keV/ADC", kev_per_adc, column)
-    return None
+    if kev_per_adc is None:
+        return Energies(f"column {name} [{units}]", kev_per_unit, column)
+    log.warning(
+        f"{path.name}: column {name} is in {units}; its energies are multiplied by "
+        f"{kev_per_adc:g}, as given (`kev_per_adc`)"
+    )
+    rule = f"column {name} [{units}] x {kev_per_adc:g}"
+    return Energies(rule, kev_per_unit * kev_per_adc, column)
 
 
-def _named_column(path: Path, layout: Layout, energy: str) -> Column:
-    columns = layout.columns
+def _named_column(path: Path, table: RawTable, energy: str) -> Column:
+    columns = table.columns
     if energy in columns:
         return columns[energy]
     file, colon, inner = energy.rpartition(":")
@@ -201,7 +206,7 @@ def _named_column(path: Path, layout: Layout, energy: str) -> Column:
     from cpunet.pulses.reading.hdf5 import column_of
 
     column, others = column_of(Path(file), inner)
-    if (rows := layout.rows) is not None and len(column) == layout.n_rows:
+    if (rows := table.chosen) is not None and len(column) == table.n_all:
         others = {n: c.at(rows) for n, c in others.items() if len(c) == len(column)}
         column = column.at(rows)
     return _joined(path, columns, energy, column, others)
@@ -238,37 +243,19 @@ def _joined(
     return Column.of(values, column.units)
 
 
-@dataclass(frozen=True)
-class Sampling:
-    """The sampling period in ns, and the column that must agree with it."""
-
-    path: Path
-    dt_ns: float
-    column: Column | None = None
-    ns_per_unit: float = 1.0
-
-    def check(self, start: int, event_number: npt.NDArray[np.int64]) -> None:
-        """Raise a `CpunetError` that names the first event with another sampling period."""
-        if self.column is None:
-            return
-        values = self.column.read(start, start + len(event_number))
-        periods = self.ns_per_unit * np.asarray(values, np.float64)
-        other = ~np.isclose(periods, self.dt_ns, rtol=_TOLERANCE, atol=0)
-        if other.any():
-            first = int(other.argmax())
-            raise CpunetError(
-                f"{self.path}: event {event_number[first]}: sampling period "
-                f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
-                "split the file by sampling period"
-            )
-
-
-def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
+def resolve_sampling(options: PulseFile, table: RawTable) -> tuple[float, Read | None]:
     """Take the period from the column of the file or from the user's ``dt_ns``.
 
     A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
     and ``dt_ns`` is required; the error message contains the hint of the format.  A file that
     says another period than the user is corrected, with a warning.
+
+    Returns
+    -------
+    dt_ns
+        Sampling period in ns.
+    periods
+        Reads that of each trace in ns, if the file has it for each.
 
     Raises
     ------
@@ -276,7 +263,7 @@ def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
         If neither gives the period, or if it is not a positive number.
     """
     path, dt_ns = options.path, options.dt_ns
-    name, column, hint = layout.period_name, layout.period, layout.period_hint
+    name, column, hint = table.period_name, table.period, table.period_hint
     try:
         ns_per_unit = None if column is None else _ns_per_unit(path, name, column)
     except CpunetError:
@@ -289,26 +276,26 @@ def resolve_sampling(options: PulseFile, layout: Layout) -> Sampling:
             raise CpunetError(
                 f"{path}: the sampling period {why}; give `dt_ns`{hint and f' ({hint})'}"
             )
-        return Sampling(path, dt_ns)
+        return dt_ns, None
     if len(column) != 1:
-        require_length(path, name, column, layout.n_pulses)
+        require_length(path, name, column, table.n)
     found = float(column.read(0, 1)[0]) * ns_per_unit
-    if dt_ns is not None and not np.isclose(found, dt_ns, rtol=_TOLERANCE, atol=0):
+    if dt_ns is not None and not np.isclose(found, dt_ns, rtol=TOLERANCE, atol=0):
         log.warning(
             f"{path.name}: says that it is sampled every {found:g} ns; taken as {dt_ns:g} ns, "
             "as given (`dt_ns`)"
         )
         if not (np.isfinite(found) and found > 0):
-            return Sampling(path, dt_ns)
+            return dt_ns, None
         ns_per_unit *= dt_ns / found
         found = dt_ns
     if not (np.isfinite(found) and found > 0):
         raise CpunetError(
             f"{path}: event 0: the sampling period ({name}) is {found:g} ns", "give `dt_ns`"
         )
-    # A single value, a scalar or an array of length 1, applies to all events.
-    varying = None if len(column) == 1 else column
-    return Sampling(path, found, varying, ns_per_unit)
+    if len(column) == 1:  # a scalar or an array of length 1 applies to all events
+        return found, None
+    return found, lambda start, stop: ns_per_unit * np.asarray(column.read(start, stop), float)
 
 
 def _ns_per_unit(path: Path, name: str, column: Column) -> float | None:

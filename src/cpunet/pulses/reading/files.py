@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import FloatArray, Pulses
 
 if TYPE_CHECKING:
     from cpunet.pulses.reading.source import PulseSource
@@ -112,6 +114,43 @@ class PulseFile:
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise CpunetError(f"{self.path}: {name} is {value}; expected more than 0")
 
+    def __repr__(self) -> str:
+        options = "".join(f", {name} {value}" for name, value in self.options.items())
+        return f"<PulseFile {self.path}{options}>"
+
+    def __bool__(self) -> bool:
+        return True  # without a look at the file
+
+    def __len__(self) -> int:
+        with self.open() as source:
+            n = source.n_pulses
+            return sum(map(len, source.blocks())) if n is None else n
+
+    def __iter__(self) -> Iterator[Pulses]:
+        """Blocks of a few thousand pulses."""
+        with self.open() as source:
+            yield from source.blocks()
+
+    def __getitem__(self, rows: slice) -> Pulses:
+        """The pulses of some rows; others are not read, where the format allows it."""
+        with self.open() as source:
+            if (n := source.n_pulses) is None:
+                return source.read()[rows]
+            if not (picked := range(n)[rows]):
+                return source.read(0, 1)[:0]
+            first, last = sorted((picked[0], picked[-1]))
+            return source.read(first, last + 1)[:: picked.step]
+
+    @property
+    def waveforms(self) -> FloatArray:
+        """Waveforms of all pulses, shape ``(n, samples)``, read on every access."""
+        return self[:].waveforms
+
+    @property
+    def energy_kev(self) -> npt.NDArray[np.float64]:
+        """Energies of all pulses in keV, read on every access."""
+        return self[:].energy_kev
+
     @property
     def place(self) -> str | None:
         """The table alone, without what chooses rows of it."""
@@ -137,8 +176,19 @@ class PulseFile:
         return {name: value for name, value in given.items() if value is not None}
 
     def open(self) -> PulseSource:
-        """Open the file."""
-        return open_file(self)
+        """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
+        from cpunet.pulses.reading.arrays import read_memory
+        from cpunet.pulses.reading.source import PulseSource
+
+        if self.pulses is not None:
+            return PulseSource(self, read_memory(self.path, self.pulses))
+        module, _, name = FORMATS[recognise(self.path)][1].partition(".")
+        table = getattr(import_module(f"{__package__}.{module}"), name)(self)
+        try:
+            return PulseSource(self, table)
+        except BaseException:
+            table.close()
+            raise
 
 
 Source: TypeAlias = str | Path | PulseFile | Pulses
@@ -172,24 +222,42 @@ def pulse_file(
     )
 
 
-class Format(NamedTuple):
-    """A format of files: its name, its suffixes, and what opens it, in a module beside this."""
+# Suffixes, reader and first bytes of each format.  Readers are imported when needed: HDF5 and
+# FlashCam take a fifth of a second each.
+FORMATS: dict[str, tuple[str, str, Callable[[bytes], bool]]] = {
+    # MATLAB writes 512 bytes of its own before the HDF5 part
+    "HDF5": (
+        ".lh5 .h5 .hdf5 .hdf", "hdf5.read_hdf5",
+        lambda head: b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:520]),
+    ),
+    "FlashCam": (
+        ".fcio", "flashcam.read_flashcam", lambda head: head[4:12] == b"FlashCam",
+    ),
+    "NumPy": (
+        ".npz .npy", "arrays.read_numpy",
+        lambda head: head.startswith((b"\x93NUMPY", b"PK\x03\x04")),
+    ),
+    "pickle": (
+        ".pickle .pkl", "published.read_pickles",
+        lambda head: head[0] == 0x80 and head[1:2] in (b"\2", b"\3", b"\4", b"\5"),
+    ),
+    # Fortran record marks around the 24 bytes of a Radware header
+    "spectrum": (
+        ".spe", "arrays.read_spectrum",
+        lambda head: len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24),
+    ),
+}  # fmt: skip
 
-    name: str
-    suffixes: tuple[str, ...]
-    module: str
-    opens: str
-
-
-HDF5 = Format("HDF5", (".lh5", ".h5", ".hdf5", ".hdf"), "hdf5", "open_hdf5")
-FLASHCAM = Format("FlashCam", (".fcio",), "flashcam", "FlashCamSource")
-NUMPY = Format("NumPy", (".npz", ".npy"), "arrays", "open_arrays")
-PICKLE = Format("pickle", (".pickle", ".pkl"), "published", "open_pickles")
-SPECTRUM = Format("spectrum", (".spe",), "arrays", "open_spectrum")
+_AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
+_FOREIGN = {  # what cannot be read, by its first bytes, and what to do
+    b"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
+    b"MATLAB 5.0": ("MATLAB 5", "save it with -v7.3"),
+    b"PAR1": ("Parquet", f"write it with {_AS_NPZ}"),
+} | dict.fromkeys(
+    (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd"), ("compressed", "unpack it")
+)
 
 _HEAD_BYTES = 520
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-_PICKLE_MAGIC, _PICKLE_PROTOCOLS = 0x80, range(2, 6)
 
 
 def open_pulses(
@@ -235,39 +303,19 @@ def open_pulses(
         If the file is missing, of an unknown format, damaged or without pulses, if `table` or
         `energy` is missing or wrong, or if the file contradicts `dt_ns` or `kev_per_adc`.
     """
-    return open_file(PulseFile(Path(path), table, energy, kev_per_adc, dt_ns))
+    return PulseFile(Path(path), table, energy, kev_per_adc, dt_ns).open()
 
 
-def open_file(options: PulseFile) -> PulseSource:
-    """Like `open_pulses`; a file of pulses in memory is a source, too."""
-    if options.pulses is not None:
-        from cpunet.pulses.reading.arrays import open_memory
-
-        return open_memory(options, options.pulses)
-    # readers are imported when needed: the LH5 library alone takes seconds to load
-    found = recognise(options.path)
-    source: PulseSource = getattr(import_module(f"{__package__}.{found.module}"), found.opens)(
-        options
-    )
-    return source
-
-
-def tables_of(path: str | Path) -> list[str]:
-    """List the waveform tables of an LH5 or other HDF5 file; empty for formats without tables.
+def table_sizes(path: str | Path) -> dict[str, int | None]:
+    """Waveform tables of an LH5 or other HDF5 file; none of formats without tables.
 
     For the Majorana release these are the detectors, for FlashCam files the channels with
     traces.
 
-    Raises
-    ------
-    CpunetError
-        If the file is missing or cannot be read.
-    """
-    return list(table_sizes(path))
-
-
-def table_sizes(path: str | Path) -> dict[str, int | None]:
-    """Tables as in `tables_of`, with the number of pulses if it had to be counted, else None.
+    Returns
+    -------
+    dict
+        Number of pulses of each if it had to be counted, else None.
 
     Raises
     ------
@@ -276,11 +324,11 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
     """
     path = Path(path)
     found = recognise(path)
-    if found is FLASHCAM:
+    if found == "FlashCam":
         from cpunet.pulses.reading.flashcam import channel_sizes
 
         return channel_sizes(path)
-    if found is not HDF5:
+    if found != "HDF5":
         return {}
     from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import channel_tables
@@ -291,8 +339,8 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         return dict.fromkeys(tables)
 
 
-def recognise(path: Path) -> Format:
-    """Return the format of a file, from its content.
+def recognise(path: Path) -> str:
+    """Return the name of the format of a file, from its content.
 
     Raises
     ------
@@ -301,15 +349,23 @@ def recognise(path: Path) -> Format:
         format than its suffix says.
     """
     head = _head(path)
-    found = _by_content(head, path)
-    if found is not None:
-        return found
-    formats = (HDF5, FLASHCAM, NUMPY, PICKLE, SPECTRUM)
-    if claimed := next((one for one in formats if path.suffix.lower() in one.suffixes), None):
-        raise CpunetError(
-            f"{path}: not a {claimed.name} file, despite its name; "
-            "give a file of pulses or correct its suffix"
-        )
+    # the FCIO library unpacks these two itself, by their suffix
+    if path.name.endswith((".fcio.gz", ".fcio.zst")):
+        return "FlashCam"
+    for name, (_, _, begins) in FORMATS.items():
+        if begins(head):
+            return name
+    foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
+    if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
+        foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
+    if foreign is not None:
+        raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
+    for name, (suffixes, _, _) in FORMATS.items():
+        if path.suffix.lower() in suffixes.split():
+            raise CpunetError(
+                f"{path}: not a {name} file, despite its name; "
+                "give a file of pulses or correct its suffix"
+            )
     raise CpunetError(
         f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
         "pickled pulses, or siggen's .spe"
@@ -329,20 +385,3 @@ def _head(path: Path) -> bytes:
     if not head:
         raise CpunetError(f"{path}: is empty; copy or write it again")
     return head
-
-
-def _by_content(head: bytes, path: Path) -> Format | None:
-    # MATLAB writes 512 bytes of its own before the HDF5 part
-    if _HDF5_MAGIC in (head[:8], head[512:520]):
-        return HDF5
-    if head.startswith((b"\x93NUMPY", b"PK\x03\x04")):
-        return NUMPY
-    # the FCIO library unpacks these two itself, by their suffix
-    if head[4:12] == b"FlashCam" or path.name.endswith((".fcio.gz", ".fcio.zst")):
-        return FLASHCAM
-    # Fortran record marks around the 24 bytes of a Radware header
-    if len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24):
-        return SPECTRUM
-    if head[0] == _PICKLE_MAGIC and len(head) > 1 and head[1] in _PICKLE_PROTOCOLS:
-        return PICKLE
-    return None

@@ -17,41 +17,54 @@ from fcio import FCIO, Tags, fcio_open
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces, choose_table
+from cpunet.pulses.reading.source import RawTable, choose_table
 
 
-class FlashCamSource(PulseSource):
+def read_flashcam(options: PulseFile) -> RawTable:
     """The traces of one channel; `table` is its index if there are several.
 
     Full and sparse events are both read; events without the channel are skipped.
     The energy of the digitiser's own filter is not in keV and is not read.
     """
+    stream = _open(options.path)
+    channels = [str(channel) for channel in range(_n_channels(options.path, stream))]
+    name = choose_table(options, channels, "channel", "channels")
+    period_ns = np.asarray(float(stream.config.sampling_period_ns))
+    events = _Events(options.path, int(name), int(stream.config.eventsamples), stream)
+    return RawTable(
+        format="FlashCam",
+        name=name,
+        n=None,
+        length=events.length,
+        rows=events.rows,
+        numbers=events.numbers,
+        close=stream.close,
+        period_name="sampling period",
+        period=Column.of(period_ns, "ns") if period_ns > 0 else None,
+    )
 
-    def __init__(self, options: PulseFile) -> None:
-        with _opened(options.path) as stream:
-            n_channels = _n_channels(options.path, stream)
-            length = int(stream.config.eventsamples)
-            period_ns = np.asarray(float(stream.config.sampling_period_ns))
-        channels = [str(channel) for channel in range(n_channels)]
-        self._channel = int(choose_table(options, channels, "channel", "channels"))
-        layout = Layout(
-            format="FlashCam",
-            table=str(self._channel),
-            n_pulses=None,
-            length=length,
-            period_name="sampling period",
-            period=Column.of(period_ns, "ns") if period_ns > 0 else None,
-        )
-        super().__init__(options, layout)
 
-    def _traces(self, size: int) -> Iterator[Traces]:
-        with _opened(self.path) as stream:
-            events = self._events(stream)
-            while some := list(islice(events, size)):
-                waveforms, numbers = zip(*some, strict=True)
-                yield Traces(np.stack(waveforms), np.asarray(numbers))
+class _Events:
+    """Traces of a channel in the order of the stream, which is opened again to begin anew."""
 
-    def _events(self, stream: FCIO) -> Iterator[tuple[npt.NDArray[np.uint16], int]]:
+    def __init__(self, path: Path, channel: int, length: int, stream: FCIO) -> None:
+        self.path, self.channel, self.length = path, channel, length
+        self._numbers, self._end = list[int](), 0
+        self._ahead = self._iterate(stream)
+
+    def rows(self, start: int, stop: int) -> npt.NDArray[np.uint16]:
+        """Traces from a first one, which follows those read last or begins anew."""
+        if start < self._end:
+            self._ahead = self._iterate(_open(self.path))
+        some = list(islice(self._ahead, stop - start))
+        self._numbers, self._end = [number for _, number in some], start + len(some)
+        return np.array([trace for trace, _ in some], np.uint16).reshape(-1, self.length)
+
+    def numbers(self, start: int, stop: int) -> npt.NDArray[np.int64]:
+        """Numbers of the events read last."""
+        return np.array(self._numbers[: stop - start], np.int64)
+
+    def _iterate(self, stream: FCIO) -> Iterator[tuple[npt.NDArray[np.uint16], int]]:
         # The last record of a truncated file looks like an event: yield each event
         # only after the next record, or the regular end, has been read.
         last: tuple[npt.NDArray[np.uint16], int] | None = None
@@ -61,8 +74,10 @@ class FlashCamSource(PulseSource):
             if last is not None:
                 yield last
             last = self._event(stream)
-        # The library also reports an error if nothing follows the configuration.
-        if stream.tag < 0 and any_record:
+        # The library also reports an error if nothing follows the configuration, and from
+        # 0.9 on none where a file is cut off.
+        size = 0 if self.path.suffix in (".gz", ".zst") else self.path.stat().st_size
+        if (stream.tag < 0 or stream.read_bytes() < size) and any_record:
             after = "" if last is None else f"event {last[1]}: "
             raise CpunetError(f"{self.path}: {after}the file is cut off; copy it again")
         if last is not None:
@@ -72,7 +87,7 @@ class FlashCamSource(PulseSource):
         if stream.tag not in (Tags.Event, Tags.SparseEvent):
             return None
         event: Any = stream.event
-        rows = np.flatnonzero(event.trace_list == self._channel)
+        rows = np.flatnonzero(event.trace_list == self.channel)
         if rows.size == 0:
             return None
         number = int(event.eventnumber)
@@ -94,13 +109,12 @@ def channel_sizes(path: Path) -> dict[str, int | None]:
         If the file cannot be read or is damaged.
     """
     counts: Counter[int] = Counter()
-    with _opened(path) as stream:
-        n_channels = _n_channels(path, stream)
-        if n_channels == 1:
-            return {"0": None}
-        while _next(path, stream):
-            if stream.tag in (Tags.Event, Tags.SparseEvent):
-                counts.update(int(channel) for channel in stream.event.trace_list)
+    stream = _open(path)
+    if _n_channels(path, stream) == 1:
+        return {"0": None}
+    while _next(path, stream):
+        if stream.tag in (Tags.Event, Tags.SparseEvent):
+            counts.update(int(channel) for channel in stream.event.trace_list)
     return {str(c): counts[c] for c in sorted(counts)}
 
 
@@ -118,17 +132,12 @@ def _next(path: Path, stream: FCIO) -> bool:
         raise CpunetError(f"{path}: damaged ({said}); copy it again") from error
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[FCIO]:
+def _open(path: Path) -> FCIO:
     try:
         with _quiet():
-            stream = fcio_open(str(path))
+            return fcio_open(str(path))
     except Exception as error:  # the library raises various errors on damaged records
         raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
-    try:
-        yield stream
-    finally:
-        stream.close()
 
 
 @contextmanager

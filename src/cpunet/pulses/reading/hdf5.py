@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import h5py
 import numpy as np
@@ -14,22 +16,23 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import (
-    StoredRows,
     is_column,
     is_text,
     item_at,
     lh5_rows,
     members,
-    opened,
+    one_line,
+    open_hdf5,
+    reading,
     text_attribute,
+    texts_of,
     units_of,
 )
-from cpunet.pulses.reading.arrays import ArraySource
 from cpunet.pulses.reading.division import divides, dividing, labels
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.published import is_majorana, open_majorana
-from cpunet.pulses.reading.source import Layout, PulseSource, Traces
+from cpunet.pulses.reading.published import is_majorana, read_majorana
+from cpunet.pulses.reading.source import RawTable
 from cpunet.tables import shortened
 
 # preference among several waveform columns of a table: full record, then full-rate window
@@ -39,82 +42,73 @@ log = logging.getLogger(__name__)
 _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
-def open_hdf5(options: PulseFile) -> PulseSource:
-    """Open the waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    with opened(options.path) as file:
-        if is_majorana(file):
-            return open_majorana(options, file)
-        chosen = choose_waveforms(options.path, file, options.place)
-        if chosen.is_lh5:
-            return Lh5Source(options, chosen)
-        values = StoredRows(options.path, chosen.path, file[chosen.path].shape)
-        columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
-    return ArraySource(options, "HDF5", chosen.path, values, columns)
+def read_hdf5(options: PulseFile) -> RawTable:
+    """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
+    path = options.path
+    with one_line(path), ExitStack() as unless_read:
+        file = unless_read.enter_context(open_hdf5(path))
+        table = _read(options, file)
+        unless_read.pop_all()
+        return replace(table, close=file.close)
 
 
-class Lh5Source(PulseSource):
-    """An LH5 waveform table ``{t0, dt, values}``, plain or encoded, with its columns."""
+def _read(options: PulseFile, file: h5py.File) -> RawTable:
+    path = options.path
+    if is_majorana(file):
+        return read_majorana(options, file)
+    name = choose_waveforms(path, file, options.place)
+    table, _, own_name = name.rpartition("/")
+    group, values = file[table or "/"], file[name]
+    columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+    if isinstance(values, h5py.Dataset):
+        columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
+        found = RawTable.of_array(path, "HDF5", name, values, columns, attrs)
+        return replace(found, rows=reading(path, values, found.rows), group=group)
+    own, values = columns_of(path, values), values["values"]
+    n = _n_rows(values)
+    first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
+    shortest, longest = _lengths(values) or first.shape[1:] * 2
+    if shortest < longest and first.dtype.kind == "f":
+        log.info(
+            f"{path.name}: pulses of {shortest} to {longest} samples are continued with their "
+            "last value"
+        )
+    rows = reading(path, values, partial(_lh5_traces, values, longest))
+    return RawTable(
+        "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
+        t0=own.get("t0"), group=group,
+    )  # fmt: skip
 
-    def __init__(self, options: PulseFile, chosen: WaveformColumn) -> None:
-        self._values = f"{chosen.path}/values"
-        with opened(options.path) as file:
-            columns = columns_of(options.path, file[chosen.table or "/"], chosen.table)
-            own = columns_of(options.path, file[chosen.path], chosen.path)
-            self._size = n_pulses = _n_rows(file[self._values])
-            first = self._rows(file, 0, 1, None) if n_pulses else np.empty((0, 0))
-            shortest, longest = _lengths(file[self._values]) or first.shape[1:] * 2
-            if shortest < longest and first.dtype.kind == "f":
-                log.info(
-                    f"{options.path.name}: pulses of {shortest} to {longest} samples are "
-                    "continued with their last value"
-                )
-            layout = Layout(
-                format="LH5",
-                table=chosen.path,
-                n_pulses=n_pulses,
-                length=longest,
-                columns=columns,
-                period_name=f"{chosen.path}/dt",
-                period=own.get("dt"),
-                t0=own.get("t0"),
-            )
-        super().__init__(options, layout)
 
-    def _traces(self, size: int) -> Iterator[Traces]:
-        with opened(self.path) as file:
-            for start in range(0, self._size, size):
-                n = min(size, self._size - start)
-                yield Traces(self._rows(file, start, n, self.length))
-
-    def _rows(
-        self, file: h5py.File, start: int, size: int, length: int | None
-    ) -> npt.NDArray[Any]:
-        item = file[self._values]
-        plain = isinstance(item, h5py.Dataset)
-        values = item[start : start + size] if plain else lh5_rows(item, start, size)
-        if not hasattr(values, "cumulative_length"):
-            traces = np.asarray(getattr(values, "nda", values))
-            if traces.ndim != 2 or traces.dtype.kind not in "iuf":
-                raise CpunetError(
-                    f"{file.filename}: {self._values} has values of {traces.dtype} and shape "
-                    f"{traces.shape}; give a file of traces"
-                )
-            return traces
-        lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
-        expected = int(lengths[0]) if length is None else length
-        flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
-        if not (other := lengths != expected).any():
-            return flat.reshape(len(lengths), expected)
-        first = int(other.argmax())
-        if flat.dtype.kind != "f":
+def _lh5_traces(
+    item: h5py.Group | h5py.Dataset, length: int | None, start: int, stop: int
+) -> npt.NDArray[Any]:
+    """Rows of LH5 traces; vectors of their own lengths are continued to `length` samples."""
+    plain = isinstance(item, h5py.Dataset)
+    values = item[start:stop] if plain else lh5_rows(item, start, stop - start)
+    if not hasattr(values, "cumulative_length"):
+        traces = np.asarray(getattr(values, "nda", values))
+        if traces.ndim != 2 or traces.dtype.kind not in "iuf":
             raise CpunetError(
-                f"{file.filename}: event {start + first}: {lengths[first]} samples, others "
-                f"have {expected}",
-                "split the file by length; only ideal pulses are continued with their last one",
+                f"{item.file.filename}: {item.name.strip('/')} has values of {traces.dtype} "
+                f"and shape {traces.shape}; give a file of traces"
             )
-        last = np.cumsum(lengths) - 1
-        at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
-        return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
+        return traces
+    lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
+    expected = int(lengths[0]) if length is None else length
+    flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
+    if not (other := lengths != expected).any():
+        return flat.reshape(len(lengths), expected)
+    first = int(other.argmax())
+    if flat.dtype.kind != "f":
+        raise CpunetError(
+            f"{item.file.filename}: event {start + first}: {lengths[first]} samples, others "
+            f"have {expected}",
+            "split the file by length; only ideal pulses are continued with their last one",
+        )
+    last = np.cumsum(lengths) - 1
+    at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
+    return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
 
 
 def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
@@ -132,33 +126,8 @@ def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
     return int(values.shape[0]) if values is not None and values.ndim else 0
 
 
-@dataclass(frozen=True)
-class WaveformColumn:
-    """Waveforms in a file.
-
-    Parameters
-    ----------
-    table
-        Path of the group that contains the waveforms and the other columns.
-    name
-        Name of the waveforms in it.
-    is_lh5
-        Whether they are an LH5 waveform table (t0, dt, values), not a plain dataset of shape
-        ``(events, samples)``.
-    """
-
-    table: str
-    name: str
-    is_lh5: bool
-
-    @property
-    def path(self) -> str:
-        """Path of the waveform column in the file."""
-        return f"{self.table}/{self.name}".strip("/")
-
-
-def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> WaveformColumn:
-    """Choose the waveforms at `table`: a table, a waveform column, or a group around one.
+def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
+    """Path of the waveforms at `table`: a table, a waveform column, or a group around one.
 
     Raises
     ------
@@ -170,17 +139,31 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> Waveform
     if item is None:
         there = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
         raise CpunetError(f"{path}: no table {place}; there are {shortened(there)}")
-    above, _, name = place.rpartition("/")
-    column = _column(item, above, name)
-    if column is not None:
-        return column
-    folders = _folders(item, place) if isinstance(item, h5py.Group) else ()
-    found = [column for folder in folders for column in folder.waveforms()]
-    if broken := next((column.table for column in found if not column.name), None):
+    if _is_lh5(item) or _is_array(item):
+        return place
+    folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
+    for broken in (link for folder in folders for link in folder.broken):
         item_at(file, broken)  # which says what is wrong
-    if found:
-        return _only(path, found)
-    raise _no_waveforms(path, file, place)
+    found = [one for folder in folders for one in folder.waveforms]
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise _no_waveforms(path, file, place)
+    tables = sorted({one.rpartition("/")[0] for one in found})
+    if len(tables) > 1:
+        raise CpunetError(
+            f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
+            "choose one with `table` (`sim_table`, `data_table`)"
+        )
+    names = {one.rpartition("/")[2]: one for one in found}
+    if best := next((name for name in _PREFERRED if name in names), None):
+        others = ", ".join(sorted(names.keys() - {best}))
+        log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
+        return names[best]
+    raise CpunetError(
+        f"{path}: {len(found)} waveform columns ({shortened(found)}); "
+        "choose one with `table` (`sim_table`, `data_table`)"
+    )
 
 
 def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
@@ -214,7 +197,11 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     )
 
 
-def _is_array(item: object) -> bool:
+def _is_row(item: object) -> bool:
+    return _is_array(item) and 1 in item.shape
+
+
+def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
     return isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
 
 
@@ -235,7 +222,13 @@ def _no_array(item: object) -> str:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    return sorted({one.table for folder in _folders(file) for one in folder.waveforms()})
+    return sorted(
+        {
+            place
+            for f in _folders(file)
+            for place in f.broken or ([f.path] if f.waveforms else [])
+        }
+    )
 
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
@@ -244,7 +237,7 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
     for table in waveform_tables(file):
         try:
             group = item_at(file, table) or file
-            columns = columns_of(path, group, table) if isinstance(group, h5py.Group) else {}
+            columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
         rows = max(map(len, columns.values()), default=0)
@@ -259,47 +252,18 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
     return found
 
 
-def _only(path: Path, found: list[WaveformColumn]) -> WaveformColumn:
-    tables = sorted({column.table for column in found})
-    if len(tables) > 1:
-        raise CpunetError(
-            f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
-            "choose one with `table` (`sim_table`, `data_table`)"
-        )
-    if len(found) == 1:
-        return found[0]
-    by_name = {column.name: column for column in found}
-    for name in _PREFERRED:
-        if name in by_name:
-            others = ", ".join(sorted(by_name.keys() - {name}))
-            log.info(f"{path.name}: {name} is read, at the full rate, not {others} (`table`)")
-            return by_name[name]
-    raise CpunetError(
-        f"{path}: {len(found)} waveform columns ({shortened(c.path for c in found)}); "
-        "choose one with `table` (`sim_table`, `data_table`)"
-    )
-
-
 @dataclass(frozen=True)
 class _Folder:
-    """A group of a file: its path, what it holds, and links in it that lead nowhere."""
+    """A group of a file: its path, what it holds, waveforms in it, and links that lead nowhere.
+
+    The waveforms are those of LH5, or else the first of the usual names.
+    """
 
     path: str
     members: dict[str, h5py.Group | h5py.Dataset]
-    broken: list[str]
     is_table: bool
-
-    def waveforms(self) -> list[WaveformColumn]:
-        """Waveforms in it, those of LH5 before others; of broken links, with no name."""
-        if self.is_table and {"dt", "values"} <= self.members.keys():
-            return []  # the inside of waveforms
-        columns = [_column(item, self.path, name) for name, item in self.members.items()]
-        there = [column for column in columns if column is not None]
-        plain = [column for name in _PLAIN for column in there if column.name == name]
-        found = [column for column in there if column.is_lh5] or plain[:1]
-        if found or self.is_table:
-            return found
-        return [WaveformColumn(f"{self.path}/{n}".strip("/"), "", False) for n in self.broken]
+    waveforms: list[str]
+    broken: list[str]
 
 
 def _folders(
@@ -318,29 +282,34 @@ def _folders(
         except CpunetError:
             broken.append(name)
     is_table = text_attribute(group, "datatype").startswith("table")
-    yield _Folder(path, found, broken, is_table)
+    names = [name for name, item in found.items() if _is_lh5(item)]
+    names = names or [name for name in _PLAIN if _is_array(found.get(name))][:1]
+    if is_table and {"dt", "values"} <= found.keys():
+        names = []  # the inside of waveforms
+    of = f"{path}/".lstrip("/")
+    lost = [] if names or is_table else [of + name for name in broken]
+    yield _Folder(path, found, is_table, [of + name for name in names], lost)
     for name, item in found.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
-            yield from _folders(item, f"{path}/{name}".strip("/"), seen)
+            yield from _folders(item, of + name, seen)
 
 
-def _column(item: h5py.Group | h5py.Dataset, table: str, name: str) -> WaveformColumn | None:
-    """Return an item of a table as waveforms; None if it is none."""
-    is_lh5 = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
-    is_lh5 = is_lh5 and text_attribute(item, "datatype").startswith("table")
-    return WaveformColumn(table, name, is_lh5) if is_lh5 or _is_array(item) else None
+def _is_lh5(item: object) -> bool:
+    """Whether an item is an LH5 waveform table (t0, dt, values)."""
+    is_group = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
+    return is_group and text_attribute(item, "datatype").startswith("table")
 
 
-def columns_of(path: Path, group: h5py.Group, table: str) -> dict[str, Column]:
+def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numeric datasets of one dimension, and its scalars.
 
-    Text counts where it separates channels.
+    Text counts where it separates channels; MATLAB has no vectors, but writes a row.
     """
     return {
-        name: _stored(path, item, f"{table}/{name}")
+        name: _stored(path, item)
         for name, item in members(group).items()
-        if is_column(item) or (divides(name) and is_text(item))
+        if is_column(item) or _is_row(item) or (divides(name) and is_text(item))
     }
 
 
@@ -352,24 +321,20 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
     CpunetError
         If there is no such file or column; the message lists the other columns of the group.
     """
-    with opened(path) as file:
-        place = name.strip("/").rpartition("/")[0]
+    file, place = open_hdf5(path), name.strip("/").rpartition("/")[0]
+    with one_line(path):
         parent, found = item_at(file, place), item_at(file, name)
-        others = columns_of(path, parent, place) if isinstance(parent, h5py.Group) else {}
-        if is_column(found):
-            return _stored(path, found, name), others
+        others = columns_of(path, parent) if isinstance(parent, h5py.Group) else {}
+        if is_column(found) or _is_row(found):
+            return _stored(path, found), others
         there = list(others or file)
     raise CpunetError(f"{path}: no column {name}; there are {shortened(there)}")
 
 
-def _stored(path: Path, dataset: h5py.Dataset, name: str) -> Column:
-    """A dataset as a column, by its name in this file; the file is open only while reading."""
-    is_constant = dataset.ndim == 0
-
-    def read(start: int, stop: int) -> npt.NDArray[Any]:
-        with opened(path) as file:
-            if is_constant:
-                return np.full(stop - start, file[name][()])
-            return np.asarray(file[name][start:stop])
-
-    return Column(read, dataset.size, units_of(dataset), is_constant)
+def _stored(path: Path, dataset: h5py.Dataset) -> Column:
+    """A dataset as a column."""
+    if dataset.ndim != 1:  # a number, or a row of MATLAB's
+        values = np.asarray(dataset[()])
+        return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
+    read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
+    return Column(read, dataset.size, units_of(dataset))

@@ -29,11 +29,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import StoredRows, is_column
-from cpunet.pulses.reading.arrays import ArraySource
+from cpunet.hdf5_files import is_column, reading
 from cpunet.pulses.reading.energies import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import ANY, choose_table
+from cpunet.pulses.reading.source import RawTable, choose_table
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
@@ -53,13 +52,10 @@ def detectors(file: h5py.File) -> list[str]:
     return [str(number) for number in np.unique(file[DETECTOR][()])]
 
 
-def open_majorana(options: PulseFile, file: h5py.File) -> ArraySource:
-    """Open the traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
-    number, length = file[WAVEFORMS].shape
-    rows = np.arange(number)
-    if options.table == WAVEFORMS:
-        options = replace(options, table=f"{WAVEFORMS}/{DETECTOR}={ANY}")
-    else:
+def read_majorana(options: PulseFile, file: h5py.File) -> RawTable:
+    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
+    rows = np.arange(len(file[WAVEFORMS]))
+    if options.table != WAVEFORMS:
         remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
         chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
         rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
@@ -68,11 +64,11 @@ def open_majorana(options: PulseFile, file: h5py.File) -> ArraySource:
         item = file.get(name)
         if is_column(item) and item.ndim:
             shown, units = _RENAMED.get(name, (name, ""))
-            columns[shown] = Column.of(item[()][rows], units)
-    values = StoredRows(options.path, WAVEFORMS, (len(rows), length), rows)
+            columns[shown] = Column.of(item[()], units)
+    path, name, values = options.path, options.place or WAVEFORMS, file[WAVEFORMS]
     hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
-    table = options.place or WAVEFORMS
-    return ArraySource(options, "Majorana release", table, values, columns, hint)
+    table = RawTable.of_array(path, "Majorana release", name, values, columns, period_hint=hint)
+    return replace(table, rows=reading(path, values, table.rows)).at(rows)
 
 
 # NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
@@ -98,8 +94,8 @@ class _Unpickler(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def open_pickles(options: PulseFile) -> ArraySource:
-    """Open pickled dictionaries, one after the other or in lists; all are held in memory.
+def read_pickles(options: PulseFile) -> RawTable:
+    """Read pickled dictionaries, one after the other or in lists; all are held in memory.
 
     Raises
     ------
@@ -136,7 +132,7 @@ def open_pickles(options: PulseFile) -> ArraySource:
         columns[name] = Column.of(values, "keV" if name == "energy" else "")
     hint = "CPU-Net's pulses are sampled every 16 ns"
     waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
-    return ArraySource(options, "pickled pulses", "", waveforms, columns, hint)
+    return RawTable.of_array(path, "pickled pulses", "", waveforms, columns, period_hint=hint)
 
 
 def _entries(path: Path) -> Iterator[Any]:

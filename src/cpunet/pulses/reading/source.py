@@ -1,12 +1,13 @@
-"""Files of pulses of any format: their layout, and their pulses in blocks."""
+"""Files of pulses of any format, open: their traces and columns, and pulses in blocks."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,14 +17,21 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.division import divides, dividing, labels, texts
 from cpunet.pulses.reading.energies import (
     EVENT_KEYS,
+    TOLERANCE,
     Column,
     require_length,
     resolve_energies,
     resolve_sampling,
+    some_of,
 )
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.tables import shortened
 from cpunet.units import factor
+
+if TYPE_CHECKING:  # of a library that other formats do not need
+    import h5py
+
+    from cpunet.hdf5_files import Read
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 ANY = "*"  # value of a column that separates no channels
@@ -31,22 +39,27 @@ _MAX_NUMBER = 2.0**62
 _EVENT_NUMBERS = EVENT_KEYS[:-1]
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Content of a file, as found by the reader of its format before any waveform is read.
+@dataclass(frozen=True, eq=False)
+class RawTable:
+    """Traces of one channel, open for reading, as the reader of a format gives them.
 
     Parameters
     ----------
     format
         Name of the format.
-    table
-        Location of the waveforms in the file.
-    n_pulses
-        Number of pulses; None if it is unknown without reading the whole file.
+    name
+        Location of the traces in the file.
+    n
+        Number of traces; None if it is unknown without reading the whole file.
     length
-        Samples per pulse.
+        Samples per trace.
+    rows
+        Gives the traces from a first one to the one before a last, shape ``(n, samples)``; of
+        a file with fewer those that are left.
     columns
-        Columns with one value per event, by name.
+        Columns with one value per trace, by name.
+    attrs
+        What the file says about the traces: side, maker, detector.
     period_name
         Name of the column of the sampling period.
     period
@@ -55,21 +68,30 @@ class Layout:
         Hint for the error message if the sampling period is not in the file.
     t0
         Times of the first samples, if they are in the file.
-    rows, n_rows
+    numbers
+        Event numbers of the traces read last, if they are in no column.
+    group, close
+        Group of an HDF5 file with columns of any kind; closes the file.
+    chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
     """
 
     format: str
-    table: str
-    n_pulses: int | None
+    name: str
+    n: int | None
     length: int
+    rows: Read
     columns: Mapping[str, Column] = field(default_factory=dict)
+    attrs: Mapping[str, str] = field(default_factory=dict)
     period_name: str = "dt"
     period: Column | None = None
     period_hint: str = ""
     t0: Column | None = None
-    rows: npt.NDArray[np.int64] | None = None
-    n_rows: int | None = None
+    numbers: Read | None = None
+    group: h5py.Group | None = None
+    close: Callable[[], None] = lambda: None
+    chosen: npt.NDArray[np.int64] | None = None
+    n_all: int | None = None
 
     @classmethod
     def of_array(
@@ -77,10 +99,12 @@ class Layout:
         path: Path,
         format: str,
         name: str,
-        shape: tuple[int, ...],
+        values: Any,
         columns: Mapping[str, Column],
-    ) -> Layout:
-        """Layout of an array of shape ``(pulses, samples)`` and the columns beside it.
+        attrs: Mapping[str, str] = MappingProxyType({}),
+        period_hint: str = "",
+    ) -> RawTable:
+        """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
 
         Raises
         ------
@@ -88,18 +112,21 @@ class Layout:
             If the columns have a value for each of its samples: Julia and MATLAB write arrays
             with their dimensions reversed.
         """
+        n, length = values.shape
         sizes = {len(column) for column in columns.values() if not column.constant}
-        if shape[1] in sizes and shape[0] not in sizes:
+        if length in sizes and n not in sizes:
             raise CpunetError(
-                f"{path}: traces of shape {shape} beside columns of {shape[1]}: their "
+                f"{path}: traces of shape {values.shape} beside columns of {length}: their "
                 "dimensions are reversed",
                 "write them transposed, with the pulses first",
             )
         period_name = "dt_ns" if "dt_ns" in columns else "dt"
-        period = columns.get(period_name)
-        return cls(format, name, shape[0], shape[1], columns, period_name, period)
+        return cls(
+            format, name, n, length, lambda start, stop: values[start:stop], columns, attrs,
+            period_name, columns.get(period_name), period_hint,
+        )  # fmt: skip
 
-    def of_rows(self, path: Path, chosen: Mapping[str, str]) -> Layout:
+    def of_channel(self, path: Path, chosen: Mapping[str, str]) -> RawTable:
         """Rows with the chosen values of some columns, or all if they are of one channel.
 
         Raises
@@ -107,22 +134,22 @@ class Layout:
         CpunetError
             If there are none, or they are of several channels.
         """
-        if self.n_pulses is None:
+        if self.n is None or self.chosen is not None:
             return self
-        whole = {n: c for n, c in self.columns.items() if len(c) == self.n_pulses}
-        rows = np.arange(self.n_pulses)
+        whole = {n: c for n, c in self.columns.items() if len(c) == self.n}
+        rows = np.arange(self.n)
         for name, value in chosen.items():
             if value == ANY:
                 continue
             if name not in whole:
                 raise CpunetError(f"{path}: no column {name}; there are {shortened(whole)}")
-            there = texts(whole[name].read(0, self.n_pulses))
+            there = texts(whole[name].read(0, self.n))
             rows = rows[there[rows] == value]
             if not len(rows):
                 raise CpunetError(
                     f"{path}: no {name} {value}; it holds {shortened(np.unique(there))}"
                 )
-        of = {n: c.read(0, self.n_pulses)[rows] for n, c in whole.items() if divides(n)}
+        of = {n: c.read(0, self.n)[rows] for n, c in whole.items() if divides(n)}
         of = {name: values for name, values in of.items() if name not in chosen}
         if names := dividing(of, len(rows)):
             held = list(np.unique(labels(of, names)))
@@ -132,13 +159,15 @@ class Layout:
                 f"choose one with `table` {held[0]} (`sim_table`, `data_table`){also}; "
                 f"{','.join(f'{name}={ANY}' for name in names)} takes them as one",
             )
-        if len(rows) == self.n_pulses:
-            return self
+        return self if len(rows) == self.n else self.at(rows)
+
+    def at(self, rows: npt.NDArray[np.int64]) -> RawTable:
+        """Some rows, which ascend."""
         period, t0 = (c and c.at(rows) for c in (self.period, self.t0))
-        columns = {n: c.at(rows) for n, c in self.columns.items()}
         return replace(
-            self, n_pulses=len(rows), columns=columns, period=period, t0=t0, rows=rows,
-            n_rows=self.n_pulses,
+            self, n=len(rows), rows=partial(some_of, self.rows, rows), period=period, t0=t0,
+            columns={n: c.at(rows) for n, c in self.columns.items()},
+            chosen=rows, n_all=self.n,
         )  # fmt: skip
 
 
@@ -178,18 +207,10 @@ def choose_table(
     return options.place
 
 
-@dataclass(frozen=True)
-class Traces:
-    """Raw waveforms ``(n, samples)``, and event numbers ``(n,)`` if the format has them."""
+class PulseSource:
+    """Pulses of an open file: iterate over its `blocks`, or `read` it as a whole.
 
-    waveforms: npt.NDArray[Any]
-    event_number: npt.NDArray[np.int64] | None = None
-
-
-class PulseSource(ABC):
-    """A file of pulses: iterate over its `blocks`, or `read` it as a whole.
-
-    The file is open only during an iteration, so a source need not be closed, and the memory
+    The file is closed at the end of a ``with``, or with the last reference to this.  The memory
     in use does not grow with the file, except for ``.npz`` and pickles, which are read as a
     whole.
 
@@ -203,34 +224,35 @@ class PulseSource(ABC):
         Number of pulses; None if it is unknown without reading the whole file.
     length : int
         Samples per pulse.
-    layout : Layout
+    table : RawTable
         Content of the file.
     energies : Energies
         Rule that gives each pulse its energy.
     """
 
-    def __init__(self, options: PulseFile, layout: Layout) -> None:
-        if layout.n_pulses == 0 or layout.length == 0:
+    def __init__(self, options: PulseFile, table: RawTable) -> None:
+        if table.n == 0 or table.length == 0:
             raise CpunetError(
-                f"{options.path}: {layout.table or layout.format} holds no pulses; "
+                f"{options.path}: {table.name or table.format} holds no pulses; "
                 "give a file with events"
             )
-        layout = layout.of_rows(options.path, options.rows)
+        table = table.of_channel(options.path, options.rows)
         self.path = options.path
-        self.n_pulses = layout.n_pulses
-        self.length = layout.length
-        self.layout = layout
-        self._sampling = resolve_sampling(options, layout)
-        self.dt_ns = self._sampling.dt_ns
-        self.energies = resolve_energies(options, layout)
-        self._number_column = next((n for n in _EVENT_NUMBERS if n in layout.columns), None)
+        self.n_pulses = table.n
+        self.length = table.length
+        self.table = table
+        self.dt_ns, self._periods = resolve_sampling(options, table)
+        self.energies = resolve_energies(options, table)
+        self._number_column = next((n for n in _EVENT_NUMBERS if n in table.columns), None)
         if self._number_column is not None:
-            column = layout.columns[self._number_column]
-            require_length(options.path, self._number_column, column, layout.n_pulses)
+            column = table.columns[self._number_column]
+            require_length(options.path, self._number_column, column, table.n)
 
-    @abstractmethod
-    def _traces(self, size: int) -> Iterator[Traces]:
-        """Yield raw waveforms in the order of the file, `size` rows at a time."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.table.close()
 
     def blocks(self, size: int = 4096) -> Iterator[Pulses]:
         """Yield the pulses of the file in order, at most `size` at a time.
@@ -243,15 +265,13 @@ class PulseSource(ABC):
             If the file is damaged or contains no pulses, or if its events differ in length or
             sampling period.
         """
-        start = row = 0
-        for traces in self._traces(min(size, max(1, BLOCK_BYTES // (4 * self.length)))):
-            begin, row = row, row + len(traces.waveforms)
-            if (rows := self.layout.rows) is not None:
-                here = rows[slice(*np.searchsorted(rows, (begin, row)))] - begin
-                traces = Traces(traces.waveforms[here])
-            if len(traces.waveforms):
-                yield self._pulses(start, traces)
-                start += len(traces.waveforms)
+        size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
+        while start != self.n_pulses:
+            waveforms = self.table.rows(start, start + size)
+            if not len(waveforms):
+                break
+            yield self._pulses(start, waveforms)
+            start += len(waveforms)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
         column = self.energies.column
@@ -261,24 +281,26 @@ class PulseSource(ABC):
                 "give the energies of the same events"
             )
 
-    def read(self) -> Pulses:
-        """Read all pulses of the file at once; they must fit in memory."""
-        return Pulses.concatenate(list(self.blocks()))
+    def read(self, start: int = 0, stop: int | None = None) -> Pulses:
+        """Read all pulses of the file, or some rows, at once; they must fit in memory."""
+        if stop is None:
+            return Pulses.concatenate(list(self.blocks()))
+        return self._pulses(start, self.table.rows(start, stop))
 
     @property
     def columns(self) -> Mapping[str, Column]:
         """Columns with one value per event, by name."""
-        return self.layout.columns
+        return self.table.columns
 
-    def _pulses(self, start: int, traces: Traces) -> Pulses:
+    def _pulses(self, start: int, traces: npt.NDArray[Any]) -> Pulses:
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
-            waveforms = np.asarray(traces.waveforms, np.float32)
+            waveforms = np.asarray(traces, np.float32)
         stop = start + len(waveforms)
-        numbers = traces.event_number
+        numbers = np.arange(start, stop)
         if self._number_column is not None:
-            numbers = self.layout.columns[self._number_column].read(start, stop)
-        elif numbers is None:
-            numbers = np.arange(start, stop)
+            numbers = self.columns[self._number_column].read(start, stop)
+        elif self.table.numbers is not None:
+            numbers = self.table.numbers(start, stop)
         energy_kev = self.energies.of(start, waveforms)
         if len(energy_kev) != len(waveforms):
             raise CpunetError(
@@ -286,8 +308,17 @@ class PulseSource(ABC):
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
-        self._sampling.check(start, event_number)
-        t0, t0_ns = self.layout.t0, np.zeros(len(waveforms))
+        if self._periods is not None:
+            periods = self._periods(start, stop)
+            other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
+            if other.any():
+                first = int(other.argmax())
+                raise CpunetError(
+                    f"{self.path}: event {event_number[first]}: sampling period "
+                    f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
+                    "split the file by sampling period"
+                )
+        t0, t0_ns = self.table.t0, np.zeros(len(waveforms))
         if t0 is not None and (ns_per_unit := factor(t0.units, "ns")) is not None:
             t0_ns = ns_per_unit * np.asarray(t0.read(start, stop), np.float64)
         return Pulses.of(
