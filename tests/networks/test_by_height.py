@@ -97,14 +97,17 @@ def test_a_run_stores_what_acts_by_height_and_asks_for_energies(run: Path) -> No
     assert np.abs(np.diff(low)).max() > 1.05 * np.abs(np.diff(high)).max()
 
 
-def test_raw_traces_have_what_acts_by_height(run: Path, tmp_path: Path) -> None:
+def test_raw_traces_have_what_acts_by_height(
+    run: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """The largest step of a high pulse is limited, that of a low one is not."""
     kev = np.repeat([200.0, KEV], 4)
     pulses = Pulses.of(np.tile(edges(4, seed=4), (2, 1)), dt_ns=16.0, energy_kev=kev)
-    write_pulses(tmp_path / "sim.lh5", pulses)
+    folder = tmp_path_factory.mktemp("files")
+    source, out = folder / "sim.lh5", folder / "out.lh5"
+    write_pulses(source, pulses)
     scale = Adc(adc_per_kev=8.0, baseline=1000.0)
-    out = tmp_path / "out.lh5"
-    translate(run, tmp_path / "sim.lh5", out, adc=True, scale=scale, noise=False)
+    translate(run, source, out, adc=True, scale=scale, noise=False)
     traces = open_pulses(out).read().waveforms.astype(float)
     low, high = np.diff(traces, axis=1).max(axis=1).reshape(2, 4)
     assert high.max() < 8 * 1.1 * LIMIT

@@ -16,9 +16,9 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
 from cpunet.training.chain_fit import POOR, Fitter, differences
-from cpunet.training.chain_parameters import SmoothParameters
+from cpunet.training.chain_parameters import STRETCH, SmoothParameters
 from cpunet.training.comparison import Difference
-from cpunet.training.joint import Joint, SingleSites
+from cpunet.training.joint import SEGMENTS, Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import Fit, amplitude_shift, fit_response
 from synthetic import load_recipe
@@ -212,8 +212,11 @@ def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None
             (ends[0] - ends[1]) / (2 * STEP * width),
             here.covariance.diagonal() ** 0.5,
         )
-        off = np.linalg.norm((here.slopes[:, i] - wanted) / error)
-        assert off < 0.15 * np.linalg.norm(wanted / error), parameters.labels[i]
+        # Levels follow half heights by whole samples, so that a difference of a shift counts
+        # the pulses that pass one; the derivative has their mean, and tails are not compared.
+        some = slice(SEGMENTS if parameters.labels[i] == STRETCH else 0, None)
+        off = np.linalg.norm(((here.slopes[:, i] - wanted) / error)[some])
+        assert off < 0.15 * np.linalg.norm((wanted / error)[some]), parameters.labels[i]
 
 
 def test_a_known_response_is_where_a_fit_starts(problem: Problem, near: Told) -> None:

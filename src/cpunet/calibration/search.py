@@ -109,19 +109,22 @@ class Search:
         before = self._problem(response, nearby, [], held=True)
         self._tell("as simulated", before)
         free = self._first_free(response, nearby)
+        problem, found = self._from_far(response, nearby, free)
+        if problem.chi_square() > POOR * problem.moments:  # as if the readout rings
+            self._tell("without deviations", problem, found)
+            response = self._deviated(before) or response
+            free = self._first_free(response, nearby)
+            problem, found = self._from_far(response, nearby, free)
         deviated, more, last = 0, 0, np.zeros(self._n)
         for number in range(1, ROUNDS + 1):
-            if number == 1:
-                problem, found = self._from_far(response, nearby, free)
-            else:
+            if number > 1:
                 problem = self._problem(response, nearby, free)
                 found = problem.fitted()
             self._tell(f"round {number}", problem, found)
             response = problem.parameters.chain.response
             moved = problem.parameters.coordinates - nearby.centre
             settled = number > 1 and _settled(problem, found, moved)
-            rings = number == 1 and problem.chi_square() > POOR * problem.moments
-            if (rings or settled) and deviated < MAX_DEVIATED:
+            if settled and deviated < MAX_DEVIATED:
                 other, deviated = self._deviated(problem), deviated + 1
                 response, settled = other or response, settled and other is None
             added = self._needed(problem) if settled and more < MAX_MORE else None
@@ -187,10 +190,10 @@ class Search:
         return JointProblem(*sets, self.recipe, self.known, held, weights)
 
     def _deviated(self, problem: JointProblem) -> ElectronicsResponse | None:
-        """The chain with deviations of its step response, if physics leave too much.
+        """The chain with deviations of its step response, if these physics leave too much.
 
-        They absorb what the chain does not describe; physics would absorb a part of it: an
-        early decay between the fixed ones looks like more self-repulsion.
+        Physics would absorb a part of it: an early decay between the fixed ones looks like more
+        self-repulsion, and so does a ringing.
         """
         mean, spread = problem.by_chance
         if problem.chi_square() < mean + BEYOND_CHANCE * spread:
