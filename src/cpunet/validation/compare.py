@@ -360,6 +360,8 @@ def _overview(name: str, metrics: Metrics, method: str) -> Overview:
     off, judged = judged_scores(metrics, method)
     text = f"{off} of {judged} off" if judged else "not judged"
     marked = off > 2 and off > 0.2 * judged  # one or two can be off by chance
+    if part(metrics, "training").get("ok") is False:
+        text, marked = f"{text}, a bad fit", True
     lines = [summary(metrics, peak, method) for peak in part(metrics, "peaks")]
     about = "; ".join(f"{key}: {text}" for key, text in part(metrics, "compared").items())
     return Overview(name, text, marked, lines, about)

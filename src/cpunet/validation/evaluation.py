@@ -153,7 +153,7 @@ def evaluate(
             "missing": baseline_methods.missing,
         },
         "training": {"recipe": recipe.name}
-        | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak")},
+        | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
         "tails": None if known is None else known.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
