@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import cpunet
 from cpunet import demo
 from cpunet.pulses.container import Pulses
 from cpunet.recipes import load_recipe
+from cpunet.translation.translator import NOISE_ROWS
 from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {
@@ -137,6 +139,45 @@ def test_histogram_of_translated_pulses(home, run):
         made.hist("drift")
 
 
+def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
+    made = run.translate(home / "sim.lh5", noise=False)
+    axes = made.plot()
+    assert axes.figure is pyplot.gcf()
+    assert made.hist("drift_time", bins=50).plot(ax=axes) is axes
+    assert len(made.hist("drift_time", bins=50).values()) == 50
+    counted = made.hist("drift_time").plot(color="red")
+    assert counted.figure is pyplot.gcf()
+    assert counted is not axes
+    pyplot.close("all")
+    with pytest.raises(cpunet.CpunetError, match="`bins` is 0"):
+        made.hist(bins=0)
+
+
+def test_a_seed_gives_the_same_pulses_in_each_way(home, run):
+    """Of more pulses than have a common seed of the noise."""
+    sim = cpunet.open_pulses(home / "sim.lh5").read()
+    sim = Pulses.concatenate([sim[sim.energy_kev > 0]] * 4)
+    assert len(sim) > 2 * NOISE_ROWS
+    of_run, of_ren = run.translate(sim, seed=5).waveforms, run.ren(sim, seed=5)
+    assert np.array_equal(of_run, of_ren)
+    given = run.ren(sim.waveforms, energy_kev=sim.energy_kev, seed=5)
+    assert np.array_equal(given, of_ren)
+
+
+def test_covariances_have_names(run):
+    covariance = run.covariance
+    assert list(covariance) == list(covariance.index) == list(run.fit.errors)
+    errors = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(errors, list(run.fit.errors.values()))
+
+
+def test_runs_are_compared_by_their_readouts(run):
+    values = cpunet.compare(run, run).values
+    assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
+    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
+        cpunet.compare(run, run.folder)
+
+
 def test_raw_traces(home, run):
     made = run.translate(home / "sim.lh5", adc=True)
     assert made.adc
@@ -249,7 +290,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert report.folder is None
     assert report.scores.loc["FEP", "drift_time", "ren"].iou > 0
     assert report["FEP"].loc["drift_time", "ren"].ceiling > 0
-    assert report.plot().axes
+    assert report.plot().get_title() == "FEP"
     assert "FEP" in report.metrics["peaks"]
     report.save(tmp_path / "report")
     again = cpunet.load(tmp_path / "report")

@@ -101,6 +101,16 @@ def panels(
     return figure, figure.subplots(rows, columns, squeeze=False, **how)
 
 
+def own_axes(ax: Axes | None) -> Axes:
+    """The axes that a user gives, or those of a new figure of pyplot, for its `savefig`."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    new: Axes = pyplot.subplots()[1]
+    return new
+
+
 def legend_above(
     figure: Figure, axes: Axes, columns: int = 1, title: str | None = None
 ) -> None:

@@ -6,6 +6,8 @@ evaluated.  This module adds others on which an analysis may cut.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import hist
 import numpy as np
 
@@ -22,6 +24,9 @@ from cpunet.pulses.parameters import (
     tail_slope,
 )
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Fractions of the maximum at which a pulse is timed.
 TIME_POINTS = {"t01": 0.01, "t10": 0.1, "t50": 0.5, "t90": 0.9, "t99": 0.99}
@@ -204,8 +209,48 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
     return hist.axis.Regular(bins, low, high + margin)
 
 
-def labelled(axis: hist.axis.Regular, parameter: str) -> hist.axis.Regular:
-    """The same bins, with the parameter's name and label."""
+def labelled(
+    axis: hist.axis.Regular, parameter: str, bins: int | None = None
+) -> hist.axis.Regular:
+    """The same range, in so many bins if given, with the parameter's name and label.
+
+    Raises
+    ------
+    CpunetError
+        If there are no so many bins.
+    """
     edges = axis.edges
+    if bins is not None and bins < 1:
+        raise CpunetError(f"`bins` is {bins}", "give 1 or more")
     label = SHAPE_PARAMETERS[parameter].axis_label
-    return hist.axis.Regular(axis.size, edges[0], edges[-1], name=parameter, label=label)
+    return hist.axis.Regular(
+        bins or axis.size, edges[0], edges[-1], name=parameter, label=label
+    )
+
+
+class Histogram(hist.Hist[Any], family=hist):
+    """A `hist.Hist` that is drawn without further packages."""
+
+    def plot(self, ax: Axes | None = None, **how: Any) -> Axes:  # type: ignore[override]
+        """Draw the counts of one axis, of each category of an axis before it.
+
+        Parameters
+        ----------
+        ax
+            Where to draw; a new figure of pyplot by default.
+        how
+            Further arguments of `matplotlib.axes.Axes.stairs`.
+        """
+        from cpunet.plotting import label, own_axes
+
+        *categories, axis = self.axes
+        ax = own_axes(ax)
+        names = list(categories[0]) if categories else []
+        for name in names or [None]:
+            one: Any = self if name is None else self[name, :]
+            text = {} if name is None else {"label": label(name)}
+            ax.stairs(one.values(), axis.edges, **text | how)
+        ax.set(xlabel=axis.label, ylabel="Counts")
+        if names:
+            ax.legend()
+        return ax

@@ -313,6 +313,18 @@ class Run(InfoPart):
         return IREN.of(self)
 
     @cached_property
+    def covariance(self) -> DataFrame:
+        """Covariance of the fitted parameters, with their names; empty if nothing was fitted.
+
+        Parameters of positive quantities are their logarithms (``log_poles_ns.0``).
+        """
+        from pandas import DataFrame
+
+        fit = self.fit or FitInfo()
+        names = list(fit.errors) if fit.covariance else []
+        return DataFrame(np.array(fit.covariance).reshape(-1, len(names)), names, names)
+
+    @cached_property
     def parameters(self) -> dict[str, float]:
         """Physical parameters of the readout chain; each name ends with the unit.
 

@@ -17,6 +17,8 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.plotting import label
 from cpunet.tables import NO_VALUE, text_table
+from cpunet.training.response import Response, response
+from cpunet.training.run import Run, RunLike
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 from cpunet.validation.verdicts import (
     Metrics,
@@ -223,11 +225,11 @@ class Comparison:
 
 
 def compare(
-    *reports: str | Path | Report,
+    *reports: RunLike | Report,
     method: str = "ren",
     out: str | Path | None = None,
     force: bool = False,
-) -> Comparison:
+) -> Comparison | Response:
     """Put the scores of several validations beside each other, of one detector or of many.
 
     The page also has links to the reports, and room for many detectors and periods. Of runs
@@ -237,7 +239,8 @@ def compare(
     Parameters
     ----------
     reports
-        Folders of cpunet validate or demo, or their metrics.json.
+        Folders of cpunet validate or demo, or their metrics.json. From Python also reports, or
+        runs, whose readouts are compared as by ``cpunet.response``.
     method
         Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.
     out
@@ -247,8 +250,8 @@ def compare(
 
     Returns
     -------
-    Comparison
-        Scores of the runs side by side.
+    Comparison or Response
+        Scores of the runs side by side; of runs, their readouts.
 
     Raises
     ------
@@ -262,10 +265,15 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
+    if runs := [report for report in reports if isinstance(report, Run)]:
+        if len(runs) < len(reports):
+            raise CpunetError("runs and reports are not compared", "validate the runs")
+        return response(*runs, out=out, force=force)
+    scored = [report for report in reports if not isinstance(report, Run)]
     if out is not None:
-        files = [report for report in reports if not isinstance(report, Report)]
+        files = [report for report in scored if not isinstance(report, Report)]
         _refuse(Path(out), files, force=force)
-    comparison = compared(reports, method=method)
+    comparison = compared(scored, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)

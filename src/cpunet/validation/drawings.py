@@ -95,7 +95,7 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         if parameter in PARAMETERS:
             axis, compared = data_axis(data, bins), scores["parameters"][parameter]
             how = (by_method, axis, parameter, name, compared)
-            drawn[parameter] = partial(parameter_histograms, *how)
+            drawn[parameter.replace("_", " ")] = partial(parameter_histograms, *how)
         else:
             further[parameter] = by_method
     drawn["further parameters"] = partial(further_histograms, further, bins, name)

@@ -14,6 +14,7 @@ from typing import Any
 
 import hist
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -119,25 +120,39 @@ def parameter_histograms(
     peak: str,
     comparison: Compared,
 ) -> Figure:
-    """Distributions of one parameter: the data filled, each method as a line.
+    """A figure of the distributions of one parameter at a peak, see `draw_parameter`."""
+    figure, ((axes,),) = panels((5.6, 4.2))
+    draw_parameter(axes, values, axis, parameter, comparison)
+    legend_above(figure, axes, title=peak)
+    return figure
+
+
+@styled
+def draw_parameter(
+    axes: Axes,
+    values: Mapping[str, Values],
+    axis: hist.axis.Regular,
+    parameter: str,
+    comparison: Compared,
+) -> None:
+    """Draw the distributions of one parameter: the data filled, each method as a line.
 
     All histograms sum to one, with the events outside the range, whose share is in the legend
     beside each method's IoU and the ceiling.
 
     Parameters
     ----------
+    axes
+        Where to draw.
     values
         Values of the parameter by method, the measured ones under ``"data"``.
     axis
         Binning, see `comparisons.data_axis`.
     parameter
         Name of the parameter in `PARAMETERS`.
-    peak
-        Name of the gamma line, for the title.
     comparison
         Result of `comparisons.compare` for the parameter.
     """
-    figure, ((axes,),) = panels((5.6, 4.2))
     for method, of_method in values.items():
         name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
         score, missing = comparison["iou"].get(name), int(np.isnan(of_method).sum())
@@ -148,8 +163,6 @@ def parameter_histograms(
             text += f", {100 * (below + above):.0f} % outside"
         steps(axes, shares, axis.edges, method, text)
     axes.set(xlabel=PARAMETERS[parameter].axis_label, ylabel="Fraction of events per bin")
-    legend_above(figure, axes, title=peak)
-    return figure
 
 
 @styled
