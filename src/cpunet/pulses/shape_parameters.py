@@ -14,6 +14,7 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.pulses import _parameter_kernels as kernels
 from cpunet.pulses.container import FloatArray, Pulses, blocks
+from cpunet.pulses.legend_parameters import legend_parameters
 from cpunet.pulses.parameters import (
     BLOCK,
     PARAMETERS,
@@ -52,10 +53,21 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
         name: Parameter(f"Rise time {int(begin[1:])}–{end[1:]} %", "ns")
         for name, (begin, end) in RISE_TIMES.items()
     },
-    "effective_drift_time": Parameter("Effective drift time", "ns"),
+    "tp_0_est": Parameter("tp_0_est", "ns"),
+    "tp_50": Parameter("tp_50", "ns"),
+    "tp_90": Parameter("tp_90", "ns"),
+    "tp_99": Parameter("tp_99", "ns"),
+    "rise_time": Parameter("T(10–90 %)", "ns"),
+    "dt_eff": Parameter("Effective drift time dt_eff", "ns"),
+    "lq": Parameter("Late charge LQ", "ns"),
     "tail_slope": PARAMETERS["tail_slope"],
     "baseline_rms": Parameter("Baseline RMS", "pulse height"),
 }
+
+
+# What also needs the pulses of another peak, see `cpunet.validation.peaks`.
+A_OVER_E = "a_over_e"
+LABELLED = SHAPE_PARAMETERS | {A_OVER_E: Parameter("A/E (double escape at 1)", "")}
 
 
 def all_parameters(
@@ -96,8 +108,8 @@ def all_parameters(
     >>> recipe = load_recipe("paper")
     >>> ramp = np.clip((np.arange(800) - 300) / 100, 0, 1)[np.newaxis]
     >>> found = all_parameters(Pulses.of(ramp, dt_ns=16), recipe.preparation, recipe.scores)
-    >>> found["rise_10_90"].round(3), found["effective_drift_time"].round(1)
-    (array([1280.]), array([784.1]))
+    >>> found["rise_10_90"].round(3), found["dt_eff"].round(1)
+    (array([1280.]), array([800.]))
     """
     preparation = preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:
@@ -123,6 +135,16 @@ def all_parameters(
             }
         for name, column in found.items():
             values[name][rows] = np.where(np.isfinite(column), column, np.nan)
+    slope = (
+        np.nanmedian(values["tail_slope"]) if np.isfinite(values["tail_slope"]).any() else 0.0
+    )
+    decay_ns = -1e6 / slope if slope < 0 else np.inf
+    for rows in blocks(len(pulses), BLOCK):
+        good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
+        block, noise = pulses.waveforms[good], values["baseline_rms"][good]
+        how = (decay_ns, noise, pulses.dt_ns, preparation.samples_before)
+        for name, column in legend_parameters(block, *how).items():
+            values[name][good] = column
     return values
 
 
@@ -137,8 +159,7 @@ def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
         zip(TIME_POINTS, ((samples - aligned) * dt_ns).T, strict=True)
     )
     rises = {name: times[end] - times[begin] for name, (begin, end) in RISE_TIMES.items()}
-    areas = kernels.missing_areas(block, samples[:, 0].copy(), stop.astype(float))
-    return {**times, **rises, "effective_drift_time": areas * dt_ns}
+    return {**times, **rises}
 
 
 def _rms_about_line(baseline: FloatArray) -> Values:
@@ -222,7 +243,7 @@ def labelled(
     edges = axis.edges
     if bins is not None and bins < 1:
         raise CpunetError(f"`bins` is {bins}", "give 1 or more")
-    label = SHAPE_PARAMETERS[parameter].axis_label
+    label = LABELLED[parameter].axis_label
     return hist.axis.Regular(
         bins or axis.size, edges[0], edges[-1], name=parameter, label=label
     )

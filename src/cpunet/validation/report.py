@@ -17,10 +17,16 @@ import numpy as np
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.parameters import Values
 from cpunet.settings import plain, read_json
 from cpunet.tables import text_table
-from cpunet.validation.verdicts import Metrics, judged_scores
+from cpunet.validation.verdicts import (
+    Metrics,
+    headline,
+    held_out,
+    judged_scores,
+    main_table,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,12 +42,14 @@ REPORT = FolderKind(
     own=r"metrics\.json|report\.html|parameters\.npz",
 )
 # methods of the printed table, in the order of the page; those without noise are in the metrics
-_METHODS = ("raw", "rc", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
+_METHODS = ("raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
 _NAMES = {
     "ren": "REN",
     "current_amplitude": "I_max",
     "drift_time": "T_drift",
     "tail_slope": "tail slope",
+    "rc_late": "rc+late",
+    "ceiling": "data vs data",
 }
 _SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table
 
@@ -236,7 +244,7 @@ class Report:
             f"{peak}/{method}/{name}": of_method[name]
             for peak, of_peak in self.values.items()
             for method, of_method in of_peak.items()
-            for name in PARAMETERS
+            for name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         before = gc.get_threshold()
@@ -252,6 +260,9 @@ class Report:
         names = [_NAMES.get(name, name) for name in head]
         rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
         lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
+        if peaks := held_out(self.metrics):
+            table = text_table(*main_table(self.metrics, peaks), words=2)
+            lines = [headline(self.metrics)[1], table, "", *lines]
         for peak, scores in self.metrics["peaks"].items():
             if "missing" in scores:
                 lines.append(f"{peak}: not scored, {scores['missing']}")
@@ -267,7 +278,7 @@ class Report:
 
         (_, _, *methods), rows = self._table(_SHOWN)
         rows = [[peak, name.replace("_", " "), *cells] for peak, name, *cells in rows]
-        head = ["peak", "overlap with data (%)", *methods]
+        head = ["peak", "overlap with data (%)", *(_NAMES.get(m, m) for m in methods)]
         where = {"page": None if self.folder is None else self.folder / PAGE}
         return part("object", "cpunet report", where, head, rows, self.verdicts)
 
