@@ -143,7 +143,7 @@ def test_pulses_sharper_than_simulated(sides, check):
     padded = np.pad(sides.sim, ((0, 0), (30, 30)), mode="edge")
     wide = np.apply_along_axis(np.convolve, 1, padded, kernel, "valid")
     done = check(sides.write_sim(waveforms=wide), sides.write_data())
-    assert "no readout makes pulses sharper" in done.out
+    assert "electronics cannot make pulses sharper" in done.out
 
 
 @pytest.mark.parametrize("n", [50, 3])

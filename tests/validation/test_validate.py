@@ -231,7 +231,7 @@ def test_a_report(report):
     assert lines[0].startswith(("REN agrees with the data in all", "REN is off in"))
     assert "REN − data" in lines[1]
     head = next(line for line in lines if line.startswith("peak"))
-    assert head.split() == ["peak", "parameter", "raw", "REN", "data", "vs", "data"]
+    assert head.split() == ["peak", "parameter", "simulation", "REN", "data", "vs", "data"]
     ren = f"{compared['iou']['ren']:.1f}"
     assert any(line.startswith("SEP") and "T_drift" in line and ren in line for line in lines)
     assert lines[-1] == str(report.folder / "report.html")

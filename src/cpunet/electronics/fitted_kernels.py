@@ -206,7 +206,8 @@ class RCLate(BaselineMethod):
         start = np.array([START_NS, START_SHARE, LATE_NS])
         scale = np.array([LONGEST_NS, 1.0, LONGEST_NS])
         how = (start, np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS]), scale)
-        (tau, share, late), slope = _fitted(sim, data, dt_ns, align, _rc_late, how)
+        fitted = _fitted(sim, data, dt_ns, align, _rc_late, how, charge=True)
+        (tau, share, late), slope = fitted
         found = cls(dt_ns, tau, share, late, slope)
         own = _own_decay(found, slope, sim[:GAUSS_PULSES], align)
         return replace(found, tail_slope_per_ms=own)
@@ -226,6 +227,8 @@ def _fitted(
     align: int,
     kernel: Callable[[int, float, Values], Spectrum],
     how: tuple[Values, Values, Values],
+    *,
+    charge: bool = False,
 ) -> tuple[list[float], float]:
     """Parameters of a kernel fitted to superpulses, and the tail slope in 1/ms.
 
@@ -237,6 +240,8 @@ def _fitted(
         Fourier transform of the kernel at a length and a period in ns.
     how
         Where the parameters start, their largest values (the smallest are 0), and scales.
+    charge
+        Compare charges in place of currents, in which late charge counts for little.
     """
     slope, steps = fitted_decay(sim, data, dt_ns, align, GAUSS_PULSES)
     measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
@@ -258,7 +263,8 @@ def _fitted(
             parameters: Values, sliced: Spectrum = sliced, places: Groups = places
         ) -> Values:
             response = sliced * kernel(length, dt_ns, parameters)
-            return (_mean_currents(response, places, length, edge) - wanted).ravel()
+            apart = _mean_currents(response, places, length, edge) - wanted
+            return np.asarray(np.cumsum(apart, axis=1) if charge else apart).ravel()
 
         best = scipy.optimize.least_squares(
             residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4

@@ -443,7 +443,8 @@ def _amplitude(sim: InputSet, data: InputSet) -> Finding:
     ratio = highest[1] / highest[0]
     text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
     remedy = (
-        "no readout makes pulses sharper: another detector, too wide a cloud, or other energies"
+        "electronics cannot make pulses sharper: another detector, too wide a cloud, or other "
+        "energies"
     )
     return _judged(text, remedy, ratio < SHARPER, ratio > OTHER_SHARPER)
 

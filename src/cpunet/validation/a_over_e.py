@@ -38,6 +38,7 @@ MIN_EVENTS = 20  # events of the DEP: two below the cut
 DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
 SCALES = 100  # bootstraps of the position of the single-site peak
+NULLS = 200  # draws of a difference without one
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,16 @@ def survival_table(
             if "ren" in survival:
                 kept, error = survival["ren"]
                 survival["ren"] = kept, float(np.hypot(error, of_fit))
-            table[name] = _against_data(replace(row, of_fit=of_fit), survival)
+            spread = {
+                m: null_spread(
+                    (ae[DEP]["data"], ae[DEP][m]), (of_peak["data"], of_peak[m]), rng
+                )
+                for m in methods
+                if m != "data"
+            }
+            if "ren" in spread:
+                spread["ren"] = float(np.hypot(spread["ren"], of_fit))
+            table[name] = _against_data(replace(row, of_fit=of_fit), survival, spread)
     return table
 
 
@@ -366,14 +376,21 @@ def subtracted(
         }
         if "data" not in kept:
             continue
-        if name in table and (of_fit := table[name].of_fit) and "ren" in kept:
-            survival, error = kept["ren"]
-            kept["ren"] = survival, float(np.hypot(error, of_fit))
+        spread = None
+        if name in table and (plain := table[name].difference_std) is not None:
+            # the subtraction adds the sampling of events below the line
+            own = table[name].survival_std or {}
+            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in kept.items()}
+            spread = {
+                m: float(np.sqrt(std**2 + more[m] + more["data"]))
+                for m, std in plain.items()
+                if m in kept
+            }
         row = SurvivalRow(
             {method: one.peak for method, one in methods.items()},
             {method: one.undefined for method, one in methods.items()},
         )
-        found[name] = _against_data(row, kept)
+        found[name] = _against_data(row, kept, spread)
     return found
 
 
@@ -389,12 +406,49 @@ def _of_fit(dep: Values, other: Values) -> float:
     return float(np.sqrt((0.25 * (kept[:, 0] - kept[:, 1]) ** 2).sum()))
 
 
-def _against_data(row: SurvivalRow, found: Mapping[str, Spread]) -> SurvivalRow:
+def null_spread(
+    dep: tuple[Values, Values], other: tuple[Values, Values], rng: np.random.Generator
+) -> float:
+    """Standard deviation in percent of the difference of two survivals without a difference.
+
+    Few events set a cut, below which those of other peaks are dense: errors of a survival grow
+    with it, and two of them in quadrature are too large for most differences, and too small for
+    some.  So the events of both sets together, in units of their medians, are divided anew, at
+    random.
+
+    Parameters
+    ----------
+    dep, other
+        A/E of the double-escape peak and of the other one, of both sets.
+    rng
+        Random generator.
+    """
+    sets = [[v[np.isfinite(v)] for v in both] for both in (dep, other)]
+    if min(v.size for v in sets[0]) < MIN_EVENTS or not all(v.size for v in sets[1]):
+        return float("nan")
+    unit = [np.median(v) for v in sets[0]]
+    pooled = [np.concatenate([v / u for v, u in zip(both, unit, strict=True)]) for both in sets]
+    sizes = [both[0].size for both in sets]
+    found = np.empty((NULLS, 2))
+    for kept in found:
+        drawn = [np.split(rng.permutation(v), [n]) for v, n in zip(pooled, sizes, strict=True)]
+        for side, (single, some) in enumerate(zip(*drawn, strict=True)):
+            cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
+            kept[side] = 100 * (some >= cut).mean()
+    return float(np.diff(found, axis=1).std(ddof=1))
+
+
+def _against_data(
+    row: SurvivalRow, found: Mapping[str, Spread], spread: Mapping[str, float] | None = None
+) -> SurvivalRow:
+    """Differences from the data, with errors as given or those of both in quadrature."""
     (data, data_std), difference, std, sigma = found["data"], {}, {}, {}
     for method, (survival, error) in found.items():
         if method != "data":
             difference[method] = survival - data
             std[method] = float(np.hypot(error, data_std))
+            if spread is not None:
+                std[method] = spread[method]
             sigma[method] = difference[method] / std[method]
     return replace(
         row,

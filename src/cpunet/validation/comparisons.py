@@ -560,22 +560,23 @@ def two_sample_test(a: Values, b: Values, moved: Values | None = None) -> Tested
     return Tested(size, known.size, float(chi2.sf(size, known.size)))
 
 
-def shift(
-    a: Values, b: Values, axis: hist.axis.Regular, moved: Values | None = None
-) -> tuple[float, float]:
-    """Mean of `b` minus that of `a` within a range, and its error with those of a fit.
+def shift(a: Values, b: Values, moved: Values | None = None) -> tuple[float, float]:
+    """Mean of `b` minus that of `a`, and its error with those of a fit.
 
-    Values beyond the range count as its ends, so that few outliers do not decide.
+    Values beyond the ranges of both (`data_axis`) count as their ends, so that few outliers
+    do not decide.
     """
-    low, high = float(axis.edges[0]), float(axis.edges[-1])
-    one, other = (_finite(values).clip(low, high) for values in (a, b))
+    one, other = _finite(a), _finite(b)
     if min(len(one), len(other)) < 2:
         return np.nan, np.nan
+    ends = np.array([data_axis(values, 1).edges for values in (one, other)])
+    low, high = ends.min(), ends.max()
+    one, other = one.clip(low, high), other.clip(low, high)
     variance = sum(values.var(ddof=1) / len(values) for values in (one, other))
     if moved is not None:
         known = np.isfinite(moved).all(axis=(0, 1))
-        ends = moved[:, :, known].clip(low, high).mean(axis=2)
-        variance += (0.25 * (ends[:, 0] - ends[:, 1]) ** 2).sum()
+        means = moved[:, :, known].clip(low, high).mean(axis=2)
+        variance += (0.25 * (means[:, 0] - means[:, 1]) ** 2).sum()
     return float(other.mean() - one.mean()), float(np.sqrt(variance))
 
 
@@ -617,7 +618,8 @@ def compare(
             mean and spread of the distances of two samples of the data's own distribution,
             at the sizes of the data and of the largest of the simulated datasets.
         ``mean``, ``shift``, ``shift_std``
-            mean of the data within the bins; that of a method minus it, and its error.
+            mean of the data within the bins; that of a method minus that of the data, and its
+            error.
         ``chi_square``, ``degrees``, ``p``
             by method, see `two_sample_test`.
         ``missing``
@@ -648,8 +650,7 @@ def compare(
             one["iou"][method] = np.nan if axis is None else iou(*both, axis)
             one["iou_std"][method] = np.nan if axis is None else iou_error(*both, axis, draws)
             ends = moved.get(method, {}).get(name)
-            off = (np.nan, np.nan) if axis is None else shift(*both, axis, ends)
-            one["shift"][method], one["shift_std"][method] = off
+            one["shift"][method], one["shift_std"][method] = shift(*both, ends)
             tested = two_sample_test(*both, ends)
             one["chi_square"][method], one["degrees"][method], one["p"][method] = tested
     return found

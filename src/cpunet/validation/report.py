@@ -44,11 +44,15 @@ REPORT = FolderKind(
 # methods of the printed table, in the order of the page; those without noise are in the metrics
 _METHODS = ("raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
 _NAMES = {
+    "raw": "simulation",
+    "truth": "true resp.",
+    "rc": "RC",
+    "gauss_exp": "Gauss ⊗ exp",
     "ren": "REN",
     "current_amplitude": "I_max",
     "drift_time": "T_drift",
     "tail_slope": "tail slope",
-    "rc_late": "rc+late",
+    "rc_late": "RC + late",
     "ceiling": "data vs data",
 }
 _SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table

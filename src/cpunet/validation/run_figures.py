@@ -110,7 +110,7 @@ def cycle_figure(pulses: Mapping[str, FloatArray], dt_ns: float) -> Figure:
     for axes, (title, windows) in zip(grid, pulses.items(), strict=True):
         axes.plot(np.arange(windows.shape[1]) * dt_ns * 1e-3, windows.T, linewidth=0.8)
         axes.set(title=title, xlabel="Time [µs]")
-    grid[0].set_ylabel("Pulse height [normalised]")
+    grid[0].set_ylabel("Normalised charge")
     return figure
 
 
