@@ -324,7 +324,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
 
 
 PEAKS = ("FEP", "SEP", "DEP")
-BASELINE_METHODS = ("rc", "gauss_exp", "superpulse")
+BASELINE_METHODS = ("rc", "rc_late", "gauss_exp", "superpulse")
 
 
 @pytest.fixture(scope="module")

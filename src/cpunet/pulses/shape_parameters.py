@@ -76,6 +76,7 @@ def all_parameters(
     scores: ScoreConfig,
     *,
     amplitudes: Values | None = None,
+    decay_ns: float | None = None,
 ) -> dict[str, Values]:
     """All parameters of `SHAPE_PARAMETERS`, each an array with one value per pulse.
 
@@ -89,6 +90,9 @@ def all_parameters(
         Score settings, with the fraction of the maximum at which the drift time begins.
     amplitudes
         Current amplitudes of the pulses, if they are known; else they are computed.
+    decay_ns
+        Decay that LEGEND's parameters are corrected for; by default the median one of these
+        pulses.
 
     Returns
     -------
@@ -135,10 +139,8 @@ def all_parameters(
             }
         for name, column in found.items():
             values[name][rows] = np.where(np.isfinite(column), column, np.nan)
-    slope = (
-        np.nanmedian(values["tail_slope"]) if np.isfinite(values["tail_slope"]).any() else 0.0
-    )
-    decay_ns = -1e6 / slope if slope < 0 else np.inf
+    if decay_ns is None:
+        decay_ns = median_decay_ns(values["tail_slope"])
     for rows in blocks(len(pulses), BLOCK):
         good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
         block, noise = pulses.waveforms[good], values["baseline_rms"][good]
@@ -146,6 +148,13 @@ def all_parameters(
         for name, column in legend_parameters(block, *how).items():
             values[name][good] = column
     return values
+
+
+def median_decay_ns(slopes: Values) -> float:
+    """Time constant of the median tail slope (1/ms); infinite if it does not fall."""
+    known = slopes[np.isfinite(slopes)]
+    slope = float(np.median(known)) if known.size else 0.0
+    return -1e6 / slope if slope < 0 else np.inf
 
 
 def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:

@@ -17,8 +17,10 @@ from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
+from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import REN
@@ -126,7 +128,8 @@ def evaluate(
             bar.update(1)
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         scales = _dep_scales(sets, seed)
-        work = partial(score_peak, recipe=recipe, seed=seed, scales=scales)
+        decays = _decays_ns(translations)
+        work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
         scored = pool.map(work, sets, moved.values())
         for peak, (found, peaks[peak.name]) in zip(sets, scored, strict=True):
             if found:
@@ -183,6 +186,16 @@ def evaluate(
         "table": verdict_table(stored),
     }
     return Evaluation(run, sets, values, slices, ae_energy, stored)
+
+
+def _decays_ns(translations: Translations) -> dict[str, float]:
+    """Decay of all pulses of each method, as an analysis has one for a channel."""
+    dt_ns = translations.ren.dt_ns
+    samples = translations.ren.recipe.preparation.at(dt_ns).decay_fit_samples
+    return {
+        method: median_decay_ns(tail_slope(windows, dt_ns, samples))
+        for method, windows in translations.windows.items()
+    }
 
 
 def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:

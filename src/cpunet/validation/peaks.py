@@ -124,6 +124,7 @@ def score_peak(
     recipe: Recipe,
     seed: int,
     scales: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    decays_ns: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[ByMethod, PeakScores]:
     """Compare the pulses of a peak, method by method.
 
@@ -140,6 +141,8 @@ def score_peak(
         Seed of bootstraps and folds.
     scales
         A/E of the single-site peak in the double-escape peak and its error, by method.
+    decays_ns
+        Decay of all pulses of a method, for which LEGEND's parameters are corrected.
 
     Returns
     -------
@@ -158,6 +161,7 @@ def score_peak(
             recipe.preparation,
             recipe.scores,
             amplitudes=peak.translations.amplitudes[method][rows],
+            decay_ns=decays_ns.get(method),
         )
         for method, rows in peak.rows.items()
     }
