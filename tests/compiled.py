@@ -17,7 +17,8 @@ ROOT = Path(__file__).parents[1]
 # What other packages compile when it is imported or first called, a minute in all; half in each
 # process.  Two processes that compile the same may each be given the other's code, and crash.
 OTHERS = (
-    "import lh5.compression.radware, dspeed.processors.moving_windows",
+    "import lh5.compression.radware, dspeed.processors.moving_windows, "
+    "dspeed.processors.pole_zero, dspeed.processors.trap_filters",
     """
 import dspeed.processors.min_max, dspeed.processors.time_point_thresh
 import dspeed.processors.upsampler, lh5.compression.varlen

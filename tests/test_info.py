@@ -85,7 +85,7 @@ def test_a_run_folder(tmp_path):
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
     assert load(tmp_path).summary() == info(tmp_path).lines
-    assert lines["pile-up tails"] == "none that are certain"
+    assert lines["pile-up tails"] == "none significant"
 
 
 def test_every_table_of_a_file(tmp_path):

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import re
 import shutil
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import cpunet
 from cpunet import demo
@@ -21,6 +24,7 @@ from cpunet.pulses import baselines, loading
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from cpunet.translation.translator import NOISE_ROWS
 from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {
@@ -174,6 +178,45 @@ def test_histogram_of_translated_pulses(home, run):
         made.hist("drift")
 
 
+def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
+    made = run.translate(home / "sim.lh5", noise=False)
+    axes = made.plot()
+    assert axes.figure is pyplot.gcf()
+    assert made.hist("drift_time", bins=50).plot(ax=axes) is axes
+    assert len(made.hist("drift_time", bins=50).values()) == 50
+    counted = made.hist("drift_time").plot(color="red")
+    assert counted.figure is pyplot.gcf()
+    assert counted is not axes
+    pyplot.close("all")
+    with pytest.raises(cpunet.CpunetError, match="`bins` is 0"):
+        made.hist(bins=0)
+
+
+def test_a_seed_gives_the_same_pulses_in_each_way(home, run):
+    """Of more pulses than have a common seed of the noise."""
+    sim = cpunet.open_pulses(home / "sim.lh5").read()
+    sim = Pulses.concatenate([sim[sim.energy_kev > 0]] * 4)
+    assert len(sim) > 2 * NOISE_ROWS
+    of_run, of_ren = run.translate(sim, seed=5).waveforms, run.ren(sim, seed=5)
+    assert np.array_equal(of_run, of_ren)
+    given = run.ren(sim.waveforms, energy_kev=sim.energy_kev, seed=5)
+    assert np.array_equal(given, of_ren)
+
+
+def test_covariances_have_names(run):
+    covariance = run.covariance
+    assert list(covariance) == list(covariance.index) == list(run.fit.errors)
+    errors = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(errors, list(run.fit.errors.values()))
+
+
+def test_runs_are_compared_by_their_readouts(run):
+    values = cpunet.compare(run, run).values
+    assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
+    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
+        cpunet.compare(run, run.folder)
+
+
 def test_raw_traces(home, run):
     made = run.translate(home / "sim.lh5", adc=True)
     assert made.adc
@@ -243,14 +286,35 @@ def test_a_recipe_and_settings_are_not_both_given():
         load_recipe(recipe, {"training.steps": 1})
 
 
+NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-\d+)?")
+
+
+def require_alike(printed: str, shown: str) -> None:
+    """The same words; numbers as near as those of another processor."""
+    words = [
+        " ".join(re.sub(r"[+-]?#", "#", NUMBER.sub("#", t)).split()) for t in (printed, shown)
+    ]
+    assert words[0] == words[1]
+    numbers = [[float(n) for n in NUMBER.findall(text)] for text in (printed, shown)]
+    np.testing.assert_allclose(*numbers, rtol=0.05, atol=0.02)
+
+
 @pytest.mark.slow
 def test_the_page_runs_on_a_stand(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    cpunet.make_stand("stand", seed=1, events="FEP=400,SEP=80,DEP=80")
+    cpunet.make_stand("stand", seed=1, events="FEP=2000,SEP=400,DEP=400")
     page = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text()
     names: dict[str, object] = {}
-    for code in re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
-        exec(compile(code, "python.md", "exec"), names)
+    blocks = re.findall(r"^```(python|text)\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    printed = ""
+    for kind, text in blocks:
+        if kind == "text":
+            require_alike(printed, text)
+            continue
+        out = io.StringIO()
+        with redirect_stdout(out):
+            exec(compile(text, "python.md", "exec"), names)
+        printed = out.getvalue()
     assert Path("report/report.html").is_file()
     assert names["calibrated"].physics is not None
 
@@ -295,7 +359,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     assert report.folder is None
     assert report.scores.loc["FEP", "drift_time", "ren"].iou > 0
     assert report["FEP"].loc["drift_time", "ren"].ceiling > 0
-    assert report.plot().axes
+    assert report.plot().get_title() == "FEP"
     assert "FEP" in report.to_dict()["peaks"]
     report.save(tmp_path / "report")
     again = cpunet.load(tmp_path / "report")
@@ -306,7 +370,7 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
 
 
 PEAKS = ("FEP", "SEP", "DEP")
-BASELINE_METHODS = ("rc", "gauss_exp", "superpulse")
+BASELINE_METHODS = ("rc", "rc_late", "gauss_exp", "superpulse")
 
 
 @pytest.fixture(scope="module")

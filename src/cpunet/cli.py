@@ -47,7 +47,7 @@ COMMANDS = {
     "export onnx": "Export the deterministic part of a run as ONNX.",
     "import": "Make a run of the weights that the authors published.",
     "info": "Say what is in a file, detector, run or report.",
-    "response": "Say in terms of physics what readout was learned, beside the truth if it is "
+    "response": "Say in terms of physics what readout was learned, with the truth if it is "
     "known.",
     "library make": "Simulate the charge pulse of every place in a detector.",
     "library translate": "Translate a library of charge pulses with a trained run, without "
@@ -59,7 +59,7 @@ COMMANDS = {
     "files.",
     "calibrate": "Calibrate the detector and its electronics together.",
     "validate": "Score a run per peak and write a report.",
-    "compare": "Put the scores of several validations beside each other.",
+    "compare": "Compare the scores of several validations.",
 }
 FUNCTIONS = {
     "import": "import_weights",

@@ -10,7 +10,7 @@ from cpunet.outputs import refuse_existing
 
 EVENTS, FEW = "FEP=2500,SEP=1000,DEP=1000", "FEP=1000,SEP=250,DEP=250"
 COARSE = ("step_ns=2",)  # of the drift, in a quick look: half the time
-GLANCE = ("SEP mean pulse", "SEP current_amplitude", "SEP single pulse")
+GLANCE = ("SEP mean pulse", "SEP current amplitude", "SEP single pulse")
 QUICK_LOOK = (
     "This is a quick look: with so few events the response is not well learned, and scores "
     "scatter by several points. The whole demonstration has more events and all figures."

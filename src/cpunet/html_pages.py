@@ -72,14 +72,20 @@ def joined(parts: Iterable[str]) -> Markup:
     return Markup("\n").join(parts)
 
 
-def figure_html(caption: str, figure: Figure, file: Path | None = None) -> Markup:
-    """Return a figure with its caption, as SVG, and write it to a file of its own."""
+def figure_html(
+    caption: str, figure: Figure, file: Path | None = None, shows: str = ""
+) -> Markup:
+    """Return a figure with its caption, as SVG, and write it to a file of its own.
+
+    `shows` says what it shows to who cannot see it.
+    """
     svg = figure_svg(figure, salt=caption)
     width, height = figure.get_size_inches()
     if file is not None:
         size = f'width="{width:g}in" height="{height:g}in"'
         file.write_text(svg.replace("<svg", f"<svg {_ALONE} {size}", 1), encoding="utf-8")
-    return part("figure", caption, Markup(svg), width, width >= WIDE * height)
+    alt = f"{caption}: {shows}" if shows else caption
+    return part("figure", caption, Markup(svg), width, width >= WIDE * height, alt)
 
 
 def notebook_picture(figure: Figure) -> Markup:

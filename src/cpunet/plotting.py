@@ -25,11 +25,12 @@ COLOURS = {
     "truth": "#009E73",
     # fixed, so that a method has one colour in all figures of a page
     "rc": "#E69F00",
+    "rc_late": "#8C6D1F",
     "gauss_exp": "#56B4E9",
-    "superpulse": "#7F7F7F",
+    "superpulse": "#5B3A8C",
 }
-SPARE_COLOURS = ("#8C6D1F", "#5B3A8C", "#9E2A2B", "#4F6D7A", "#B8A200")
-DATA_FILL = "0.80"
+SPARE_COLOURS = ("#3D7A3D", "#9E2A2B", "#4F6D7A", "#B8A200")
+DATA_FILL = "0.88"
 
 GROUP = "method-"  # begins the group id of what a figure draws of a method
 
@@ -40,9 +41,10 @@ LABELS = {
     "iren": "IREN translation",
     "truth": "True response",
     "rc": "RC",
+    "rc_late": "RC + late charge",
     "gauss_exp": "Gaussian ⊗ exponential",
     "superpulse": "Superpulse ratio",
-    "ceiling": "Ceiling",
+    "ceiling": "Data vs data",
 }
 
 # two panels above each other, the lower one smaller
@@ -80,9 +82,9 @@ def styled(make_figure: Callable[P, R]) -> Callable[P, R]:
 
 
 def line(axes: Axes, x: Any, y: Any, method: str, text: str | None = None) -> None:
-    """Draw a line of a method; that of the data is broad and grey, to show below others."""
-    colour, width = ("0.65", 4.0) if method == "data" else (COLOURS[method], None)
-    axes.plot(x, y, label=text, color=colour, linewidth=width, gid=GROUP + method)
+    """Draw a line of a method; that of the data is broad, to show below others."""
+    width = 3.0 if method == "data" else None
+    axes.plot(x, y, label=text, color=COLOURS[method], linewidth=width, gid=GROUP + method)
 
 
 def group(drawn: Container, method: str) -> None:
@@ -99,6 +101,16 @@ def panels(
 
     figure = Figure(figsize=size)
     return figure, figure.subplots(rows, columns, squeeze=False, **how)
+
+
+def own_axes(ax: Axes | None) -> Axes:
+    """The axes that a user gives, or those of a new figure of pyplot, for its `savefig`."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    new: Axes = pyplot.subplots()[1]
+    return new
 
 
 def legend_above(

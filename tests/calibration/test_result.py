@@ -90,7 +90,7 @@ def test_what_cannot_be_is_no_finding(values, name, why):
     )
     assert not any("no other physics are needed" in note for note in told["notes"])
     comment = doubts(free_parameters(one))
-    assert comment.startswith(f"# {name}: no finding, makes up for something else")
+    assert comment.startswith(f"# {name}: unreliable value, makes up for something else")
     assert comment.count("\n") == 1
 
 

@@ -126,7 +126,7 @@ MISTAKES = {
         r"other.lh5: .*amplitudes and energies do not go together.*",
     ),
     "traces go down": Mistake(
-        f"{TRAIN} --data down.lh5", r"down.lh5: .*polarity is negative; turn them round.*"
+        f"{TRAIN} --data down.lh5", r"down.lh5: .*polarity is negative; invert them.*"
     ),
     "too few pulses": Mistake(
         f"{TRAIN} --data few.lh5",

@@ -229,7 +229,7 @@ def test_traces_are_turned_round_and_unwrapped_as_advised(command, home, stand, 
     monkeypatch.chdir(home)
     waves, kev = stand.data_waveforms, stand.data_kev
     for name, traces, advice in (
-        ("down", 60_000 - waves, r"turn them round, as by pulses\.with_waveforms\(-pulses"),
+        ("down", 60_000 - waves, r"invert them, as by pulses\.with_waveforms\(-pulses"),
         ("rolled", waves.view(np.int16), r"values\.view\('uint16'\).*, period=65536"),
     ):
         stand.write(home / f"{name}.lh5", "geds/raw", traces, kev)

@@ -14,6 +14,7 @@ from cpunet.electronics.fitted_kernels import (
     BASELINE_METHODS,
     LEAD_NS,
     GaussExp,
+    RCLate,
     SuperpulseKernel,
     crossing,
 )
@@ -208,3 +209,16 @@ def test_bad_input_is_named(sim) -> None:
             method.fit(sim[:7], sim, DT_NS, ALIGN)
     with pytest.raises(CpunetError, match="check their polarity"):
         RC.fit(sim, -sim, DT_NS, ALIGN)
+
+
+def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
+    time = np.arange(0, 6000, FINE_NS)
+    kernel = np.convolve(
+        np.exp(-time / 60) / 60,
+        0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500,
+    )[: len(time)]
+    data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
+    found = RCLate.fit(sim, data, DT_NS, ALIGN)
+    assert found.tau_ns == pytest.approx(60, rel=0.1)
+    assert found.late_share == pytest.approx(0.07, abs=0.015)
+    assert found.late_ns == pytest.approx(500, rel=0.35)

@@ -69,6 +69,7 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
         "aoemeanmod.yaml",
         "aoeresmod.yaml",
         "cpunet.yaml",
+        "response.yaml",
     }
     electronics = read(out / "elecmod.yaml")["V01"]
     assert set(electronics) == {"sigma", "tau"}
@@ -90,7 +91,25 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     # without a report, what is known of A/E is nothing; old files of the kind go
     told = export_legend(chain, out, force=True)
     assert told.detector == "default"
-    assert sorted(p.name for p in out.glob("*.yaml")) == ["cpunet.yaml", "elecmod.yaml"]
+    assert sorted(p.name for p in out.glob("*.yaml")) == [
+        "cpunet.yaml",
+        "elecmod.yaml",
+        "response.yaml",
+    ]
+    numbers = read(out / "response.yaml")["default"]["numbers"]
+    head, line = (out / "response.csv").read_text().splitlines()
+    row = dict(zip(head.split(","), line.split(","), strict=True))
+    assert float(row["rise_10_90_ns"]) == numbers["rise_10_90_ns"]["value"]
+
+
+def test_a_width_without_noise_is_not_exported(chain, tmp_path, caplog) -> None:
+    silent = METHOD | {"resolution": LAW | {"b": 0.0}}
+    found = {"multi_site": True, "methods": {"data": silent, "ren": METHOD}}
+    given = report(tmp_path / "report", ae_energy=found)
+    export_legend(chain, tmp_path / "pars", report=given)
+    assert not (tmp_path / "pars" / "aoeresmod.yaml").exists()
+    assert (tmp_path / "pars" / "aoemeanmod.yaml").exists()
+    assert any("b = 0" in note for note in caplog.messages)
 
 
 @pytest.mark.parametrize(

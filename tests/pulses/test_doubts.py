@@ -53,7 +53,7 @@ def test_the_polarity_is_the_reason_and_not_the_energies(tmp_path):
     assert go_down(traces(energies, sign=-1).astype(np.float32))
     assert not go_down(traces(energies).astype(np.float32))
     file = written(tmp_path / "down.lh5", traces(energies, sign=-1), energies)
-    with pytest.raises(CpunetError, match="polarity is negative; turn them round"):
+    with pytest.raises(CpunetError, match="polarity is negative; invert them"):
         load_pulses(file, "measured", RECIPE, FEP)
 
 

@@ -139,7 +139,7 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
 
 def test_data_without_tails_are_given_none(run: Run) -> None:
     assert run.fit.tails.rate_khz == 0
-    assert dict(run.summary())["pile-up tails"] == "none that are certain"
+    assert dict(run.summary())["pile-up tails"] == "none significant"
     tails = REN.load(run.folder).tails
     assert tails is not None
     assert tails.law.rate_khz == 0

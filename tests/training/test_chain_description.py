@@ -201,8 +201,10 @@ def test_a_folder_with_numbers_and_figure(run, tmp_path):
     told = response(run, truth=electronics(), out=out)
     assert {file.name for file in out.iterdir()} == {
         ".cpunet.json",
+        "response.csv",
         "response.json",
         "response.png",
+        "response.yaml",
     }
     stored = json.loads((out / "response.json").read_text())
     assert stored["runs"][0]["recipe"] == "fast"
@@ -296,7 +298,7 @@ def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, capsys):
         assert text in printed
     line = next(line for line in printed.splitlines() if "bandwidth pole 1" in line)
     assert line.split()[:9] == ["bandwidth", "pole", "1", "[ns]", "55", *["60"] * 4]
-    assert "slow share of the charge [%]" in printed
+    assert "late charge [%]" in printed
     assert "…" not in printed
 
 

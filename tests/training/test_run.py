@@ -143,11 +143,13 @@ def test_who_uses_a_run_whose_own_verdict_is_bad_is_told(run, caplog):
     checks = {"chi_square": 9.0, "amplitude": 1.0, "z": 40.0, "z_ns": 64.0}
     checks |= {"beyond_ns": [32.0, 640.0], "off": {"top": 40.0}, "pulses": [900, 900]}
     (run / "run.json").write_text(facts(fit={"checks": checks}), encoding="utf-8")
-    assert used_run(run).fit.checks.z == 40.0
+    used = used_run(run)
+    assert not used.ok
+    assert "a bad fit" in repr(used)
     (warning,) = caplog.messages
-    assert warning.startswith(f"{run}: its own verdict is bad: the mean pulse is off by 40.0")
+    assert warning.startswith(f"{run}: the fit of this run is bad: the top is off by 40.0")
     assert "charges that are trapped" in warning
     good = checks | {"chi_square": 1.0, "z": 2.0, "beyond_ns": [], "off": {}}
     (run / "run.json").write_text(facts(fit={"checks": good}), encoding="utf-8")
-    used_run(run)
+    assert used_run(run).ok
     assert len(caplog.messages) == 1

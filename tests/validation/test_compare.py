@@ -10,11 +10,14 @@ from typing import Any
 from urllib.parse import unquote
 
 import pytest
+from scipy.stats import norm
 
 from cpunet.cli import run
 from cpunet.errors import CpunetError
 from cpunet.validation.compare import Comparison, compare
 from cpunet.validation.report import Report
+
+NAMES = ("drift_time", "current_amplitude", "tail_slope", "rise_time")
 
 
 def scores(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, Any]:
@@ -137,11 +140,12 @@ def test_the_page_is_whole_and_alone(tmp_path):
 def metrics(*ious: float) -> dict[str, Any]:
     """Scores of as many parameters as there are IoU; their ceiling is 88 ± 2."""
     parameters = {
-        f"parameter_{i}": {
+        name: {
             "iou": {"ren": iou, "ceiling": 88.0},
             "iou_std": {"ren": 2.5, "ceiling": 2.0},
+            "p": {"ren": float(2 * norm.sf((88.0 - iou) / 1.0))},
         }
-        for i, iou in enumerate(ious)
+        for name, iou in zip(NAMES, ious, strict=False)
     }
     tested = {"ren": {"auc": 0.51, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}}
     return {
@@ -164,16 +168,16 @@ def page_of(folder: Path, runs: dict[str, tuple[float, ...]], **more: Any) -> st
 
 
 def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
-    # three of four IoU lie more than two of the ceiling's sigmas below it, the AUC does not
+    # three of four lie beyond three sigma, the AUC does not
     runs = {
-        "V01/p03": (87.0, 83.9, 70.0, 60.0),
-        "V01/p04": (87.0, 84.1),
+        "V01/p03": (87.0, 84.0, 70.0, 60.0),
+        "V01/p04": (87.0, 85.5),
         "B 2#?<&/p04": (50.0,),
     }
     page = page_of(tmp_path, runs)
     assert '<td class="off">3 of 5 off</td>' in page
     assert "<td>0 of 3 off</td>" in page
-    assert "off by 19.0 sigma (IoU 50.0 of 88.0)" in page
+    assert "drift time off by 37.1 sigma (p &lt; 1e-12)" in page
     assert "trained: recipe fast on FEP" in page
     links = re.findall(r'href="([^#].*?)"', page)
     targets = {(tmp_path / "pages" / unquote(link)).resolve() for link in links}

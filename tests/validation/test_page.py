@@ -120,7 +120,7 @@ def test_page_shows_scores_counts_and_provenance(report):
     for text in (
         "SEP: 200 simulated, 200 measured pulses",
         '<th scope="col">IoU [%]</th>',
-        ">Ceiling</td>",
+        ">Data vs data</td>",
         "Drift time",
         "<td>REN translation</td><td>250</td><td>–</td>",
         "<td>data: saturated</td><td>3</td>",
@@ -140,16 +140,17 @@ def test_a_page_begins_with_what_was_compared_and_a_picture(tmp_path):
     places = [
         html.index(text)
         for text in (
+            "The fit is chi-square is 1.1",
+            'aria-label="SEP mean pulse: ',
             "my &lt;sim&gt;.lh5",
-            'aria-label="SEP mean pulse"',
             'id="scores"',
-            'aria-label="A over E survival"',
-            'aria-label="SEP noise"',
-            'aria-label="FEP mean pulse"',
+            'aria-label="A over E survival: ',
+            'aria-label="SEP noise: ',
+            'aria-label="FEP mean pulse: ',
         )
     ]
     assert places == sorted(places)
-    assert all(html.count(f'aria-label="{name}"') == 1 for name in names)
+    assert all(html.count(f'aria-label="{name}: ') == 1 for name in names)
 
 
 def test_the_same_report_gives_the_same_bytes(report, tmp_path_factory):
@@ -184,13 +185,44 @@ def test_distances_have_errors_and_what_chance_leaves(tmp_path):
 
 
 def test_verdicts_in_words(tmp_path):
-    one = {"SEP": {"ren": {"drift_time": {"sigma": 3.14, "words": "off by 3.1 sigma"}}}}
+    off = {"p": 0.0017, "sigma": 3.14, "words": "off by 3.1 sigma", "numbers": "+12 ± 4 ns"}
+    one = {"SEP": {"ren": {"drift_time": off}}}
     verdicts = {"summary": ["REN, SEP: <all> agree"], "table": one}
     write_report(tmp_path, {"verdicts": verdicts}, {}, [])
     html = (tmp_path / "report.html").read_text()
     assert "<li>REN, SEP: &lt;all&gt; agree</li>" in html
-    row = r"<td>SEP</td><td[^>]*>REN translation</td><td[^>]*>drift time</td><td>\+3\.1</td>"
-    assert re.search(row, html)
+    row = r"<td>SEP</td><td[^>]*>REN translation</td><td[^>]*>drift time</td>"
+    assert re.search(row + r"<td>\+12 ± 4 ns</td><td>0\.0017</td>", html)
+
+
+def test_nothing_is_empty_and_the_verdict_comes_first(tmp_path):
+    parameters = {
+        name: {
+            "iou": {"ren": 80.0, "ceiling": 85.0},
+            "iou_std": {"ren": 2.0, "ceiling": 1.5},
+            "mean": 300.0,
+            "shift": {"ren": 12.0},
+            "shift_std": {"ren": 4.0},
+            "p": {"ren": 1e-5},
+        }
+        for name in ("tail_slope", "rise_time")
+    }
+    found = {"training": {"peak": "FEP"}, "peaks": {"SEP": {"further": parameters}}}
+    found["peaks"]["SEP"]["parameters"] = {"tail_slope": parameters["tail_slope"]}
+    for peak in found["peaks"].values():
+        for one in (*peak["parameters"].values(), *peak["further"].values()):
+            one |= {"wasserstein": {}, "wasserstein_null": 1.0, "wasserstein_null_std": 0.1}
+            one |= {"ks_null": 0.1, "ks_null_std": 0.1}
+    write_report(tmp_path, found, {}, [])
+    html = (tmp_path / "report.html").read_text()
+    headline = "REN is off in 2 of 2 quantities of SEP; the least likely has p = 1e-05."
+    places = [html.index(text) for text in (headline, 'table class="main"', 'id="scores"')]
+    assert places == sorted(places)
+    assert '<td data-name="REN − data">+12.0 ± 4.0</td><td data-name="p">1e-05</td>' in html
+    for name in ("shapes", "noise", "pulses"):
+        assert f'id="{name}"' not in html
+        assert f'href="#{name}"' not in html
+    assert not re.search(r"</h[23]>\s*(</section>|<h2)", html)
 
 
 def test_survival_by_ranges_and_the_noise_are_tables(tmp_path):
@@ -212,7 +244,8 @@ def test_no_peak_of_a_combined_training_is_shown_first(tmp_path):
     found = {"training": {"peak": "FEP,1000-1580"}}
     write_report(tmp_path, found, {name: figure() for name in names}, [])
     html = (tmp_path / "report.html").read_text()
-    first = re.findall(r'<figure [^>]*aria-label="([^"]*)"', html[: html.index('id="scores"')])
+    drawn = html[: html.index('id="scores"')]
+    first = re.findall(r'role="img" aria-label="([^":]*)', drawn)
     assert first == ["SEP mean pulse", "DEP mean pulse"]
 
 

@@ -158,7 +158,7 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
     assert rows.tolist() == peak.rows["raw"].tolist()
     each = [translations.without_noise(row) for row in rows]
     windows = {method: np.concatenate([one[method] for one in each]) for method in each[0]}
-    assert set(windows) == {"raw", "rc", "gauss_exp", "superpulse", "ren", "truth"}
+    assert set(windows) == {"raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth"}
     scores = peak.paired_scores()
     squares = pair_squares(windows, windows["truth"], found.run.recipe.scores.edge_samples)
     for method, score in scores.items():
@@ -169,7 +169,16 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
 def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     peak = found.sets[0]
     pulses = {method: peak.windows(method) for method in peak.rows}
-    assert list(pulses) == ["data", "raw", "rc", "gauss_exp", "superpulse", "ren", "truth"]
+    assert list(pulses) == [
+        "data",
+        "raw",
+        "rc",
+        "rc_late",
+        "gauss_exp",
+        "superpulse",
+        "ren",
+        "truth",
+    ]
     raw = peak.rows["raw"]
     assert all(len(p) == len(raw) for m, p in pulses.items() if m != "data")
     again = peak.translations.ren.apply(
@@ -216,7 +225,10 @@ def test_a_report(report):
     with pytest.raises(CpunetError, match="no scored peak '1500'; there are FEP, SEP, DEP"):
         report["1500"]
     lines = str(report).splitlines()
-    assert lines[1].split() == ["peak", "parameter", "raw", "REN", "ceiling"]
+    assert lines[0].startswith(("REN agrees with the data in all", "REN is off in"))
+    assert "REN − data" in lines[1]
+    head = next(line for line in lines if line.startswith("peak"))
+    assert head.split() == ["peak", "parameter", "simulation", "REN", "data", "vs", "data"]
     ren = f"{compared['iou']['ren']:.1f}"
     assert any(line.startswith("SEP") and "T_drift" in line and ren in line for line in lines)
     assert lines[-1] == str(report.folder / "report.html")
@@ -227,7 +239,12 @@ def test_a_report_again(report, tmp_path):
     for method in ("data", "raw", "ren"):
         one, other = (r.hist("FEP", "drift_time")[{"method": method}] for r in (report, again))
         assert np.array_equal(one.values(), other.values())
-    assert again.plot("SEP", "drift_time").axes
+    assert again.plot("SEP", "drift_time").get_title() == "SEP"
+    picture = again.figures["FEP mean pulse"]
+    assert picture._repr_svg_().startswith("<svg")
+    picture.savefig(tmp_path / "mean.svg")
+    with pytest.raises(CpunetError, match="has its figures as SVG"):
+        picture.savefig(tmp_path / "mean.pdf")
     assert again.scores.sort_index().equals(report.scores.sort_index())
     assert (again.folder / "FEP_mean_pulse.svg").is_file()
     with pytest.raises(CpunetError, match="is a report already; copy the folder"):

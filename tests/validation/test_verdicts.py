@@ -1,4 +1,4 @@
-"""Scores in plain words: what chance explains agrees, and what has no value says why."""
+"""p-values and words: what statistics explain agrees, and what has no value says why."""
 
 from __future__ import annotations
 
@@ -8,35 +8,36 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import kstest, norm
 
-from cpunet.validation.comparisons import compare
-from cpunet.validation.verdicts import summary, verdict, verdict_table
+from cpunet.validation.comparisons import compare, two_sample_test
+from cpunet.validation.verdicts import ALARM, Verdict, summary, verdict_table
 from synthetic import load_recipe
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 60})
 
 
-def one(iou: float, w1: float = 5.0) -> dict[str, Any]:
-    """A parameter with a ceiling of 85.9 ± 0.9 and a null of 5 ± 2."""
+def one(p: float, shift: float = 5.0) -> dict[str, Any]:
+    """A parameter whose mean differs by a shift ± 2."""
     return {
-        "iou": {"ren": iou, "ceiling": 85.9},
-        "iou_std": {"ren": 3.0, "ceiling": 0.9},
-        "wasserstein": {"ren": w1},
-        "wasserstein_null": 5.0,
-        "wasserstein_null_std": 2.0,
+        "iou": {"ren": 80.0, "ceiling": 85.9},
+        "mean": 500.0,
+        "shift": {"ren": shift},
+        "shift_std": {"ren": 2.0},
+        "p": {"ren": p},
     }
 
 
 def metrics() -> dict[str, Any]:
     auc = {"auc": 0.51, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}
-    survival = {"difference": {"ren": 1.0}, "difference_std": {"ren": 2.0}}
+    survival = {"difference": {"ren": -9.5}, "difference_std": {"ren": 5.0}}
     return {
         "peaks": {
             "SEP": {
                 "parameters": {
-                    "current_amplitude": one(86.5),
-                    "drift_time": one(83.1),
-                    "tail_slope": one(85.0),
+                    "current_amplitude": one(0.5),
+                    "drift_time": one(1e-4),
+                    "tail_slope": one(0.9),
                 },
                 "two_sample": {"ren": auc},
             },
@@ -46,31 +47,20 @@ def metrics() -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(
-    ("value", "worse", "sigma", "agrees"),
-    [
-        (83.0, "lower", 3.0, False),
-        (84.1, "lower", 1.9, True),
-        (88.1, "lower", -2.1, True),
-        (88.3, "higher", 2.3, False),
-        (83.0, "higher", -3.0, True),
-        (83.1, "both", -2.9, False),
-        (89.0, "both", 3.0, False),
-        (87.1, "both", 1.1, True),
-    ],
-)
-def test_only_the_worse_side_is_off(value, worse, sigma, agrees):
-    found = verdict(value, 86.0, 1.0, worse)
-    assert found.sigma == pytest.approx(sigma)
-    assert found.agrees is agrees
-    words = f"off by {abs(found.sigma):.1f} sigma"
-    assert found.words == ("agrees within errors" if agrees else words)
+@pytest.mark.parametrize("sigma", [0.5, 2.9, 3.1, 20.0, 60.0])
+def test_what_is_beyond_three_sigma_is_off(sigma):
+    found = Verdict(float(2 * norm.sf(sigma)))
+    if sigma < 37:
+        assert found.sigma == pytest.approx(sigma)
+    assert found.agrees is (sigma < 3)
+    assert found.words.startswith("agrees" if sigma < 3 else "off by ")
 
 
 def test_too_good_to_be_chance_asks_for_the_same_events():
-    found = verdict(99.0, 86.0, 2.0, "lower")
-    assert found.agrees
-    assert found.words == "closer than chance by 6.5 sigma: are the same events on both sides?"
+    words = Verdict(1 - 1e-6).words
+    assert words == "closer than statistics permit: are the same events on both sides?"
+    values = np.random.default_rng(1).normal(size=400)
+    assert Verdict(two_sample_test(values, values).p).words == words
 
 
 def test_the_table_holds_every_quantity_and_is_json():
@@ -78,27 +68,21 @@ def test_the_table_holds_every_quantity_and_is_json():
     assert json.loads(json.dumps(table, allow_nan=False)) == table
     assert table["DEP"] == {}
     sep = table["SEP"]["ren"]
-    assert list(table["SEP"]) == ["ren"]  # and no ceiling
-    assert list(sep) == [
-        "current_amplitude",
-        "current_amplitude_wasserstein",
-        "drift_time",
-        "drift_time_wasserstein",
-        "tail_slope",
-        "tail_slope_wasserstein",
-        "auc",
-        "ae_survival",
-    ]
-    assert sep["drift_time"]["sigma"] == pytest.approx(2.8 / 0.9)
-    assert sep["drift_time"]["words"] == "off by 3.1 sigma"
-    assert sep["auc"]["sigma"] == pytest.approx(0.5)
-    assert sep["ae_survival"] == {"sigma": 0.5, "words": "agrees within errors"}
+    assert list(table["SEP"]) == ["ren"]  # and not the data
+    names = ["current_amplitude", "drift_time", "tail_slope", "auc", "ae_survival"]
+    assert list(sep) == names
+    assert sep["drift_time"]["words"] == "off by 3.9 sigma"
+    assert sep["current_amplitude"]["numbers"] == "+1.00 ± 0.40 %"
+    assert sep["auc"]["p"] == pytest.approx(0.31, abs=0.01)
+    assert sep["ae_survival"]["p"] == pytest.approx(0.057, abs=0.001)
 
 
-def test_the_summary_says_what_agrees_and_what_is_off():
+def test_an_agreement_is_quoted_with_its_sensitivity():
     assert summary(metrics(), "SEP", "ren") == (
-        "REN, SEP: current amplitude, tail slope, classifier and A/E survival agree with the "
-        "data within errors; drift time off by 3.1 sigma (IoU 83.1 of 85.9)"
+        "REN, SEP: drift time off by 3.9 sigma (+5.0 ± 2.0 ns, p = 0.0001); agreement in "
+        "current amplitude (+1.00 ± 0.40 %, p = 0.5), tail slope (+5.0 ± 2.0 1/ms, p = 0.9), "
+        "classifier (AUC 0.510 ± 0.020, 0.50 expected, p = 0.31), A/E survival (-9.5 ± 5.0 "
+        "points, p = 0.057)"
     )
 
 
@@ -111,18 +95,14 @@ def noise_of(ratio: float, worst: float = 0.3) -> dict[str, Any]:
 def test_noise_that_differs_is_said():
     changed = metrics()
     sep = changed["peaks"]["SEP"]
+    for ratio in (1.11, 0.89):  # too little of it is as wrong
+        sep["noise"] = noise_of(ratio)
+        line = summary(changed, "SEP", "ren")
+        assert f"noise off by 4.3 sigma (RMS {ratio:.3f} ± 0.026 of the data's" in line
     sep["noise"] = noise_of(1.01)
-    assert "A/E survival and noise agree with the data" in summary(changed, "SEP", "ren")
-    sep["noise"] = noise_of(1.11)
-    assert "; noise off by 4.3 sigma (RMS 1.11 of the data's)" in summary(changed, "SEP", "ren")
-    found = verdict_table(changed)["SEP"]["ren"]
-    assert found["noise"]["sigma"] == pytest.approx(1.95 * 0.11 / 0.05)
-    assert found["noise_spectrum"] == {"sigma": 0.3, "words": "agrees within errors"}
-    sep["noise"] = noise_of(0.89)  # too little of it is as wrong
-    assert "noise off by 4.3 sigma (RMS 0.89" in summary(changed, "SEP", "ren")
+    assert "off" not in summary(changed, "SEP", "ren").partition("noise")[2]
     sep["noise"] = noise_of(1.01, worst=5.5)
-    words = "noise off by 5.5 sigma (worst band of its spectrum; RMS 1.01 of the data's)"
-    assert words in summary(changed, "SEP", "ren")
+    assert "noise spectrum off by 5.6 sigma (worst band" in summary(changed, "SEP", "ren")
     sep["noise"] = {m: {"missing": "7 baselines; 10 are needed"} for m in ("data", "ren")}
     assert "noise not judged (7 baselines; 10 are needed)" in summary(changed, "SEP", "ren")
 
@@ -130,39 +110,47 @@ def test_noise_that_differs_is_said():
 def test_the_summary_quotes_the_worst_first():
     changed = metrics()
     sep = changed["peaks"]["SEP"]
-    sep["parameters"] = {"drift_time": one(83.1, w1=15.0)}
-    sep["two_sample"]["ren"]["auc"] = 0.6
-    changed["ae_survival"]["SEP"]["difference"]["ren"] = -8.0
-    assert summary(changed, "SEP", "ren") == (
-        "REN, SEP: drift time off by 5.0 sigma (W₁ 15 ns, by chance 5 ns); "
-        "classifier off by 5.0 sigma (AUC 0.60, by chance 0.50); "
-        "A/E survival off by 4.0 sigma (-8.0 points)"
-    )
+    sep["two_sample"]["ren"]["auc"] = 0.7
+    line = summary(changed, "SEP", "ren")
+    assert line.index("classifier off") < line.index("drift time off") < line.index("agreement")
 
 
 def test_what_is_not_scored_says_why():
     changed = metrics()
     sep = changed["peaks"]["SEP"]
     sep["two_sample"]["ren"] = {"missing": "12 measured pulses are usable"}
-    sep["parameters"]["drift_time"]["iou"]["ren"] = None
-    sep["parameters"]["drift_time"]["wasserstein"]["ren"] = None
+    sep["parameters"]["drift_time"]["p"]["ren"] = None
     changed["ae_survival"]["SEP"]["difference"]["ren"] = None
     line = summary(changed, "SEP", "ren")
-    assert "drift time not judged (no value)" in line
+    assert "drift time not judged (too few pulses)" in line
     assert "classifier not judged (12 measured pulses are usable)" in line
     assert "A/E survival not judged (too few events" in line
 
 
-def test_what_compare_gives_is_judged_rightly():
-    """Samples of one distribution agree, and a shifted one does not, for many parameters."""
+def test_p_is_uniform_for_one_distribution_and_small_for_two():
     rng = np.random.default_rng(11)
-    names = [f"p{i}" for i in range(40)]
-    data, ren = ({name: rng.normal(size=400) for name in names} for _ in range(2))
-    shifted = {name: values + 0.4 for name, values in copy.deepcopy(ren).items()}
-    found = compare(data, {"ren": ren, "shifted": shifted}, SCORES, seed=1)
-    table = verdict_table({"peaks": {"SEP": {"parameters": found}}})["SEP"]
-    assert len(table["ren"]) == 80
-    # 4 … 7 % are expected
-    assert sum(words["sigma"] > 2 for words in table["ren"].values()) <= 12
-    w1 = [words["sigma"] for n, words in table["shifted"].items() if n.endswith("wasserstein")]
-    assert min(w1) > 2
+    names = [f"p{i}" for i in range(200)]
+    data, ren = ({name: rng.normal(size=n) for name in names} for n in (400, 300))
+    for values in (data["p0"], ren["p0"]):
+        values[:40] = np.nan  # a bin of its own
+    shifted = {name: values + 0.8 for name, values in copy.deepcopy(ren).items()}
+    few = {"bootstraps": 2}
+    found = compare(data, {"ren": ren, "shifted": shifted}, SCORES.model_copy(update=few), 1)
+    p = np.array([found[name]["p"]["ren"] for name in names])
+    assert kstest(p, "uniform").pvalue > 0.01
+    assert (p < ALARM).mean() <= 0.01
+    assert max(found[name]["p"]["shifted"] for name in names) < 0.01
+
+
+def test_errors_of_a_fit_are_in_p_and_in_the_error_of_the_mean():
+    """Both sides differ by what a fit may be off: its axis moves all values by that much."""
+    rng, error = np.random.default_rng(5), 0.1
+    p, pulls = [], []
+    for _ in range(200):
+        data, ren = rng.normal(size=400), rng.normal(size=400) + error * rng.normal()
+        moved = np.array([[ren + error, ren - error]])
+        found = compare({"a": data}, {"ren": {"a": ren}}, SCORES, 1, {"ren": {"a": moved}})["a"]
+        p.append(found["p"]["ren"])
+        pulls.append(found["shift"]["ren"] / found["shift_std"]["ren"])
+    assert kstest(p, "uniform").pvalue > 0.01
+    assert np.std(pulls) == pytest.approx(1, abs=0.15)

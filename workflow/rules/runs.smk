@@ -50,7 +50,7 @@ rule calibrate:
         options=lambda w: calibration_options(w) if CALIBRATED else "",
     shell:
         "cpunet calibrate --sim {input.sim:q} --data {input.data:q} {params.options}"
-        " --out {output:q} --force > {log:q} 2>&1"
+        " --out {output:q} --force > {log:q} 2>&1 || [ -f {output:q}/run.json ]"
 
 
 rule train:
@@ -74,8 +74,10 @@ rule train:
         reading=reading,
         options=options(**config["train"], device=config["device"]),
     shell:
+        # a run whose fit is bad is used: its log, each use and the page of all say so
         "cpunet train --sim {input.sim:q} --data {input.data:q} {params.reading}"
         " {params.options} --out {output:q} --force > {log:q} 2>&1"
+        " || [ -f {output:q}/run.json ]"
 
 
 def translation_reading(wildcards):

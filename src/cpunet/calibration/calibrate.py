@@ -106,7 +106,7 @@ def calibrate(
     prior
         NAME=VALUE±ERROR (or +-) of a parameter or of depletion_voltage (repeatable).
     plan
-        Only tell what these pulses know of the physics, before any fit.
+        Only print the expected sensitivity to the physics, before any fit.
     peak
         Energies to calibrate on: FEP, SEP, DEP or ranges in keV.
     recipe

@@ -152,7 +152,7 @@ class Calibration(Run):
         for name, told in self.content["parameters"].items():
             value = f"{told['value']:.5g} ± {told['error']:.2g}"
             if told["doubt"]:
-                value = f"no finding: {told['value']:.5g} makes up for something else"
+                value = f"unreliable value: {told['value']:.5g} makes up for something else"
             elif name in pairs:
                 value = "known only together with another"
             found[name] = value
@@ -227,7 +227,9 @@ class Plan:
             for d in self.content["directions"][self._middle]
         ]
         unit = "error in units of the prior:"
-        about = f"directions with {self._middle} pulses of each side, {unit}"
+        about = (
+            f"eigenvectors of the covariance with {self._middle} pulses of each side, {unit}"
+        )
         return "\n".join([*tables, about, *directions])
 
     def __repr__(self) -> str:

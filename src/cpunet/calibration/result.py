@@ -163,8 +163,8 @@ def notes(calibrated: Calibrated, free: Mapping[str, FreeParameter]) -> list[str
     mean, spread = (number / problem.moments for number in problem.by_chance)
     if per <= mean + BEYOND_CHANCE * spread:
         found.append(
-            f"chi-square is {per:.2f} per function, as by chance ({mean:.2f} ± {spread:.2f})"
-            + ("" if found else ": no other physics are needed")
+            f"chi-square is {per:.2f} per function, expected from statistics ({mean:.2f} ± "
+            f"{spread:.2f})" + ("" if found else ": no other physics are needed")
         )
         return found
     fall, best = max(((fall, i) for i, fall in calibrated.promised.items()), default=(0.0, 0))
@@ -173,8 +173,8 @@ def notes(calibrated: Calibrated, free: Mapping[str, FreeParameter]) -> list[str
         name = calibrated.physics.nuisances[best].name
         rest = f"with {name} free, too, it would fall by {fall:.0f}"
     found.append(
-        f"chi-square is {per:.2f} per function, too much for chance ({mean:.2f} ± "
-        f"{spread:.2f}); {rest}"
+        f"chi-square is {per:.2f} per function, a poor fit (expected from statistics: "
+        f"{mean:.2f} ± {spread:.2f}); {rest}"
     )
     return found
 
@@ -182,7 +182,7 @@ def notes(calibrated: Calibrated, free: Mapping[str, FreeParameter]) -> list[str
 def doubts(free: Mapping[str, FreeParameter]) -> str:
     """Comment on the parameters whose values are no findings, for the files of the physics."""
     return "".join(
-        f"# {name}: no finding, makes up for something else ({one.doubt})\n"
+        f"# {name}: unreliable value, makes up for something else ({one.doubt})\n"
         for name, one in free.items()
         if one.doubt
     )

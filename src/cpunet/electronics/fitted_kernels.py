@@ -1,4 +1,4 @@
-"""Kernels fitted to superpulses: a Gaussian with an exponential, and a free one.
+"""Kernels fitted to superpulses: RC with late charge, Gaussian with exponential, a free one.
 
 Superpulses are mean currents of pulses with similar rise times, aligned at half maximum.
 Simulated and measured pulses are of different events, so single pulses cannot be compared.
@@ -14,7 +14,7 @@ where the measured spectrum does not exceed its statistical error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -141,6 +141,7 @@ def superpulses(spectra: Spectrum, steps: Values, groups: Groups) -> Superpulses
 GAUSS_PULSES, GAUSS_ROUNDS = 2000, 3
 # Time compared before and after the half maximum; initial and maximum sigma and tau.
 EDGE_NS, START_NS, LONGEST_NS = 1536.0, 32.0, 1024.0
+START_SHARE, LATE_NS = 0.05, 400.0  # the same of the late charge
 
 
 @dataclass(frozen=True)
@@ -165,45 +166,122 @@ class GaussExp(BaselineMethod):
     @classmethod
     def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
         """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
-        slope, steps = fitted_decay(sim, data, dt_ns, align, GAUSS_PULSES)
-        measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
-        length = record_length(sim.shape[1], dt_ns)
-        of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
-        wanted = _mean_currents(of_data, slices(measured), length, edge)
-        spectra = np.asarray(
-            scipy.fft.rfft(currents(sim[:GAUSS_PULSES], dt_ns), axis=1), complex
-        )
-
-        best = np.array([START_NS, START_NS]) / dt_ns
-        for _ in range(GAUSS_ROUNDS):
-            transfer = _gauss_exp(length, 1.0, best[0], best[1])
-            groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
-            # pulses outside the slices do not enter the fit
-            sliced = spectra[np.concatenate(groups)]
-            ends = np.cumsum([len(group) for group in groups])
-            places = np.split(np.arange(ends[-1]), ends[:-1])
-
-            def residual(
-                parameters: Values, sliced: Spectrum = sliced, places: Groups = places
-            ) -> Values:
-                response = sliced * _gauss_exp(length, 1.0, parameters[0], parameters[1])
-                return (_mean_currents(response, places, length, edge) - wanted).ravel()
-
-            best = scipy.optimize.least_squares(
-                residual, best, bounds=(0.0, LONGEST_NS / dt_ns), diff_step=1e-3, xtol=1e-4
-            ).x
-        sigma, tau = (best * dt_ns).tolist()
+        longest = np.full(2, LONGEST_NS)
+        how = (np.full(2, START_NS), longest, longest)
+        (sigma, tau), slope = _fitted(sim, data, dt_ns, align, _gauss_exp, how)
         return cls(dt_ns, sigma, tau, slope)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
         length = record_length(waveforms.shape[1], self.dt_ns)
-        transfer = _gauss_exp(length, self.dt_ns, self.sigma_ns, self.tau_ns)
+        transfer = _gauss_exp(length, self.dt_ns, np.array([self.sigma_ns, self.tau_ns]))
         return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
 
 
-def _gauss_exp(length: int, dt_ns: float, sigma_ns: float, tau_ns: float) -> Spectrum:
-    """Fourier transform of the kernel at the frequencies of a record."""
+@dataclass(frozen=True)
+class RCLate(BaselineMethod):
+    r"""An RC integration with a part of the charge that comes late, and a decay.
+
+    .. math:: H(\omega) = \frac{1}{1 + i \omega \tau}
+        \left(1 - w + \frac{w}{1 + i \omega T}\right)
+
+    Parameters
+    ----------
+    tau_ns, late_share, late_ns
+        Time constant of the integration, share :math:`w` of the late charge and its time
+        constant :math:`T`, times in ns.
+    tail_slope_per_ms
+        Logarithmic slope of the tail in 1/ms.
+    """
+
+    tau_ns: float
+    late_share: float
+    late_ns: float
+    tail_slope_per_ms: float
+    name: ClassVar[str] = "rc_late"
+
+    @classmethod
+    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
+        """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
+        start = np.array([START_NS, START_SHARE, LATE_NS])
+        scale = np.array([LONGEST_NS, 1.0, LONGEST_NS])
+        how = (start, np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS]), scale)
+        fitted = _fitted(sim, data, dt_ns, align, _rc_late, how, charge=True)
+        (tau, share, late), slope = fitted
+        found = cls(dt_ns, tau, share, late, slope)
+        own = _own_decay(found, slope, sim[:GAUSS_PULSES], align)
+        return replace(found, tail_slope_per_ms=own)
+
+    def translate(self, waveforms: FloatArray) -> FloatArray:
+        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
+        length = record_length(waveforms.shape[1], self.dt_ns)
+        values = np.array([self.tau_ns, self.late_share, self.late_ns])
+        transfer = _rc_late(length, self.dt_ns, values)
+        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+
+
+def _fitted(
+    sim: FloatArray,
+    data: FloatArray,
+    dt_ns: float,
+    align: int,
+    kernel: Callable[[int, float, Values], Spectrum],
+    how: tuple[Values, Values, Values],
+    *,
+    charge: bool = False,
+) -> tuple[list[float], float]:
+    """Parameters of a kernel fitted to superpulses, and the tail slope in 1/ms.
+
+    Parameters
+    ----------
+    sim, data, dt_ns, align
+        As of `BaselineMethod.fit`.
+    kernel
+        Fourier transform of the kernel at a length and a period in ns.
+    how
+        Where the parameters start, their largest values (the smallest are 0), and scales.
+    charge
+        Compare charges in place of currents, in which late charge counts for little.
+    """
+    slope, steps = fitted_decay(sim, data, dt_ns, align, GAUSS_PULSES)
+    measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
+    length = record_length(sim.shape[1], dt_ns)
+    of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
+    wanted = _mean_currents(of_data, slices(measured), length, edge)
+    spectra = np.asarray(scipy.fft.rfft(currents(sim[:GAUSS_PULSES], dt_ns), axis=1), complex)
+
+    best, high, scale = how
+    for _ in range(GAUSS_ROUNDS):
+        transfer = kernel(length, dt_ns, best)
+        groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
+        # pulses outside the slices do not enter the fit
+        sliced = spectra[np.concatenate(groups)]
+        ends = np.cumsum([len(group) for group in groups])
+        places = np.split(np.arange(ends[-1]), ends[:-1])
+
+        def residual(
+            parameters: Values, sliced: Spectrum = sliced, places: Groups = places
+        ) -> Values:
+            response = sliced * kernel(length, dt_ns, parameters)
+            apart = _mean_currents(response, places, length, edge) - wanted
+            return np.asarray(np.cumsum(apart, axis=1) if charge else apart).ravel()
+
+        best = scipy.optimize.least_squares(
+            residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
+        ).x
+    return best.tolist(), slope
+
+
+def _rc_late(length: int, dt_ns: float, values: Values) -> Spectrum:
+    """Fourier transform of the kernel of `RCLate` at the frequencies of a record."""
+    s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
+    tau, share, late = values
+    return np.asarray((1 - share + share / (1 + s * late)) / (1 + s * tau), complex)
+
+
+def _gauss_exp(length: int, dt_ns: float, values: Values) -> Spectrum:
+    """Fourier transform of the kernel of `GaussExp` at the frequencies of a record."""
+    sigma_ns, tau_ns = values
     omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
     gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
     return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
@@ -265,11 +343,8 @@ class SuperpulseKernel(BaselineMethod):
             )
             kernel = _kernel(wanted, _superpulses(spectra, response), length, dt_ns)
         found = cls(dt_ns, kernel, slope)
-        # subtract the contribution of the kernel's late part to the tail slope from the decay
-        before = padding(dt_ns)[0]
-        windows = found.translate(sim[:FREE_PULSES])[:, before : before + sim.shape[1]]
-        excess = fitted_tail_slope(windows, dt_ns, align) - slope
-        return replace(found, tail_slope_per_ms=slope - excess)
+        own = _own_decay(found, slope, sim[:FREE_PULSES], align)
+        return replace(found, tail_slope_per_ms=own)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
@@ -287,6 +362,13 @@ class SuperpulseKernel(BaselineMethod):
             "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
             "tail_slope_per_ms": self.tail_slope_per_ms,
         }
+
+
+def _own_decay(found: BaselineMethod, slope: float, sim: FloatArray, align: int) -> float:
+    """Slope of the decay (1/ms) without what a kernel's late part contributes to the tail."""
+    before = padding(found.dt_ns)[0]
+    windows = found.translate(sim)[:, before : before + sim.shape[1]]
+    return slope - (fitted_tail_slope(windows, found.dt_ns, align) - slope)
 
 
 def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
@@ -320,5 +402,5 @@ def _transfer(kernel: Values, lead: int, length: int) -> Spectrum:
 
 
 BASELINE_METHODS: dict[str, type[BaselineMethod]] = {
-    method.name: method for method in (RC, GaussExp, SuperpulseKernel)
+    method.name: method for method in (RC, RCLate, GaussExp, SuperpulseKernel)
 }

@@ -51,11 +51,11 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         likely = drawn_like(found, data, config)
         told = found.describe().model_copy(update={"drawn": likely.describe()})
     if found is not None and found.law is not None:
-        drawn, tenth = likely, told.percent_above["10_kev"]["law"]
+        drawn, tenth = likely, told.percent_above["10_kev"]["measured"]
         alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
         log.info(
             f"pile-up tails: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
-            f"kHz{alone}, {tenth:.0f} % of the traces on more than 10 keV; translations are "
+            f"kHz{alone}, {tenth:.2g} % of the traces above 10 keV; translations are "
             "given them"
         )
     return TraceNoise(noise_of(data, found), drawn), told

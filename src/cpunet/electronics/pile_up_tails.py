@@ -189,13 +189,13 @@ class TailsInfo(InfoPart):
     def in_words(self) -> list[tuple[str, str]]:
         """Names and texts."""
         if not self.rate_khz:
-            return [("pile-up tails", "none that are certain")]
+            return [("pile-up tails", "none significant")]
         shares = ", ".join(
-            f"{share['measured']:.3g} % above {size.partition('_')[0]} keV"
+            f"{share['measured']:.2g} % above {size.partition('_')[0]} keV"
             for size, share in self.percent_above.items()
         )
         rate = f"{self.rate_khz:.3g} ± {self.rate_error_khz:.2g} kHz"
-        by = f"told by {self.told_by}, error {self.error_kev:.2g} keV"
+        by = f"estimated from {self.told_by}, error {self.error_kev:.2g} keV"
         return [
             ("pile-up tails", f"{rate}, decaying with {self.decay_us:.3g} µs"),
             ("", f"{shares} ({by})"),

@@ -30,6 +30,7 @@ from cpunet.progress import stage
 from cpunet.settings import plain, read_json, yaml_text
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.closed_forms import StepResponse
+from cpunet.training.response_tables import as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
 
 Values = npt.NDArray[np.float64]
@@ -162,7 +163,7 @@ log = logging.getLogger(__name__)
 LEGEND_PARS = FolderKind(
     name="legend-pars",
     command="cpunet export legend",
-    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet)\.yaml",
+    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
 )
 EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
 SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
@@ -286,6 +287,8 @@ def export_legend(
         for kind, content in (pars | {"cpunet": whole}).items():
             text = yaml_text(plain({name: content}))
             (folder / f"{kind}.yaml").write_text(text, encoding="utf-8")
+        (folder / "response.yaml").write_text(as_yaml({name: told}), encoding="utf-8")
+        (folder / "response.csv").write_text(as_csv({name: told}), encoding="utf-8")
     return LegendParameters(out, name, whole)
 
 
@@ -306,7 +309,13 @@ def _against_energy(
             mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
             line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
             pars["aoemeanmod"] = {"psl": {"expression": "x*a+b", "pars": line}}
-            pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
+            if law["b"] > 0:
+                pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
+            else:
+                log.warning(
+                    f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
+                    "aoeresmod.yaml is not written: give events of more energies"
+                )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CpunetError(
             f"{path}: no A/E against energy; give the folder that `cpunet validate` made"

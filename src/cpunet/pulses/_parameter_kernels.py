@@ -130,23 +130,6 @@ def maxima_elsewhere(current, first, samples):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _missing(pulse, start, stop, height):  # type: ignore[no-untyped-def]
-    """Area between `height` and the pulse from time `start` to sample `stop`, over `height`."""
-    first = math.ceil(start)
-    if first >= stop:
-        return math.nan
-    # straight lines between samples, with a partial interval at the start
-    share = first - start
-    area = 0.0
-    if share > 0:
-        at_start = pulse[first] + share * (pulse[first - 1] - pulse[first])
-        area = share * (height - 0.5 * (at_start + pulse[first]))
-    for i in range(first, stop):
-        area += height - 0.5 * (pulse[i] + pulse[i + 1])
-    return area / height
-
-
-@_compiled
 def crossings(waveforms, levels, stops):  # type: ignore[no-untyped-def]
     """Times in samples of the last crossings of levels before a sample; NaN without one.
 
@@ -165,21 +148,3 @@ def crossings(waveforms, levels, stops):  # type: ignore[no-untyped-def]
                     times[row, column] = i - 1 + (level - before) / (after - before)
                     break
     return times
-
-
-@_compiled
-def missing_areas(waveforms, starts, stops):  # type: ignore[no-untyped-def]
-    r"""Area between a step and each pulse ``(n, length)``, divided by its height, in samples.
-
-    .. math:: \frac{1}{x(t_1)} \int_{t_0}^{t_1} [x(t_1) - x(t)] \, dt
-
-    from the time :math:`t_0` in `starts` (NaN for no value) to the sample :math:`t_1` in
-    `stops`, with straight lines between samples.
-    """
-    areas = np.empty(len(waveforms))
-    for i in range(len(waveforms)):
-        areas[i] = math.nan
-        if starts[i] >= 0 and stops[i] > starts[i]:
-            stop = int(stops[i])
-            areas[i] = _missing(waveforms[i], starts[i], stop, np.float64(waveforms[i, stop]))
-    return areas

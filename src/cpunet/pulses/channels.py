@@ -114,8 +114,8 @@ class Outcome(Generic[R]):
 
     @property
     def ok(self) -> bool:
-        """Whether no channel failed."""
-        return not self.failed
+        """Whether no channel failed, and no result is bad."""
+        return not self.failed and all(getattr(one, "ok", True) for one in self.done.values())
 
     def __str__(self) -> str:
         lines = {name: repr(found).strip("<>'") for name, found in self.done.items()}

@@ -244,7 +244,7 @@ class Seen:
         if self._first is not None and go_down(self._first):
             return CpunetError(
                 f"{self._path}: the traces go down: their polarity is negative",
-                "turn them round, as by pulses.with_waveforms(-pulses.waveforms) in Python",
+                "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
             )
         known = self.energies_kev
         if len(known):

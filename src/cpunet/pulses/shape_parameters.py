@@ -6,12 +6,15 @@ evaluated.  This module adds others on which an analysis may cut.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import hist
 import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.pulses import _parameter_kernels as kernels
 from cpunet.pulses.container import FloatArray, Pulses, blocks
+from cpunet.pulses.legend_parameters import legend_parameters
 from cpunet.pulses.parameters import (
     BLOCK,
     PARAMETERS,
@@ -22,6 +25,9 @@ from cpunet.pulses.parameters import (
     tail_slope,
 )
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Fractions of the maximum at which a pulse is timed.
 TIME_POINTS = {"t01": 0.01, "t10": 0.1, "t50": 0.5, "t90": 0.9, "t99": 0.99}
@@ -47,10 +53,21 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
         name: Parameter(f"Rise time {int(begin[1:])}–{end[1:]} %", "ns")
         for name, (begin, end) in RISE_TIMES.items()
     },
-    "effective_drift_time": Parameter("Effective drift time", "ns"),
+    "tp_0_est": Parameter("tp_0_est", "ns"),
+    "tp_50": Parameter("tp_50", "ns"),
+    "tp_90": Parameter("tp_90", "ns"),
+    "tp_99": Parameter("tp_99", "ns"),
+    "rise_time": Parameter("T(10–90 %)", "ns"),
+    "dt_eff": Parameter("Effective drift time dt_eff", "ns"),
+    "lq": Parameter("Late charge LQ", "ns"),
     "tail_slope": PARAMETERS["tail_slope"],
     "baseline_rms": Parameter("Baseline RMS", "pulse height"),
 }
+
+
+# What also needs the pulses of another peak, see `cpunet.validation.peaks`.
+A_OVER_E = "a_over_e"
+LABELLED = SHAPE_PARAMETERS | {A_OVER_E: Parameter("A/E (double escape at 1)", "")}
 
 
 def all_parameters(
@@ -59,6 +76,7 @@ def all_parameters(
     scores: ScoreConfig,
     *,
     amplitudes: Values | None = None,
+    decay_ns: float | None = None,
 ) -> dict[str, Values]:
     """All parameters of `SHAPE_PARAMETERS`, each an array with one value per pulse.
 
@@ -72,6 +90,9 @@ def all_parameters(
         Score settings, with the fraction of the maximum at which the drift time begins.
     amplitudes
         Current amplitudes of the pulses, if they are known; else they are computed.
+    decay_ns
+        Decay that LEGEND's parameters are corrected for; by default the median one of these
+        pulses.
 
     Returns
     -------
@@ -91,8 +112,8 @@ def all_parameters(
     >>> recipe = load_recipe("paper")
     >>> ramp = np.clip((np.arange(800) - 300) / 100, 0, 1)[np.newaxis]
     >>> found = all_parameters(Pulses.of(ramp, dt_ns=16), recipe.preparation, recipe.scores)
-    >>> found["rise_10_90"].round(3), found["effective_drift_time"].round(1)
-    (array([1280.]), array([784.1]))
+    >>> found["rise_10_90"].round(3), found["dt_eff"].round(1)
+    (array([1280.]), array([800.]))
     """
     preparation = preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:
@@ -118,7 +139,22 @@ def all_parameters(
             }
         for name, column in found.items():
             values[name][rows] = np.where(np.isfinite(column), column, np.nan)
+    if decay_ns is None:
+        decay_ns = median_decay_ns(values["tail_slope"])
+    for rows in blocks(len(pulses), BLOCK):
+        good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
+        block, noise = pulses.waveforms[good], values["baseline_rms"][good]
+        how = (decay_ns, noise, pulses.dt_ns, preparation.samples_before)
+        for name, column in legend_parameters(block, *how).items():
+            values[name][good] = column
     return values
+
+
+def median_decay_ns(slopes: Values) -> float:
+    """Time constant of the median tail slope (1/ms); infinite if it does not fall."""
+    known = slopes[np.isfinite(slopes)]
+    slope = float(np.median(known)) if known.size else 0.0
+    return -1e6 / slope if slope < 0 else np.inf
 
 
 def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
@@ -132,8 +168,7 @@ def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
         zip(TIME_POINTS, ((samples - aligned) * dt_ns).T, strict=True)
     )
     rises = {name: times[end] - times[begin] for name, (begin, end) in RISE_TIMES.items()}
-    areas = kernels.missing_areas(block, samples[:, 0].copy(), stop.astype(float))
-    return {**times, **rises, "effective_drift_time": areas * dt_ns}
+    return {**times, **rises}
 
 
 def _rms_about_line(baseline: FloatArray) -> Values:
@@ -204,8 +239,48 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
     return hist.axis.Regular(bins, low, high + margin)
 
 
-def labelled(axis: hist.axis.Regular, parameter: str) -> hist.axis.Regular:
-    """The same bins, with the parameter's name and label."""
+def labelled(
+    axis: hist.axis.Regular, parameter: str, bins: int | None = None
+) -> hist.axis.Regular:
+    """The same range, in so many bins if given, with the parameter's name and label.
+
+    Raises
+    ------
+    CpunetError
+        If there are no so many bins.
+    """
     edges = axis.edges
-    label = SHAPE_PARAMETERS[parameter].axis_label
-    return hist.axis.Regular(axis.size, edges[0], edges[-1], name=parameter, label=label)
+    if bins is not None and bins < 1:
+        raise CpunetError(f"`bins` is {bins}", "give 1 or more")
+    label = LABELLED[parameter].axis_label
+    return hist.axis.Regular(
+        bins or axis.size, edges[0], edges[-1], name=parameter, label=label
+    )
+
+
+class Histogram(hist.Hist[Any], family=hist):
+    """A `hist.Hist` that is drawn without further packages."""
+
+    def plot(self, ax: Axes | None = None, **how: Any) -> Axes:  # type: ignore[override]
+        """Draw the counts of one axis, of each category of an axis before it.
+
+        Parameters
+        ----------
+        ax
+            Where to draw; a new figure of pyplot by default.
+        how
+            Further arguments of `matplotlib.axes.Axes.stairs`.
+        """
+        from cpunet.plotting import label, own_axes
+
+        *categories, axis = self.axes
+        ax = own_axes(ax)
+        names = list(categories[0]) if categories else []
+        for name in names or [None]:
+            one: Any = self if name is None else self[name, :]
+            text = {} if name is None else {"label": label(name)}
+            ax.stairs(one.values(), axis.edges, **text | how)
+        ax.set(xlabel=axis.label, ylabel="Counts")
+        if names:
+            ax.legend()
+        return ax

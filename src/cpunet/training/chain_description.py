@@ -193,10 +193,12 @@ def _parameters(values: Mapping[str, float]) -> str:
     """Parameters of a readout chain; ``slow_100_ns`` and such are shares of the charge."""
     words = []
     for name, value in values.items():
+        name = name.replace("drift_stretch_per_us", "drift-time scale, per µs")
+        name = name.replace("drift_stretch", "drift-time scale")
         stem, _, unit = name.rpartition("_")
         shown = f" {UNITS[unit]}" if unit in UNITS else ""
         called = (stem if shown else name).replace("_", " ")
-        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation", name):
+        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation|drift-.*", name):
             words.append(f"{called}{shown} {percent(100 * value)}")
         else:
             words.append(f"{called} {value:.4g}{shown}")

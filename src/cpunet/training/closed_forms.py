@@ -328,25 +328,41 @@ def propagated(
         Standard deviation by name, of numbers that are defined at both ends of every axis;
         empty if the covariance does not match the parameters.
     """
-    moved, ends = copy.deepcopy(response), []
+    ends = [numbers(end) for pair in error_ends(response, covariance) for end in pair]
+    return _half_ranges(ends) if ends else {}
+
+
+MAX_AXES = 12  # of the errors of a deviation, of which the others are negligible
+
+
+def error_ends(
+    response: ElectronicsResponse, covariance: Sequence[Sequence[float]]
+) -> list[tuple[ElectronicsResponse, ElectronicsResponse]]:
+    """A response at both ends of each axis of its error ellipsoid, see `propagated`."""
+    ends: list[tuple[ElectronicsResponse, ElectronicsResponse]] = []
     if response.config.deviations:  # their draws contain the parameters of the chain
-        for axis in response.deviation_draws:
-            for sign in (1, -1):
-                moved.deviation = response.deviation + sign * axis
-                ends.append(numbers(moved))
-        return _half_ranges(ends)
+        _, sizes, axes = np.linalg.svd(response.deviation_draws, full_matrices=False)
+        for axis in (sizes[:, np.newaxis] * axes)[:MAX_AXES]:
+            pair = copy.deepcopy(response), copy.deepcopy(response)
+            for end, sign in zip(pair, (1, -1), strict=True):
+                end.deviation += sign * axis
+            ends.append(pair)
+        return ends
+    moved = copy.deepcopy(response)
     parameters = SmoothParameters(moved, poles=False)
     centre = parameters.vector()
     matrix = np.asarray(covariance, float)
     if matrix.shape != (len(centre),) * 2 or not np.isfinite(matrix).all():
-        return {}
+        return []
     turn = parameters.turn()
     variances, axes = np.linalg.eigh(turn @ matrix @ turn.T)
     for axis in (np.sqrt(np.maximum(variances, 0)) * axes).T:
+        both = []
         for end in (centre + axis, centre - axis):
             parameters.set(end)
-            ends.append(numbers(moved))
-    return _half_ranges(ends)
+            both.append(copy.deepcopy(moved))
+        ends.append((both[0], both[1]))
+    return ends
 
 
 def _half_ranges(ends: Sequence[Numbers]) -> Numbers:

@@ -20,7 +20,7 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
     Examples
     --------
     >>> beyond({"pole_1_ns": 40.0, "slow_100_ns": -0.5, "slow_400_ns": -0.2})
-    ['70 % of the charge would arrive too early, which no readout does; see the fit']
+    ['70 % of the charge would arrive too early, which electronics cannot cause; see the fit']
     """
     if "deviation" in parameters:  # the parts of its chain are not what it consists of
         return []
@@ -29,7 +29,7 @@ def beyond(parameters: Mapping[str, float]) -> list[str]:
         return []
     how = "late, as of slower pulses than simulated"
     if slow < 0:
-        how = "too early, which no readout does"
+        how = "too early, which electronics cannot cause"
     return [f"{100 * abs(slow):.0f} % of the charge would arrive {how}; see the fit"]
 
 

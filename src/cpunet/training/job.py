@@ -331,7 +331,7 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
     started, clock = datetime.now(UTC), time.perf_counter()
     if job.init is not None:
         known = known_response(job.init, job.recipe)
-    with stage("Matching") as bar:  # how many steps a fit needs is not known
+    with stage("Fitting") as bar:  # how many steps a fit needs is not known
 
         def listen(step: int, chi_square: float) -> None:
             losses = {"chi_square": chi_square}

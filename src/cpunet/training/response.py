@@ -20,6 +20,7 @@ from cpunet.settings import checked, read_json
 from cpunet.tables import text_table
 from cpunet.training.chain_description import DescribedChain, describe_chain
 from cpunet.training.closed_forms import Numbers, chain_numbers, true_chain_of, true_parameters
+from cpunet.training.response_tables import array_page, as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ log = logging.getLogger(__name__)
 
 MARKER = "response.json"
 RESPONSE = FolderKind(
-    name="response", command="cpunet response", own=r"response\.json|response\.png"
+    name="response", command="cpunet response", own=r"response\.(json|png|yaml|csv|html)"
 )
 _DPI = 150
 # What ``response.json`` has of a `Run` and of a `DescribedChain`
@@ -40,16 +41,16 @@ _OF_CHAIN = ("values", "errors", "parameters", "parameter_errors", "doubts")
 # What a name of `describe_chain` stands for, and its unit; shares are given in percent.
 ROWS = {
     r"pole_(\d)_ns": (r"bandwidth pole \1", "ns"),
-    r"slow_share": ("slow share of the charge", "%"),
+    r"slow_share": ("late charge", "%"),
     r"slow_time_ns": ("its mean time", "ns"),
     r"ringing": ("ringing", "%"),
     r"ringing_mhz": ("ringing frequency", "MHz"),
     r"ringing_damping_ns": ("ringing damping", "ns"),
     r"deviation": ("largest deviation from a chain", "%"),
-    r"drift_stretch": ("drift stretched by", "%"),
-    r"drift_stretch_per_us": ("and per µs by", "%"),
+    r"drift_stretch": ("drift-time scale, change", "%"),
+    r"drift_stretch_per_us": ("drift-time scale, change per µs", "%"),
     r"rise_(.*)_(.*)_ns": (r"rise \1–\2 %", "ns"),
-    r"missing_(.*)_ns": (r"still missing at \1 ns", "%"),
+    r"missing_(.*)_ns": (r"not yet collected after \1 ns", "%"),
     r"overshoot": ("overshoot", "%"),
     r"decay_us": ("main decay", "µs"),
     r"fast_decay_(\d)_us": (r"fast decay \1", "µs"),
@@ -123,7 +124,10 @@ class Response:
         return response_figure([one.chain for one in self.runs], truth, tail_ns=tail_ns)
 
     def save(self, path: str | Path, force: bool = False) -> None:
-        """Make a folder of ``response.json`` and ``response.png``.
+        """Make a folder of ``response.json``, ``.yaml``, ``.csv`` and ``.png``.
+
+        The YAML has correlations.  Of several runs, ``response.html`` is a page with outliers
+        marked.
 
         Raises
         ------
@@ -146,6 +150,11 @@ class Response:
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
+            chains = {one.run.name: one for one in self.runs}
+            (folder / "response.yaml").write_text(as_yaml(chains), encoding="utf-8")
+            (folder / "response.csv").write_text(as_csv(chains), encoding="utf-8")
+            if len(chains) > 1:
+                (folder / "response.html").write_text(array_page(chains), encoding="utf-8")
             self.plot().savefig(folder / "response.png", dpi=_DPI)
 
     def __str__(self) -> str:
@@ -155,7 +164,7 @@ class Response:
         return text_table(head, list(map(self._cells, self._names)), title="Readout response")
 
     def __repr__(self) -> str:
-        truth = "" if self.truth is None else f", beside {self.truth.name}"
+        truth = "" if self.truth is None else f", truth {self.truth.name}"
         names = ", ".join(Path(one.run.name).name for one in self.runs)
         return f"<{type(self).__name__} of {names}{truth}>"
 
@@ -190,7 +199,7 @@ def response(
     out: str | Path | None = None,
     force: bool = False,
 ) -> Response:
-    """Say in terms of physics what readout was learned, beside the truth if it is known.
+    """Say in terms of physics what readout was learned, with the truth if it is known.
 
     Parameters
     ----------
@@ -199,7 +208,8 @@ def response(
     truth
         True readout: folder of a test stand, ornl, legend200, ringing, mjd, or a YAML file.
     out
-        Folder for response.json and response.png.
+        Folder for response.json and .png, tables in YAML (with correlations) and CSV, and, of
+        several runs, a page with outliers marked.
     force
         Replace existing output.
 

@@ -34,7 +34,7 @@ from cpunet.training.verdict import WIDTH, Verdict, verdict
 # longer or shorter by more than a third is that of another detector.
 NEEDED, MAX_STRETCH = 16.0, 1 / 3
 BY_HEIGHT = "slew rate and curve"
-DRIFT = {1: "a stretch of the drift", 2: "its change with time"}  # by number of terms
+DRIFT = {1: "drift-time scale", 2: "its change with time"}  # by number of terms
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,11 @@ class Fit:
         """Remaining difference between translation and data, in a sentence."""
         shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
         off = abs(shift) >= 2 * error
-        right = f"right to {abs(shift) + error:.2f} %"
-        size = f"off by {shift:+.2f} ± {error:.2f} %" if off else right
+        size = f"is off by {shift:+.2f} ± {error:.2f} %"
+        if not off:
+            size = f"has a statistical error of {error:.2g} % (1σ)"
         # a shift that is small compared with its error does not make the shape right
-        more = f"; the current amplitude is {size}" if off or self.checks.good else ""
+        more = f"; the current amplitude {size}" if off or self.checks.good else ""
         return f"{self.checks}{more}"
 
 

@@ -313,6 +313,18 @@ class Run(InfoPart):
         return IREN.of(self)
 
     @cached_property
+    def covariance(self) -> DataFrame:
+        """Covariance of the fitted parameters, with their names; empty if nothing was fitted.
+
+        Parameters of positive quantities are their logarithms (``log_poles_ns.0``).
+        """
+        from pandas import DataFrame
+
+        fit = self.fit or FitInfo()
+        names = list(fit.errors) if fit.covariance else []
+        return DataFrame(np.array(fit.covariance).reshape(-1, len(names)), names, names)
+
+    @cached_property
     def parameters(self) -> dict[str, float]:
         """Physical parameters of the readout chain; each name ends with the unit.
 
@@ -357,6 +369,12 @@ class Run(InfoPart):
 
         return validate(self, sim, data, out, **how)
 
+    @property
+    def ok(self) -> bool:
+        """Whether its fit is good, or nothing was fitted."""
+        checks = None if self.fit is None else self.fit.checks
+        return checks is None or checks.good
+
     def summary(self) -> list[tuple[str, str]]:
         """What was trained, on what, and how well it fits: topics and texts."""
         from cpunet.training.chain_description import summary
@@ -369,6 +387,7 @@ class Run(InfoPart):
     def __repr__(self) -> str:
         per = None if self.fit is None else self.fit.chi_square_per_moment
         fit = "" if per is None else f", chi-square per moment {per:.2f}"
+        fit += "" if self.ok else ", a bad fit"
         return f"<{type(self).__name__} {self.name}: {self.recipe.name}, {self.peak}{fit}>"
 
     def _repr_html_(self) -> str:
@@ -391,11 +410,11 @@ def as_run(run: RunLike) -> Run:
 
 
 def used_run(run: RunLike) -> Run:
-    """The same, with a warning if its own verdict is bad."""
+    """The same, with a warning if its fit is bad."""
     used = as_run(run)
     checks = None if used.fit is None else used.fit.checks
     if checks is not None and not checks.good:
-        log.warning(f"{used.name}: its own verdict is {checks}; {checks.causes[0]}")
+        log.warning(f"{used.name}: the fit of this run is bad: {checks.causes[0]}")
     return used
 
 

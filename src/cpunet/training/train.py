@@ -39,6 +39,8 @@ def train(
 ) -> Run | Outcome[Run]:
     """Train REN and IREN on simulated and measured pulses, unpaired.
 
+    Ends with status 1 if the fit is bad; the run is written all the same.
+
     Parameters
     ----------
     sim
@@ -72,7 +74,8 @@ def train(
     Returns
     -------
     Run or Outcome
-        The trained run; of all channels, each run or the reason why there is none.
+        The trained run; of all channels, each run or the reason why there is none. Its ``ok``
+        says whether its fit is good.
 
     Raises
     ------
@@ -116,7 +119,12 @@ def train(
         runs = {name: Run.load(run) for name, run in found.done.items()}
         trained, of_all = Outcome(runs, found.failed), ["--data-table", ALL]
     if target is not None and all(side.pulses is None for side in sides):
-        report = target.with_name(f"{target.name}-report")
-        words = ["cpunet", "validate", target, "--sim", sides[0].path, "--data", sides[1].path]
-        log.info(f"next: {shlex.join(map(str, [*words, '--out', report, *of_all]))}")
+        words: list[object] = ["--sim", sides[0].path, "--data", sides[1].path, *of_all]
+        if trained.ok:
+            report = target.with_name(f"{target.name}-report")
+            words = ["validate", target, *words, "--out", report]
+        else:
+            log.warning(f"{target}: written, though bad; whatever uses it will say so")
+            words = ["check", *words]
+        log.info(f"next: {shlex.join(map(str, ['cpunet', *words]))}")
     return trained

@@ -27,8 +27,9 @@ LARGEST = 100.0  # standard errors that are stated
 PARTS = {
     "onset": (
         -240.0,
-        "no readout shapes it: the physics simulated are not those of the detector, or it is "
-        "another one; try: cpunet check; cpunet calibrate finds temperature and impurities",
+        "electronics cannot cause this: the physics simulated are not those of the detector, "
+        "or it is another one; try: cpunet check; cpunet calibrate finds temperature and "
+        "impurities",
     ),
     "edge": (
         240.0,

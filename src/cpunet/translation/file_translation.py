@@ -33,13 +33,19 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import form_of
 from cpunet.translation.options import TranslateOptions
-from cpunet.translation.translator import IREN, REN, TranslatedPulses, Translator
+from cpunet.translation.translator import (
+    IREN,
+    NOISE_ROWS,
+    REN,
+    TranslatedPulses,
+    Translator,
+    noise_seed,
+)
 
 log = logging.getLogger(__name__)
 
 BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
 BLOCK_SAMPLES = 1 << 24
-NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 OWN_COLUMNS = frozenset(
     {"waveform", "energy", "event_number", "rejection", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
@@ -260,27 +266,6 @@ def source_print(source: PulseFile) -> str:
             raise CpunetError(f"{path}: no such file; check the name") from None
         known.append((path.name, stat.st_size, stat.st_mtime_ns))
     return hashlib.sha256(repr(known).encode(errors="surrogateescape")).hexdigest()
-
-
-def noise_seed(seed: int, key: str | None, block: int) -> int:
-    """Seed of the noise of a block of a file.
-
-    Parameters
-    ----------
-    seed
-        Seed of the translation.
-    key
-        Name of the file or the channel; None for a single file, whose first block then has
-        `seed` itself, as in `cpunet.translation.translator.Translator.translate`.
-    block
-        Number of the block in the file.
-    """
-    if key is None and block == 0:
-        return int(seed)
-    # names of files need not be UTF-8
-    digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
-    words = [seed, block, 0, int.from_bytes(digest[:16])]
-    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:

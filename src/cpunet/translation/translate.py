@@ -89,7 +89,7 @@ def translate(
         How files are read, if they do not tell themselves.  With ``all`` for the table, each
         table is translated to a file in `out`.
     insist
-        Pulses are simulated or measured as given, whatever they look like.
+        Skip the check whether pulses are simulated or measured.
     force
         Replace existing files.
 

@@ -8,24 +8,30 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import hist
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from cpunet.errors import CpunetError, named
 from cpunet.html_pages import notebook_picture, part
-from cpunet.plotting import COLOURS, styled
+from cpunet.plotting import COLOURS, own_axes, styled
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.shape_parameters import MAX_BINS, all_parameters, data_axis, labelled
+from cpunet.pulses.shape_parameters import (
+    MAX_BINS,
+    Histogram,
+    all_parameters,
+    data_axis,
+    labelled,
+)
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.file_translation import Counts
 from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from pandas import DataFrame
 
 DRAWN = 50  # pulses in a figure
@@ -105,8 +111,8 @@ class Translation:
             )
         return all_parameters(self.pulses, self.recipe.preparation, self.recipe.scores)
 
-    def hist(self, parameter: str = "current_amplitude") -> hist.Hist[Any]:
-        """Distribution of a parameter as a `hist.Hist`.
+    def hist(self, parameter: str = "current_amplitude", bins: int | None = None) -> Histogram:
+        """Distribution of a parameter as a `hist.Hist`, in so many bins if given.
 
         Raises
         ------
@@ -114,24 +120,30 @@ class Translation:
             If there is no such parameter.
         """
         values = named(self.parameters, parameter, "parameter")
-        axis = labelled(data_axis(values, MAX_BINS), parameter)
-        made: hist.Hist[Any] = hist.Hist(axis)
-        return made.fill(values[np.isfinite(values)])
+        made = Histogram(labelled(data_axis(values, MAX_BINS), parameter, bins))
+        made.fill(values[np.isfinite(values)])
+        return made
 
     @styled
-    def plot(self, n: int = DRAWN) -> Figure:
-        """Draw the first `n` translated pulses over each other."""
-        rows = np.flatnonzero(self.valid)[:n]
-        figure = Figure(figsize=(6.4, 3.2))
-        axes = figure.subplots()
+    def plot(self, n: int = DRAWN, ax: Axes | None = None) -> Axes:
+        """Draw the first `n` translated pulses over each other; return the axes.
+
+        Parameters
+        ----------
+        n
+            Number of pulses.
+        ax
+            Where to draw; a new figure of pyplot by default.
+        """
+        rows, axes = np.flatnonzero(self.valid)[:n], own_axes(ax)
         pulses = self.pulses
         time_us = np.arange(pulses.length) * pulses.dt_ns * 1e-3
         lines = pulses.waveforms[rows].T
         axes.plot(time_us, lines, color=COLOURS["ren"], lw=0.6, alpha=0.5)
         axes.set_xlabel("Time [µs]")
-        axes.set_ylabel("ADC counts" if self.adc else "Pulse height")
+        axes.set_ylabel("ADC counts" if self.adc else "Normalised charge")
         axes.set_title(f"{len(rows)} of {self.counts.translated} translated pulses")
-        return figure
+        return axes
 
     def to_dataframe(self) -> DataFrame:
         """Event, energy, reason of rejection and parameters of each pulse, as a data frame."""
@@ -193,5 +205,9 @@ class Translation:
         }
         facts |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
         small = self.kept is not None  # a file may be large
-        drawn = notebook_picture(self.plot()) if small and self.counts.translated else ""
-        return part("object", "cpunet translation", facts, picture=drawn)
+        picture: str = ""
+        if small and self.counts.translated:
+            figure = Figure(figsize=(6.4, 3.2))
+            self.plot(ax=figure.subplots())
+            picture = notebook_picture(figure)
+        return part("object", "cpunet translation", facts, picture=picture)

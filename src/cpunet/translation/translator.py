@@ -7,6 +7,7 @@ of any length are accepted.  Preparation leaves prepared pulses unchanged.
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -36,6 +37,7 @@ Act: TypeAlias = Callable[[FloatArray, Drawn], Translated]
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
+NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
 
 
 class RejectionWarning(UserWarning):
@@ -152,6 +154,12 @@ class Translator:
         """
         return cls.of(Run.load(run), device)
 
+    def __call__(self, pulses: Pulses | Waveforms, **how: Any) -> Any:
+        """Translate pulses with their energies, or waveforms, as `translate` does."""
+        if not isinstance(pulses, Pulses):
+            return self.translate(pulses, **how)
+        return self.translate(pulses.waveforms, **{"energy_kev": pulses.energy_kev} | how)
+
     def translate(
         self,
         waveforms: Waveforms,
@@ -174,7 +182,7 @@ class Translator:
         noise
             Whether to add noise; without it the result is deterministic.
         seed
-            Seed of the noise; None for a random one.
+            Seed of the noise, the same as of `cpunet.translate`; None for a random one.
         tails_kev
             Pile-up tails under each pulse in keV; `tails` can draw them.
 
@@ -216,9 +224,19 @@ class Translator:
         left = None
         if tails_kev is not None:
             left = _one_each("tails_kev", tails_kev, len(pulses))
-        done = self.translate_pulses(
-            pulses, noise=noise, generator=np.random.default_rng(seed), tails_kev=left
-        )
+        if seed is None:
+            seed = int(np.random.default_rng().integers(2**63))
+        blocks: list[TranslatedPulses] = []
+        for first in range(0, max(len(pulses), 1), NOISE_ROWS):
+            rows = slice(first, first + NOISE_ROWS)
+            block = self.translate_pulses(
+                pulses[rows],
+                noise=noise,
+                generator=np.random.default_rng(noise_seed(seed, None, len(blocks))),
+                tails_kev=None if left is None else left[rows],
+            )
+            blocks.append(block)
+        done = TranslatedPulses.joined(blocks)
         reasons = counted(done.rejections)
         if array.ndim == 1 and reasons:
             raise CpunetError(f"the pulse cannot be translated: {reasons}")
@@ -356,6 +374,27 @@ class Translator:
             some = windows[rows], drawn.of_rows(rows)
             result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)[:3]
         return Translated(result, codes, begin)
+
+
+def noise_seed(seed: int, key: str | None, block: int) -> int:
+    """Seed of the noise of a block of a file.
+
+    Parameters
+    ----------
+    seed
+        Seed of the translation.
+    key
+        Name of the file or the channel; None for a single file, whose first block then has
+        `seed` itself, as of arrays.
+    block
+        Number of the block in the file.
+    """
+    if key is None and block == 0:
+        return int(seed)
+    # names of files need not be UTF-8
+    digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
+    words = [seed, block, 0, int.from_bytes(digest[:16])]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 def _one_each(name: str, energy_kev: npt.ArrayLike, n: int) -> Energies:

@@ -19,10 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.electronics.baseline_methods import most_frequent
 from cpunet.pulses.parameters import Values
 from cpunet.validation.comparisons import Missing, resampled_quantiles
 
@@ -35,6 +37,8 @@ ACCEPTANCE = 0.9  # fraction of the DEP that survives
 MIN_EVENTS = 20  # events of the DEP: two below the cut
 DEP = "DEP"  # the peak that defines the cuts
 BOOTSTRAPS = 300
+SCALES = 100  # bootstraps of the position of the single-site peak
+NULLS = 200  # draws of a difference without one
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,8 @@ class SurvivalRow:
         Of the other peaks, in percent.
     difference, difference_std, sigma
         Method minus data in percentage points, and the same divided by its error.
+    of_fit
+        Part of the error of the REN that is due to those of its fit.
     """
 
     events: dict[str, int]
@@ -62,6 +68,7 @@ class SurvivalRow:
     difference: ByMethod | None = None
     difference_std: ByMethod | None = None
     sigma: ByMethod | None = None
+    of_fit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class RangeSurvival:
     undefined
         Events there without a finite amplitude, which are not counted.
     survival, survival_std
-        Survival in percent, and its error without that of the cut.
+        Survival in percent, and its error with that of the cut.
     missing
         Reason why there is none.
     """
@@ -151,7 +158,9 @@ def ae_survival(
     return cut, float(cuts.std(ddof=1)), peaks
 
 
-def survival_table(ae: ByPeak, seed: int = 0) -> dict[str, SurvivalRow] | Missing:
+def survival_table(
+    ae: ByPeak, moved: Mapping[str, Values] = MappingProxyType({}), seed: int = 0
+) -> dict[str, SurvivalRow] | Missing:
     """Survival of each peak in data and simulations, each after its own cut.
 
     Since each dataset has its own cut, a wrong scale of A/E alone makes no difference.
@@ -161,6 +170,9 @@ def survival_table(ae: ByPeak, seed: int = 0) -> dict[str, SurvivalRow] | Missin
     ae
         A/E by peak and method, the measured ones under ``"data"``.  Methods that lack a peak
         are left out.
+    moved
+        A/E of the REN by peak at both ends of each axis of the errors of its fit, shape
+        ``(axes, 2, pulses)``.
     seed
         Seed of the bootstraps for the errors of the cuts.
     """
@@ -188,7 +200,21 @@ def survival_table(ae: ByPeak, seed: int = 0) -> dict[str, SurvivalRow] | Missin
             errors = {m: std for m, (_, std, _) in found.items()}
             table[name] = replace(row, cut=cuts, cut_std=errors)
         else:
-            table[name] = _against_data(row, {m: s[2][name] for m, s in found.items()})
+            survival = {m: s[2][name] for m, s in found.items()}
+            of_fit = _of_fit(moved[DEP], moved[name]) if {DEP, name} <= moved.keys() else 0.0
+            if "ren" in survival:
+                kept, error = survival["ren"]
+                survival["ren"] = kept, float(np.hypot(error, of_fit))
+            spread = {
+                m: null_spread(
+                    (ae[DEP]["data"], ae[DEP][m]), (of_peak["data"], of_peak[m]), rng
+                )
+                for m in methods
+                if m != "data"
+            }
+            if "ren" in spread:
+                spread["ren"] = float(np.hypot(spread["ren"], of_fit))
+            table[name] = _against_data(replace(row, of_fit=of_fit), survival, spread)
     return table
 
 
@@ -198,6 +224,7 @@ def peak_survival(
     cut: float,
     peak: Range,
     sidebands: Sequence[Range] = (),
+    cut_std: float = 0.0,
 ) -> RangeSurvival:
     """Survival of a gamma line after a low-A/E cut, with its background subtracted.
 
@@ -213,6 +240,8 @@ def peak_survival(
         Range of the line in keV: lower end (included) and upper end (excluded).
     sidebands
         Ranges in keV beside the line that contain only background.
+    cut_std
+        Error of the cut.
     """
     finite = np.isfinite(amplitude)
     in_peak, beside = _within(energy_kev, [peak]), _within(energy_kev, sidebands)
@@ -234,6 +263,11 @@ def peak_survival(
         return replace(found, missing=f"the sidebands leave no events of {n} {span}")
     if not scale or not std:
         std = 100 * survival_error(passing, n)
+    if cut_std:
+        ends = (cut - cut_std, cut + cut_std)
+        kept = [peak_survival(amplitude, energy_kev, end, peak, sidebands) for end in ends]
+        low, high = (one.survival or 0.0 for one in kept)
+        std = float(np.hypot(std, 0.5 * (low - high)))
     return replace(found, survival=survival, survival_std=std)
 
 
@@ -303,12 +337,118 @@ def _peak_survival(values: Values, cut: float, cuts: Values) -> Spread:
     return 100 * passing / n, error
 
 
-def _against_data(row: SurvivalRow, found: Mapping[str, Spread]) -> SurvivalRow:
+def dep_scale(dep_ae: Values, seed: int = 0) -> Spread:
+    """Position of the single-site peak of A/E in the double-escape peak, and its error.
+
+    Parameters
+    ----------
+    dep_ae
+        A/E of the events of the peak; values that are not finite are left out.
+    seed
+        Seed of the bootstraps.
+    """
+    known = dep_ae[np.isfinite(dep_ae)]
+    if known.size < MIN_EVENTS:
+        return np.nan, np.nan
+    rng = np.random.default_rng(seed)
+    drawn = [most_frequent(rng.choice(known, known.size)) for _ in range(SCALES)]
+    return most_frequent(known), float(np.std(drawn, ddof=1))
+
+
+def subtracted(
+    table: Mapping[str, SurvivalRow], ranges: Mapping[str, Mapping[str, RangeSurvival]]
+) -> dict[str, SurvivalRow]:
+    """The table with the background of lines subtracted, and with ranges of the continuum.
+
+    Parameters
+    ----------
+    table
+        Result of `survival_table`.
+    ranges
+        Survival by range and method, see `peak_survival`.
+    """
+    found = dict(table)
+    for name, methods in ranges.items():
+        kept = {
+            method: (one.survival, one.survival_std)
+            for method, one in methods.items()
+            if one.survival is not None and one.survival_std is not None
+        }
+        if "data" not in kept:
+            continue
+        spread = None
+        if name in table and (plain := table[name].difference_std) is not None:
+            # the subtraction adds the sampling of events below the line
+            own = table[name].survival_std or {}
+            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in kept.items()}
+            spread = {
+                m: float(np.sqrt(std**2 + more[m] + more["data"]))
+                for m, std in plain.items()
+                if m in kept
+            }
+        row = SurvivalRow(
+            {method: one.peak for method, one in methods.items()},
+            {method: one.undefined for method, one in methods.items()},
+        )
+        found[name] = _against_data(row, kept, spread)
+    return found
+
+
+def _of_fit(dep: Values, other: Values) -> float:
+    """Error of a survival in percent from those of the fit, see `survival_table`."""
+    kept = np.zeros(dep.shape[:2])
+    for axis, end in np.ndindex(*kept.shape):
+        single, some = (v[axis, end][np.isfinite(v[axis, end])] for v in (dep, other))
+        if min(single.size, some.size) < MIN_EVENTS:
+            return 0.0
+        cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
+        kept[axis, end] = 100 * (some >= cut).mean()
+    return float(np.sqrt((0.25 * (kept[:, 0] - kept[:, 1]) ** 2).sum()))
+
+
+def null_spread(
+    dep: tuple[Values, Values], other: tuple[Values, Values], rng: np.random.Generator
+) -> float:
+    """Standard deviation in percent of the difference of two survivals without a difference.
+
+    Few events set a cut, below which those of other peaks are dense: errors of a survival grow
+    with it, and two of them in quadrature are too large for most differences, and too small for
+    some.  So the events of both sets together, in units of their medians, are divided anew, at
+    random.
+
+    Parameters
+    ----------
+    dep, other
+        A/E of the double-escape peak and of the other one, of both sets.
+    rng
+        Random generator.
+    """
+    sets = [[v[np.isfinite(v)] for v in both] for both in (dep, other)]
+    if min(v.size for v in sets[0]) < MIN_EVENTS or not all(v.size for v in sets[1]):
+        return float("nan")
+    unit = [np.median(v) for v in sets[0]]
+    pooled = [np.concatenate([v / u for v, u in zip(both, unit, strict=True)]) for both in sets]
+    sizes = [both[0].size for both in sets]
+    found = np.empty((NULLS, 2))
+    for kept in found:
+        drawn = [np.split(rng.permutation(v), [n]) for v, n in zip(pooled, sizes, strict=True)]
+        for side, (single, some) in enumerate(zip(*drawn, strict=True)):
+            cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
+            kept[side] = 100 * (some >= cut).mean()
+    return float(np.diff(found, axis=1).std(ddof=1))
+
+
+def _against_data(
+    row: SurvivalRow, found: Mapping[str, Spread], spread: Mapping[str, float] | None = None
+) -> SurvivalRow:
+    """Differences from the data, with errors as given or those of both in quadrature."""
     (data, data_std), difference, std, sigma = found["data"], {}, {}, {}
     for method, (survival, error) in found.items():
         if method != "data":
             difference[method] = survival - data
             std[method] = float(np.hypot(error, data_std))
+            if spread is not None:
+                std[method] = spread[method]
             sigma[method] = difference[method] / std[method]
     return replace(
         row,

@@ -158,10 +158,10 @@ def against_energy(
         common = set.intersection(*ranges)
         if len(common) >= 3:
             break
-    if len(common) < 2:
+    if len(common) < 3:  # a line through two points has no chi-square
         return AgainstEnergy(
             missing=f"A/E can be fitted in {len(common)} ranges of energy only; "
-            "it takes two that both sides have: give events of more energies"
+            "it takes three that both sides have: give events of more energies"
         )
     methods = {
         method: _course([p for p in found if (p.low_kev, p.high_kev) in common])

@@ -16,10 +16,16 @@ import numpy as np
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.plotting import label
+from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.tables import NO_VALUE, text_table
+from cpunet.training.response import Response, response
+from cpunet.training.run import Run, RunLike
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 from cpunet.validation.verdicts import (
+    MAIN,
+    QUANTITIES,
     Metrics,
+    judged_parameters,
     judged_scores,
     methods_of,
     number,
@@ -223,21 +229,22 @@ class Comparison:
 
 
 def compare(
-    *reports: str | Path | Report,
+    *reports: RunLike | Report,
     method: str = "ren",
     out: str | Path | None = None,
     force: bool = False,
-) -> Comparison:
-    """Put the scores of several validations beside each other, of one detector or of many.
+) -> Comparison | Response:
+    """Compare the scores of several validations, of one detector or of many.
 
     The page also has links to the reports, and room for many detectors and periods. Of runs
-    that differ in their seed only, the median and the standard deviation are told as well.
+    that differ in their seed only, it has the median and the standard deviation as well.
     Reports that are missing are listed.
 
     Parameters
     ----------
     reports
-        Folders of cpunet validate or demo, or their metrics.json.
+        Folders of cpunet validate or demo, or their metrics.json. From Python also reports, or
+        runs, whose readouts are compared as by ``cpunet.response``.
     method
         Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.
     out
@@ -247,8 +254,8 @@ def compare(
 
     Returns
     -------
-    Comparison
-        Scores of the runs side by side.
+    Comparison or Response
+        Scores of the runs side by side; of runs, their readouts.
 
     Raises
     ------
@@ -262,10 +269,15 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
+    if runs := [report for report in reports if isinstance(report, Run)]:
+        if len(runs) < len(reports):
+            raise CpunetError("runs and reports are not compared", "validate the runs")
+        return response(*runs, out=out, force=force)
+    scored = [report for report in reports if not isinstance(report, Run)]
     if out is not None:
-        files = [report for report in reports if not isinstance(report, Report)]
+        files = [report for report in scored if not isinstance(report, Report)]
         _refuse(Path(out), files, force=force)
-    comparison = compared(reports, method=method)
+    comparison = compared(scored, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)
@@ -332,7 +344,7 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
         ceiling = number(one, "iou", "ceiling")
         more = "" if ceiling is None else f" ({ceiling:.1f})"
         iou, error = (number(one, key, method) for key in ("iou", "iou_std"))
-        title = f"{name.replace('_', ' ')}: IoU [%] (ceiling)"
+        title = f"{name.replace('_', ' ')}: IoU [%] (data vs data)"
         found[title] = Cell.of(iou, error, ".1f", 100.0, more)
     auc, error, chance = (
         number(scores, "two_sample", method, key) for key in ("auc", "auc_std", "null_mean")
@@ -342,8 +354,20 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     return found | {
         "classifier: AUC": Cell.of(auc, error, ".3f", chance or 0.0),
         "edge RMSE [10⁻³]": Cell.of(None if edge is None else 1e3 * edge, None, "#.3g", 0.0),
+        **_legend(metrics, peak, method),
         "A/E survival minus data [points]": Cell.of(apart, std, "+.2f", 0.0),
     }
+
+
+def _legend(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
+    """Differences of LEGEND's quantities from the data, by name."""
+    judged, found = judged_parameters(part(metrics, "peaks", peak)), {}
+    for name in (name for name in MAIN if name in judged):
+        shift, error = (number(judged[name], key, method) for key in ("shift", "shift_std"))
+        unit = LABELLED[name].unit
+        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
+        found[title] = Cell.of(shift, error, "+.2g", 0.0)
+    return found
 
 
 class Overview(NamedTuple):
@@ -359,7 +383,9 @@ class Overview(NamedTuple):
 def _overview(name: str, metrics: Metrics, method: str) -> Overview:
     off, judged = judged_scores(metrics, method)
     text = f"{off} of {judged} off" if judged else "not judged"
-    marked = off > 2 and off > 0.2 * judged  # one or two can be off by chance
+    marked = off > 2 and off > 0.2 * judged  # one or two of many may be off
+    if part(metrics, "training").get("ok") is False:
+        text, marked = f"{text}, a bad fit", True
     lines = [summary(metrics, peak, method) for peak in part(metrics, "peaks")]
     about = "; ".join(f"{key}: {text}" for key, text in part(metrics, "compared").items())
     return Overview(name, text, marked, lines, about)

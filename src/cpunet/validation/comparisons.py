@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import NamedTuple, Self, TypedDict
 
 import hist
@@ -37,6 +38,9 @@ NULL_NODES = 4096
 Counts = npt.NDArray[np.float32]
 Bins = npt.NDArray[np.integer]
 Draws = tuple["Resampled", "Resampled"]  # of the two datasets that are compared
+
+# Bins of a test of two samples, and events of the smaller one expected in each.
+TEST_BINS, EXPECTED = 16, 15
 
 # Above this number of events, bin counts are drawn directly, in a time independent of the
 # number of events; below it, sums over drawn events are up to ten times faster.
@@ -371,6 +375,12 @@ class Compared(TypedDict):
     ks_std: ByMethod
     ks_null: float
     ks_null_std: float
+    mean: float
+    shift: ByMethod
+    shift_std: ByMethod
+    chi_square: ByMethod
+    degrees: dict[str, int]
+    p: ByMethod
     missing: dict[str, int]
     axis: dict[str, float | None]
 
@@ -488,11 +498,94 @@ def _axis_bins(values: Values, axis: hist.axis.Regular) -> tuple[Bins, int]:
     return np.where(np.isnan(values), axis.size + 2, places), axis.size + 3
 
 
+class Tested(NamedTuple):
+    """Chi-square of two samples, its degrees of freedom, and the probability of more."""
+
+    chi_square: float
+    degrees: int
+    p: float
+
+
+def two_sample_test(a: Values, b: Values, moved: Values | None = None) -> Tested:
+    r"""Whether two samples are of one distribution, but for the errors of a fit.
+
+    .. math:: \chi^2 = d^T \left[ \left(\tfrac{1}{n} + \tfrac{1}{m}\right)
+        \left(\mathrm{diag}(q) - q q^T\right) + \sum_k \delta_k \delta_k^T \right]^{-1} d
+
+    with the difference :math:`d` of the shares in bins of equal numbers of events of both
+    samples together, their common shares :math:`q`, and the change :math:`\delta_k` of the
+    shares with one standard deviation along each axis of the errors of the fit.  Undefined
+    values are a bin of their own, or with the last one if they are few.
+
+    Parameters
+    ----------
+    a, b
+        Values of one parameter in both samples.
+    moved
+        Values of pulses of `b` at both ends of each axis, shape ``(axes, 2, pulses)``.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> a, b = rng.normal(size=500), rng.normal(size=400)
+    >>> two_sample_test(a, b).p > 0.05, two_sample_test(a, b + 0.5).p < 1e-4
+    (True, True)
+    """
+    from scipy.stats import chi2
+
+    pooled = np.concatenate([a, b])
+    finite = np.sort(_finite(pooled))
+    least = min(len(a), len(b))
+    if least < 2 * EXPECTED or not finite.size:
+        return Tested(np.nan, 0, np.nan)
+    n_bins = min(TEST_BINS, least // EXPECTED)
+    edges = np.unique(np.quantile(finite, np.linspace(0, 1, n_bins + 1)[1:-1]))
+    apart = np.isnan(pooled).sum() * least / len(pooled) >= EXPECTED
+
+    def shares(values: Values) -> Values:
+        last = len(edges) + 1 if apart else len(edges)
+        place = np.where(np.isnan(values), last, np.searchsorted(edges, values, side="right"))
+        return np.bincount(place, minlength=len(edges) + 1 + apart) / len(values)
+
+    common = shares(pooled)
+    covariance = (np.diag(common) - np.outer(common, common)) * (1 / len(a) + 1 / len(b))
+    for low, high in () if moved is None else moved:
+        change = 0.5 * (shares(low) - shares(high))
+        covariance += np.outer(change, change)
+    known = np.flatnonzero(common)[1:]  # shares sum to 1
+    if not known.size:
+        return Tested(0.0, 0, 1.0)
+    apart_by = (shares(a) - shares(b))[known]
+    size = float(apart_by @ np.linalg.solve(covariance[np.ix_(known, known)], apart_by))
+    return Tested(size, known.size, float(chi2.sf(size, known.size)))
+
+
+def shift(a: Values, b: Values, moved: Values | None = None) -> tuple[float, float]:
+    """Mean of `b` minus that of `a`, and its error with those of a fit.
+
+    Values beyond the ranges of both (`data_axis`) count as their ends, so that few outliers
+    do not decide.
+    """
+    one, other = _finite(a), _finite(b)
+    if min(len(one), len(other)) < 2:
+        return np.nan, np.nan
+    ends = np.array([data_axis(values, 1).edges for values in (one, other)])
+    low, high = ends.min(), ends.max()
+    one, other = one.clip(low, high), other.clip(low, high)
+    variance = sum(values.var(ddof=1) / len(values) for values in (one, other))
+    if moved is not None:
+        known = np.isfinite(moved).all(axis=(0, 1))
+        means = moved[:, :, known].clip(low, high).mean(axis=2)
+        variance += (0.25 * (means[:, 0] - means[:, 1]) ** 2).sum()
+    return float(other.mean() - one.mean()), float(np.sqrt(variance))
+
+
 def compare(
     data: Mapping[str, Values],
     methods: Mapping[str, Mapping[str, Values]],
     scores: ScoreConfig,
     seed: int,
+    moved: Mapping[str, Mapping[str, Values]] = MappingProxyType({}),
 ) -> dict[str, Compared]:
     """Compare each parameter of the data with that of every method.
 
@@ -506,6 +599,9 @@ def compare(
         Score settings: numbers of bins and of bootstraps.
     seed
         Seed of the bootstraps.
+    moved
+        Values by method and parameter at both ends of each axis of the errors of its fit,
+        see `two_sample_test`.
 
     Returns
     -------
@@ -521,6 +617,11 @@ def compare(
         ``wasserstein_null``, ``ks_null``, ``wasserstein_null_std``, ``ks_null_std``
             mean and spread of the distances of two samples of the data's own distribution,
             at the sizes of the data and of the largest of the simulated datasets.
+        ``mean``, ``shift``, ``shift_std``
+            mean of the data within the bins; that of a method minus that of the data, and its
+            error.
+        ``chi_square``, ``degrees``, ``p``
+            by method, see `two_sample_test`.
         ``missing``
             number of NaN values, by method and for the ``data``.
         ``axis``
@@ -548,6 +649,10 @@ def compare(
             axis = axes.get(name)
             one["iou"][method] = np.nan if axis is None else iou(*both, axis)
             one["iou_std"][method] = np.nan if axis is None else iou_error(*both, axis, draws)
+            ends = moved.get(method, {}).get(name)
+            one["shift"][method], one["shift_std"][method] = shift(*both, ends)
+            tested = two_sample_test(*both, ends)
+            one["chi_square"][method], one["degrees"][method], one["p"][method] = tested
     return found
 
 
@@ -567,6 +672,12 @@ def _of_data(data: Values, null: Draws, axis: hist.axis.Regular | None) -> Compa
         ks_std={},
         ks_null=distances.ks,
         ks_null_std=distances.ks_std,
+        mean=np.nan if axis is None else float(_finite(data).clip(*axis.edges[[0, -1]]).mean()),
+        shift={},
+        shift_std={},
+        chi_square={},
+        degrees={},
+        p={},
         missing={"data": int(np.isnan(data).sum())},
         axis={"low": low, "high": high, "bins": None if axis is None else axis.size},
     )

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cpunet.pulses.parameters import PARAMETERS, Values
-from cpunet.pulses.shape_parameters import data_axis
+from cpunet.pulses.shape_parameters import A_OVER_E, data_axis
 from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import ae_energy_figure
@@ -23,15 +23,19 @@ from cpunet.validation.run_figures import (
     further_histograms,
     loss_curves,
     nearest,
+    overlap_figure,
     parameter_histograms,
     roc_figure,
     shape_figure,
 )
 from cpunet.validation.slices import MeanPulse, around_half
+from cpunet.validation.verdicts import held_out, judged_parameters
 
-# methods in the figures; more lines could not be distinguished
-DRAWN = ("data", "raw", "gauss_exp", "superpulse", "ren", "truth")
-SINGLE = ("raw", "rc", "ren", "truth")  # methods in the figure of a single pulse
+# methods in the figures; a reader may hide some
+DRAWN = ("data", "raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth")
+SINGLE = ("raw", "rc", "rc_late", "ren", "truth")  # methods in the figure of a single pulse
+SLICED = ("data", "rc", "rc_late", "ren")  # and in slices
+MAIN_FIGURES = (A_OVER_E, "rise_time", "lq")  # further parameters with a figure of their own
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
 
 Drawing = Callable[[], Figure]
@@ -41,6 +45,8 @@ T = TypeVar("T")
 def drawings(found: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
+    if peaks := held_out(found.metrics):
+        drawn["overlap with data"] = partial(overlap_figure, found.metrics, peaks)
     if found.ae_energy.methods:
         drawn["A over E and energy"] = partial(ae_energy_figure, found.ae_energy.methods)
     for peak in found.sets:
@@ -92,26 +98,25 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         by_method = {m: v[parameter] for m, v in values.items()}
         if not np.isfinite(data).any():
             continue
-        if parameter in PARAMETERS:
-            axis, compared = data_axis(data, bins), scores["parameters"][parameter]
+        if parameter in (*PARAMETERS, *MAIN_FIGURES):
+            axis, compared = data_axis(data, bins), judged_parameters(scores)[parameter]
             how = (by_method, axis, parameter, name, compared)
-            drawn[parameter] = partial(parameter_histograms, *how)
+            drawn[parameter.replace("_", " ")] = partial(parameter_histograms, *how)
         else:
             further[parameter] = by_method
     drawn["further parameters"] = partial(further_histograms, further, bins, name)
     slices = found.slices[name]
     means = {"": {method: of_method.whole for method, of_method in _shown(slices).items()}}
-    title = f"{name}: mean pulse; bands: ±1 standard error"
+    title = f"{name}: mean pulse"
     drawn["mean pulse"] = partial(shape_figure, means, dt_ns, title)
     edges = slices["data"].edges
     columns = {
         f"{low:.0f} … {high:.0f} ns": {
-            m: of_method.pulses[i]
-            for m, of_method in _shown(slices, ("data", "superpulse", "ren")).items()
+            m: of_method.pulses[i] for m, of_method in _shown(slices, SLICED).items()
         }
         for i, (low, high) in enumerate(pairwise(edges))
     }
-    title = f"{name}: superpulses in slices of rise time 1–90 %; bands: ±1 standard error"
+    title = f"{name}: superpulses in slices of rise time 1–90 %"
     drawn["superpulses"] = partial(shape_figure, columns, dt_ns, title)
     if (single := _single_pulse(peak)) is not None:
         drawn["single pulse"] = single

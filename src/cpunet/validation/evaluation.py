@@ -10,13 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
+from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.pulses.reading.files import PulseFile
+from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import REN
@@ -24,12 +28,16 @@ from cpunet.validation.a_over_e import (
     DEP,
     Range,
     RangeSurvival,
+    Spread,
     SurvivalRow,
+    dep_scale,
     peak_survival,
+    subtracted,
     survival_table,
 )
 from cpunet.validation.ae_energy import AgainstEnergy, against_energy
 from cpunet.validation.comparisons import Missing
+from cpunet.validation.fit_errors import fit_ends, moved_values
 from cpunet.validation.methods import (
     Translations,
     fit_baseline_methods,
@@ -112,8 +120,17 @@ def evaluate(
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
+    ends = fit_ends(run, ren)
+    with stage("Moving by errors of the fit", len(sets)) as bar:
+        moved = {}
+        for peak in sets:
+            moved[peak.name] = moved_values(peak, ends, seed)
+            bar.update(1)
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        scored = pool.map(partial(score_peak, recipe=recipe, seed=seed), sets)
+        scales = _dep_scales(sets, seed)
+        decays = _decays_ns(translations)
+        work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
+        scored = pool.map(work, sets, moved.values())
         for peak, (found, peaks[peak.name]) in zip(sets, scored, strict=True):
             if found:
                 values[peak.name] = found
@@ -130,8 +147,12 @@ def evaluate(
             name: {method: v["current_amplitude"] for method, v in of_peak.items()}
             for name, of_peak in values.items()
         },
+        {name: of_peak["current_amplitude"] for name, of_peak in moved.items() if of_peak},
         seed=seed,
     )
+    ranges = _range_survivals(translations, kept, recipe)
+    if not isinstance(kept, Missing) and not isinstance(ranges, Missing):
+        kept = subtracted(kept, ranges)
     known = None if run.fit is None else run.fit.tails
     ae_energy = against_energy(
         {method: translations.amplitudes[method] for method in ("data", "ren")},
@@ -142,10 +163,9 @@ def evaluate(
         "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
         "ae_survival": kept,
-        "ae_details": {
-            "survival by energy range": _range_survivals(translations, kept, recipe)
-        },
+        "ae_details": {"survival by energy range": ranges},
         "ae_energy": ae_energy,
+        "a_over_e_scale": {method: list(spread) for method, spread in scales.items()},
         "baseline_methods": {
             "fits": {
                 name: method.describe() for name, method in baseline_methods.methods.items()
@@ -153,7 +173,7 @@ def evaluate(
             "missing": baseline_methods.missing,
         },
         "training": {"recipe": recipe.name}
-        | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak")},
+        | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
         "tails": None if known is None else known.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
@@ -166,6 +186,28 @@ def evaluate(
         "table": verdict_table(stored),
     }
     return Evaluation(run, sets, values, slices, ae_energy, stored)
+
+
+def _decays_ns(translations: Translations) -> dict[str, float]:
+    """Decay of all pulses of each method, as an analysis has one for a channel."""
+    dt_ns = translations.ren.dt_ns
+    samples = translations.ren.recipe.preparation.at(dt_ns).decay_fit_samples
+    return {
+        method: median_decay_ns(tail_slope(windows, dt_ns, samples))
+        for method, windows in translations.windows.items()
+    }
+
+
+def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
+    """Position of the single-site peak of A/E in the DEP, and its error, by method."""
+    dep = next((peak for peak in sets if peak.name == DEP), None)
+    if dep is None:
+        return {}
+    found = {
+        method: dep_scale(dep.translations.amplitudes[method][rows], seed)
+        for method, rows in dep.rows.items()
+    }
+    return found if np.isfinite(list(found.values())).all() else {}
 
 
 def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
@@ -184,13 +226,18 @@ def _range_survivals(
     """A/E survival of gamma lines, sideband-subtracted, and of continua, after known cuts."""
     if isinstance(ae_survival, Missing):
         return Missing(f"there is no A/E cut: {ae_survival.missing}")
-    cuts = ae_survival[DEP].cut or {}  # each method has its own
+    cuts, errors = ae_survival[DEP].cut or {}, ae_survival[DEP].cut_std or {}  # of each method
     ranges = {name: line for name, line in _lines(recipe).items() if name != DEP}
     ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
     return {
         name: {
             method: peak_survival(
-                values, translations.energy_kev[method], cuts[method], span, sidebands
+                values,
+                translations.energy_kev[method],
+                cuts[method],
+                span,
+                sidebands,
+                errors[method],
             )
             for method, values in translations.amplitudes.items()
             if method in cuts

@@ -19,16 +19,32 @@ from cpunet.html_pages import asset, figure_html, joined, part, rendered
 from cpunet.plotting import COLOURS, label
 from cpunet.progress import stage
 from cpunet.pulses.parameters import PARAMETERS
-from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS
+from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.settings import flat
 from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.ae_energy import REFERENCE_KEV
 from cpunet.validation.report import PAGE
-from cpunet.validation.verdicts import Metrics
+from cpunet.validation.verdicts import Metrics, called, headline, held_out, main_table
 
-FIRST = 2  # figures of mean pulses at the top of the page, and of noise
+FIRST = 3  # figures of overlap and mean pulses at the top of the page, and of noise
+# What a figure shows, for readers of its text alone, by the end of its name.
+SHOWS = {
+    "overlap with data": "overlap with the data by quantity and method; band: data with data",
+    "mean pulse": "mean pulse of the data and each method; differences in standard errors",
+    "superpulses": "mean pulses in four ranges of rise time; differences in standard errors",
+    "noise": "noise power before the pulse by frequency, data and REN; their ratio",
+    "single pulse": "one simulated pulse by each method, and the nearest measured one",
+    "further parameters": "distributions of further parameters, data and each method",
+    "A over E survival": "survival of other peaks against that of the double-escape peak",
+    "A over E and energy": "position and width of the single-site peak of A/E against energy",
+}
+DISTRIBUTION = "distribution in the data and by each method, and differences in standard errors"
 # section of a figure by the end of its name; all others are under Details
 PLACES = {
+    "overlap with data": "first",
+    "a over e": "distributions",
+    "rise time": "distributions",
+    "lq": "distributions",
     "A over E survival": "ae",
     "A over E and energy": "ae_energy",
     "mean pulse": "first",
@@ -63,10 +79,14 @@ def write_page(
     with stage("Drawing", len(figures)) as bar:
         for name, draw in figures.items():
             stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
-            drawn[name] = figure_html(name.replace("_", " "), draw(), folder / f"{stem}.svg")
+            shows = next((t for end, t in SHOWS.items() if name.endswith(end)), DISTRIBUTION)
+            file = folder / f"{stem}.svg"
+            drawn[name] = figure_html(name.replace("_", " "), draw(), file, shows)
             bar.update(1)
     ranges = metrics.get("ae_details", {}).get("survival by energy range", {})
     placed = _placed(drawn, metrics.get("training", {}).get("peak"))
+    peaks = held_out(metrics)
+    good, verdict = headline(metrics) if peaks else (False, "")
     scores = [peak_html(name, scores) for name, scores in metrics.get("peaks", {}).items()]
     # of each method that is drawn, for the page's legend
     methods = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn.values())))
@@ -76,6 +96,9 @@ def write_page(
         compared={name: number(v) for name, v in metrics.get("compared", {}).items()},
         placed=placed,
         notes=notes,
+        good=good,
+        headline=verdict,
+        table=part("main_table", *main_table(metrics, peaks)) if peaks else "",
         verdicts=verdicts_html(metrics.get("verdicts", {})),
         methods=[{"name": m, "label": label(m), "colour": COLOURS[m]} for m in methods],
         scores=joined(scores),
@@ -113,24 +136,19 @@ def verdicts_html(verdicts: Mapping[str, Any]) -> Markup:
     """Return the verdicts in plain words; nothing without verdicts."""
     if not verdicts:
         return Markup()
-    spelt = {"auc": "AUC", "wasserstein": "W₁", "ae": "A/E"}
     rows = [
         [
-            *(peak, label(method), " ".join(spelt.get(w, w) for w in quantity.split("_"))),
-            *(_sigma(found["sigma"]), found["words"]),
+            *(peak, label(method), called(quantity), found["numbers"]),
+            *(number(found["p"]), found["words"]),
         ]
         for peak, methods in verdicts.get("table", {}).items()
         for method, quantities in methods.items()
         for quantity, found in quantities.items()
     ]
-    head = ["Peak", "Method", "Quantity", "σ", "In words"]
-    table = part("table", head, rows, {0, 1, 2, 4})
-    return joined(
-        [
-            part("points", verdicts["summary"]),
-            part("folded", "Each verdict", table, screen=True),
-        ]
-    )
+    head = ["Peak", "Method", "Quantity", "Difference", "p", "Verdict"]
+    table = part("table", head, rows, {0, 1, 2, 5})
+    words = part("folded", "All quantities in words", part("points", verdicts["summary"]))
+    return joined([words, part("folded", "Each verdict", table, screen=True) if rows else ""])
 
 
 def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
@@ -151,7 +169,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
         parts.append(part("p", f"{text}like data: {'; '.join(counts)}."))
     tables = []
     if tested := scores.get("two_sample", {}):
-        head = ["Distinguished from data by a classifier", "AUC", "Same with shuffled labels"]
+        head = ["Distinguished from data by a classifier", "AUC", "Null AUC"]
         pairs = (("auc", "auc_std"), ("null_mean", "null_std"))
         rows = [
             [label(method), NO_VALUE, found["missing"]]
@@ -250,10 +268,10 @@ def pairs_table(values: Mapping[str, Any], head: tuple[str, str]) -> Markup:
 
 
 def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
-    """One row per parameter and method, and one with the ceiling."""
+    """One row per parameter and method, and one of data with data."""
     rows = []
     for name, values in parameters.items():
-        unit, iou, error = SHAPE_PARAMETERS[name].unit, values["iou"], values["iou_std"]
+        unit, iou, error = LABELLED[name].unit, values["iou"], values["iou_std"]
         title = name.replace("_", " ").capitalize() + (f" [{unit}]" if unit else "")
         for method, distance in values["wasserstein"].items():
             moved = with_std(distance, values["wasserstein_std"][method])
@@ -266,7 +284,7 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
             with_std(values[f"{kind}_null"], values[f"{kind}_null_std"])
             for kind in ("wasserstein", "ks")
         )
-        rows.append([title, "Ceiling", ceiling, moved, apart])
+        rows.append([title, "Data vs data", ceiling, moved, apart])
     head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS"]
     return part("table", head, rows, {0, 1})
 

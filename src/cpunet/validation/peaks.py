@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -13,7 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.peaks import EnergySelection
-from cpunet.pulses.shape_parameters import all_parameters
+from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.recipes.schema import Recipe
 from cpunet.validation.comparisons import Compared, Missing, compare
@@ -116,17 +117,32 @@ class PeakScores:
     missing: str | None = None
 
 
-def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, PeakScores]:
+def score_peak(
+    peak: PeakSets,
+    moved: Mapping[str, Values],
+    *,
+    recipe: Recipe,
+    seed: int,
+    scales: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    decays_ns: Mapping[str, float] = MappingProxyType({}),
+) -> tuple[ByMethod, PeakScores]:
     """Compare the pulses of a peak, method by method.
 
     Parameters
     ----------
     peak
         Pulses of the peak.
+    moved
+        What the errors of the fit do to translated pulses, see
+        `cpunet.validation.fit_errors.moved_values`.
     recipe
         Recipe of the run.
     seed
         Seed of bootstraps and folds.
+    scales
+        A/E of the single-site peak in the double-escape peak and its error, by method.
+    decays_ns
+        Decay of all pulses of a method, for which LEGEND's parameters are corrected.
 
     Returns
     -------
@@ -145,9 +161,16 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, Pea
             recipe.preparation,
             recipe.scores,
             amplitudes=peak.translations.amplitudes[method][rows],
+            decay_ns=decays_ns.get(method),
         )
         for method, rows in peak.rows.items()
     }
+    ends = {"ren": dict(moved)} | {m: {} for m in values if m not in ("data", "ren")}
+    for method, of_method in values.items() if scales else ():
+        scale, _ = scales[method]
+        of_method[A_OVER_E] = of_method["current_amplitude"] / scale
+        if method != "data":
+            ends[method][A_OVER_E] = _normalised(of_method[A_OVER_E], method, scales)
     chief, further = (
         {
             m: {name: v for name, v in of.items() if (name in PARAMETERS) is chosen}
@@ -163,17 +186,34 @@ def score_peak(peak: PeakSets, recipe: Recipe, seed: int) -> tuple[ByMethod, Pea
     )
     return values, replace(
         counted,
-        parameters=_compared(chief, recipe, seed),
-        further=_compared(further, recipe, seed),
+        parameters=_compared(chief, recipe, seed, ends),
+        further=_compared(further, recipe, seed, ends),
         two_sample=classifier_tests(peak, chief, seed),
         noise=noise,
         paired=peak.paired_scores(),
     )
 
 
-def _compared(values: ByMethod, recipe: Recipe, seed: int) -> dict[str, Compared]:
+def _normalised(
+    values: Values,
+    method: str,
+    scales: Mapping[str, tuple[float, float]],
+) -> Values:
+    """A/E over that of the double-escape peak at both ends of each axis of its errors.
+
+    The last axis is the error of both scales.  Parameters of the fit move A/E of both peaks;
+    what is left of that is far less than the error of the scales.
+    """
+    one, other = (scales[m][1] / scales[m][0] for m in ("data", method))
+    error = np.hypot(one, other)
+    return np.stack([values * (1 + error), values * (1 - error)])[np.newaxis]
+
+
+def _compared(
+    values: ByMethod, recipe: Recipe, seed: int, moved: Mapping[str, Mapping[str, Values]]
+) -> dict[str, Compared]:
     methods = {method: of_method for method, of_method in values.items() if method != "data"}
-    return compare(values["data"], methods, recipe.scores, seed)
+    return compare(values["data"], methods, recipe.scores, seed, moved)
 
 
 def classifier_tests(

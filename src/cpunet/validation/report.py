@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import shutil
 from collections import UserDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
@@ -17,15 +18,23 @@ import numpy as np
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.parameters import Values
 from cpunet.settings import plain, read_json
 from cpunet.tables import text_table
-from cpunet.validation.verdicts import Metrics, judged_scores
+from cpunet.validation.verdicts import (
+    Metrics,
+    headline,
+    held_out,
+    judged_scores,
+    main_table,
+)
 
 if TYPE_CHECKING:
-    import hist
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from cpunet.pulses.shape_parameters import Histogram
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
@@ -34,12 +43,18 @@ REPORT = FolderKind(
     own=r"metrics\.json|report\.html|parameters\.npz",
 )
 # methods of the printed table, in the order of the page; those without noise are in the metrics
-_METHODS = ("raw", "rc", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
+_METHODS = ("raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
 _NAMES = {
+    "raw": "simulation",
+    "truth": "true resp.",
+    "rc": "RC",
+    "gauss_exp": "Gauss ⊗ exp",
     "ren": "REN",
     "current_amplitude": "I_max",
     "drift_time": "T_drift",
     "tail_slope": "tail slope",
+    "rc_late": "RC + late",
+    "ceiling": "data vs data",
 }
 _SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table
 
@@ -131,22 +146,29 @@ class Report:
         return list(self.metrics["verdicts"]["summary"])
 
     @property
-    def figures(self) -> Mapping[str, Figure]:
-        """Figures by name, drawn on every access."""
-        return _Figures(self.drawn or {})
+    def figures(self) -> Mapping[str, Figure | Picture]:
+        """Figures by name, drawn on every access; of an opened report its pictures."""
+        if self.drawn is None:
+            files = [] if self.folder is None else sorted(self.folder.glob("*.svg"))
+            return {file.stem.replace("_", " "): Picture(file) for file in files}
+        return _Figures(self.drawn)
 
-    def hist(self, peak: str, parameter: str = "current_amplitude") -> hist.Hist[Any]:
-        """Distributions of a parameter by method, in the bins in which it is scored.
+    def hist(
+        self, peak: str, parameter: str = "current_amplitude", bins: int | None = None
+    ) -> Histogram:
+        """Distributions of a parameter by method, in the range in which it is scored.
 
         Parameters
         ----------
         peak, parameter
             Names of both.
+        bins
+            Number of bins; that of the score by default.
 
         Returns
         -------
-        hist.Hist
-            Axes ``method`` (categories) and the parameter.
+        Histogram
+            A `hist.Hist` with the axes ``method`` (categories) and the parameter.
 
         Raises
         ------
@@ -155,22 +177,26 @@ class Report:
         """
         import hist
 
-        from cpunet.pulses.shape_parameters import labelled
+        from cpunet.pulses.shape_parameters import Histogram, labelled
 
         of_peak = named(self.values, peak, "scored peak")
         named(of_peak["data"], parameter, "parameter")
         scores = self.metrics["peaks"][peak]
         compared = (scores["parameters"] | scores["further"])[parameter]
-        low, high, bins = (compared["axis"][key] for key in ("low", "high", "bins"))
-        axis = labelled(hist.axis.Regular(bins, low, high), parameter)
-        methods = hist.axis.StrCategory(list(of_peak), name="method")
-        made: hist.Hist[Any] = hist.Hist(methods, axis)
+        low, high, scored = (compared["axis"][key] for key in ("low", "high", "bins"))
+        axis = labelled(hist.axis.Regular(scored, low, high), parameter, bins)
+        made = Histogram(hist.axis.StrCategory(list(of_peak), name="method"), axis)
         for method, values in of_peak.items():
             made.fill(method, values[parameter][np.isfinite(values[parameter])])
         return made
 
-    def plot(self, peak: str | None = None, parameter: str = "current_amplitude") -> Figure:
-        """Draw the distributions of a parameter by method, with its scores.
+    def plot(
+        self,
+        peak: str | None = None,
+        parameter: str = "current_amplitude",
+        ax: Axes | None = None,
+    ) -> Axes:
+        """Draw the distributions of a parameter by method, with its scores; return the axes.
 
         Parameters
         ----------
@@ -178,21 +204,28 @@ class Report:
             Name of a scored peak; None for the first.
         parameter
             Name of a scored parameter.
+        ax
+            Where to draw; a new figure of pyplot by default.
 
         Raises
         ------
         CpunetError
             If there is no such peak, or no such parameter is scored there.
         """
+        from cpunet.plotting import own_axes
         from cpunet.validation.drawings import DRAWN
-        from cpunet.validation.run_figures import parameter_histograms
+        from cpunet.validation.run_figures import draw_parameter
 
         peak = next(iter(self.values)) if peak is None else peak
         of_peak = named(self.values, peak, "scored peak")
         compared = named(self._compared(peak), parameter, "scored parameter")
         values = {m: of_peak[m][parameter] for m in DRAWN if m in of_peak}
         axis = self.hist(peak, parameter).axes[1]
-        return parameter_histograms(values, axis, parameter, peak, compared)
+        ax = own_axes(ax)
+        draw_parameter(ax, values, axis, parameter, compared)
+        ax.set_title(peak)
+        ax.legend()
+        return ax
 
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write the report to a folder: page, metrics, values and figures.
@@ -220,7 +253,7 @@ class Report:
             f"{peak}/{method}/{name}": of_method[name]
             for peak, of_peak in self.values.items()
             for method, of_method in of_peak.items()
-            for name in PARAMETERS
+            for name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
         before = gc.get_threshold()
@@ -236,6 +269,9 @@ class Report:
         names = [_NAMES.get(name, name) for name in head]
         rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
         lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
+        if peaks := held_out(self.metrics):
+            table = text_table(*main_table(self.metrics, peaks), words=2)
+            lines = [headline(self.metrics)[1], table, "", *lines]
         for peak, scores in self.metrics["peaks"].items():
             if "missing" in scores:
                 lines.append(f"{peak}: not scored, {scores['missing']}")
@@ -251,7 +287,7 @@ class Report:
 
         (_, _, *methods), rows = self._table(_SHOWN)
         rows = [[peak, name.replace("_", " "), *cells] for peak, name, *cells in rows]
-        head = ["peak", "overlap with data (%)", *methods]
+        head = ["peak", "overlap with data (%)", *(_NAMES.get(m, m) for m in methods)]
         where = {"page": None if self.folder is None else self.folder / PAGE}
         return part("object", "cpunet report", where, head, rows, self.verdicts)
 
@@ -296,6 +332,31 @@ def as_stored(results: Any) -> Any:
     if isinstance(results, Mapping):
         return {name: as_stored(one) for name, one in results.items()}
     return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of a report that was opened: its SVG file, which a notebook shows."""
+
+    path: Path
+
+    def _repr_svg_(self) -> str:
+        return self.path.read_text(encoding="utf-8")
+
+    def savefig(self, path: str | Path) -> None:
+        """Copy the picture.
+
+        Raises
+        ------
+        CpunetError
+            If another format is asked for.
+        """
+        if Path(path).suffix.lower() != ".svg":
+            raise CpunetError(
+                f"{path}: an opened report has its figures as SVG",
+                "give a name in .svg, or validate again for others",
+            )
+        shutil.copyfile(self.path, path)
 
 
 class _Figures(UserDict[str, Any]):

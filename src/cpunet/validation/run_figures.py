@@ -14,14 +14,16 @@ from typing import Any
 
 import hist
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from cpunet.errors import CpunetError
 from cpunet.plotting import (
     COLOURS,
-    GROUP,
+    DATA_FILL,
     STACKED,
+    group,
     label,
     legend_above,
     line,
@@ -30,14 +32,15 @@ from cpunet.plotting import (
     styled,
 )
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.parameters import PARAMETERS, Values
-from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
-from cpunet.validation.comparisons import Compared, histogram
+from cpunet.pulses.parameters import Values
+from cpunet.pulses.shape_parameters import LABELLED, data_axis
+from cpunet.validation.comparisons import histogram
 from cpunet.validation.slices import BEFORE_NS, MeanPulse
+from cpunet.validation.verdicts import QUANTITIES, judged_parameters, methods_of
 
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is told
-LINEAR = 0.1  # percent of full charge, up to which the scale of differences is linear
+SIGMAS, PERCENT = 8.0, 3.0  # range of differences in standard errors, and of full charge
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
@@ -107,7 +110,7 @@ def cycle_figure(pulses: Mapping[str, FloatArray], dt_ns: float) -> Figure:
     for axes, (title, windows) in zip(grid, pulses.items(), strict=True):
         axes.plot(np.arange(windows.shape[1]) * dt_ns * 1e-3, windows.T, linewidth=0.8)
         axes.set(title=title, xlabel="Time [µs]")
-    grid[0].set_ylabel("Pulse height [normalised]")
+    grid[0].set_ylabel("Normalised charge")
     return figure
 
 
@@ -117,29 +120,111 @@ def parameter_histograms(
     axis: hist.axis.Regular,
     parameter: str,
     peak: str,
-    comparison: Compared,
+    comparison: Mapping[str, Any],
 ) -> Figure:
-    """Distributions of one parameter: the data filled, each method as a line.
+    """Distributions of one parameter at a peak, and differences from the data in sigma.
 
-    All histograms sum to one, with the events outside the range, whose share is in the legend
-    beside each method's IoU and the ceiling.
+    For the parameters see `draw_parameter`; `peak` is the name of the gamma line.
+    """
+    figure, ((axes,), (below,)) = panels((5.6, 5.2), 2, **STACKED)
+    draw_parameter(axes, values, axis, parameter, comparison)
+    counts = {method: histogram(v, axis)[1:-2] for method, v in values.items()}
+    sizes = {method: max(len(v), 1) for method, v in values.items()}
+    for method in counts:
+        if method != "data":
+            share, of_data = (counts[m] / sizes[m] for m in (method, "data"))
+            common = (counts[method] + counts["data"]) / (sizes[method] + sizes["data"])
+            error = np.sqrt(common * (1 / sizes[method] + 1 / sizes["data"]))
+            pull = np.divide(
+                share - of_data, error, out=np.full_like(error, np.nan), where=error > 0
+            )
+            steps(below, pull, axis.edges, method, label(method))
+    sigma_panel(below)
+    below.set_xlabel(axes.get_xlabel())
+    axes.set_xlabel("")
+    legend_above(figure, axes, title=peak)
+    return figure
+
+
+def sigma_panel(axes: Axes) -> None:
+    """Residuals in standard deviations, linear, with the range in which all is well."""
+    axes.axhspan(-2, 2, color=DATA_FILL, zorder=0)
+    axes.set(ylabel="Method − data\n[standard errors]", ylim=(-SIGMAS, SIGMAS))
+
+
+@styled
+def overlap_figure(metrics: Mapping[str, Any], peaks: Sequence[str]) -> Figure:
+    """Overlap with the data by quantity and method, and that of data with data as a band.
 
     Parameters
     ----------
+    metrics
+        Content of ``metrics.json``.
+    peaks
+        Peaks, a panel each.
+    """
+    figure, (grid,) = panels((1.2 + 4.2 * len(peaks), 3.6), 1, len(peaks), sharey=True)
+    for axes, peak in zip(grid, peaks, strict=True):
+        compared = judged_parameters(metrics["peaks"][peak])
+        names = [name for name in compared if compared[name]["iou"].get("ceiling") is not None]
+        methods = [m for m in methods_of(metrics, peak) if m != "raw"]
+        for x, name in enumerate(names):
+            iou, error = compared[name]["iou"], compared[name]["iou_std"]
+            middle, half = iou["ceiling"], error["ceiling"]
+            band = {"color": DATA_FILL, "lw": 0, "zorder": 0}
+            axes.fill_between([x - 0.45, x + 0.45], middle - half, middle + half, **band)
+            axes.hlines(middle, x - 0.45, x + 0.45, color=COLOURS["data"], lw=1)
+            for i, method in enumerate(methods):
+                if iou.get(method) is not None:
+                    at = x + 0.7 * ((i + 0.5) / len(methods) - 0.5)
+                    look = {"color": COLOURS[method], "marker": "o", "markersize": 3.5}
+                    name_once = label(method) if x == 0 else "_"
+                    drawn = axes.errorbar(
+                        at,
+                        iou[method],
+                        error[method],
+                        label=name_once,
+                        **look,
+                        lw=0,
+                        elinewidth=1,
+                    )
+                    group(drawn, method)
+        axes.set(title=peak, xticks=range(len(names)), ylim=(0, 100))
+        texts = [QUANTITIES.get(name, name.replace("_", " ")) for name in names]
+        axes.set_xticklabels(texts, rotation=30, ha="right")
+    grid[0].set_ylabel("Overlap with the data [%]\n(bands: data vs data)")
+    legend_above(figure, grid[0], 4)
+    return figure
+
+
+@styled
+def draw_parameter(
+    axes: Axes,
+    values: Mapping[str, Values],
+    axis: hist.axis.Regular,
+    parameter: str,
+    comparison: Mapping[str, Any],
+) -> None:
+    """Draw the distributions of one parameter: the data filled, each method as a line.
+
+    All histograms sum to one, with the events outside the range, whose share is in the legend
+    with each method's IoU and that of data with data.
+
+    Parameters
+    ----------
+    axes
+        Where to draw.
     values
         Values of the parameter by method, the measured ones under ``"data"``.
     axis
         Binning, see `comparisons.data_axis`.
     parameter
         Name of the parameter in `PARAMETERS`.
-    peak
-        Name of the gamma line, for the title.
     comparison
         Result of `comparisons.compare` for the parameter.
     """
-    figure, ((axes,),) = panels((5.6, 4.2))
     for method, of_method in values.items():
-        name, kind = ("ceiling", "ceiling") if method == "data" else (method, "IoU")
+        name, kind = ("ceiling", "data vs data") if method == "data" else (method, "IoU")
         score, missing = comparison["iou"].get(name), int(np.isnan(of_method).sum())
         text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
         text += f", n = {len(of_method)}" + (f", {missing} undefined" if missing else "")
@@ -147,9 +232,7 @@ def parameter_histograms(
         if below + above >= OUTSIDE:
             text += f", {100 * (below + above):.0f} % outside"
         steps(axes, shares, axis.edges, method, text)
-    axes.set(xlabel=PARAMETERS[parameter].axis_label, ylabel="Fraction of events per bin")
-    legend_above(figure, axes, title=peak)
-    return figure
+    axes.set(xlabel=LABELLED[parameter].axis_label, ylabel="Fraction of events per bin")
 
 
 @styled
@@ -175,7 +258,7 @@ def further_histograms(
         for method, of_method in by_method.items():
             share = histogram(of_method, axis)[1:-2] / max(len(of_method), 1)
             steps(axes, share, axis.edges, method, label(method))
-        axes.set(xlabel=SHAPE_PARAMETERS[name].axis_label, yticks=[])
+        axes.set(xlabel=LABELLED[name].axis_label, yticks=[])
         axes.xaxis.set_major_locator(MaxNLocator(4))
     for empty in grid.flat[len(values) :]:
         empty.set_axis_off()
@@ -190,8 +273,8 @@ def shape_figure(
 ) -> Figure:
     """Pulses aligned at half maximum (top) and differences from the data (bottom), by column.
 
-    Bands are standard errors.  The simulation is scaled to the height of the data, which would
-    dominate the difference.
+    Differences are in standard errors; those of neighbouring samples are correlated.  The
+    simulation is scaled to the height of the data, which would dominate the difference.
 
     Parameters
     ----------
@@ -216,22 +299,25 @@ def shape_figure(
                 mean = mean * (data.mean[-1] / mean[-1])
             line(above, time_ns, mean, method, label(method))
             if method != "data":
-                middle = 100 * (mean - data.mean)
-                error = 100 * np.hypot(pulse.error, data.error)
-                band = {"color": COLOURS[method], "gid": GROUP + method, "alpha": 0.2, "lw": 0}
-                line(below, time_ns, middle, method)
-                below.fill_between(time_ns, middle - error, middle + error, **band)
-        counts = "n = " + ", ".join(str(pulse.n) for pulse in pulses.values())
+                apart = mean - data.mean
+                error = np.full(len(apart), 0.01)
+                if data.n > 1:
+                    error = np.hypot(pulse.error, data.error)
+                pull = np.divide(apart, error, out=np.full_like(apart, np.nan), where=error > 0)
+                line(below, time_ns, pull, method)
+        most = max((pulse.n for method, pulse in pulses.items() if method != "data"), default=0)
+        counts = f"{data.n} measured, {most} simulated pulses"
         if data.n > 1:
             above.text(0.97, 0.03, counts, ha="right", transform=above.transAxes, size=8)
         above.set(title=name, xlim=(time_ns[0], time_ns[-1]))
         below.axhline(0, color="black", linewidth=0.8)
         below.set_xlabel("Time from half maximum [ns]")
-    # small differences show beside those of an untranslated simulation
-    grid[1, 0].set_yscale("symlog", linthresh=LINEAR)
-    grid[1, 0].yaxis.set_major_formatter("{x:g}")
-    grid[1, 0].set_ylabel(f"Method − data\n[% of full charge,\nlinear within ± {LINEAR:g}]")
-    grid[0, 0].set_ylabel("Pulse height")
+        if data.n > 1:
+            sigma_panel(below)
+            below.label_outer()
+        else:  # of a pulse alone no error is known
+            below.set(ylabel="Method − data\n[% of full charge]", ylim=(-PERCENT, PERCENT))
+    grid[0, 0].set_ylabel("Normalised charge")
     legend_above(figure, grid[0, 0], per_line, title)
     return figure
 

@@ -154,8 +154,8 @@ def _notes(run: Run, metrics: Metrics, truth: Path | None) -> list[str]:
     notes = [
         f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
-        "distribution do not reach 100 at finite size: the ceiling is what data score "
-        "against data at these sizes.",
+        "distribution do not reach 100 at finite size: data vs data is what two samples of the "
+        "measured distribution have at these sizes.",
     ]
     tails = metrics["tails"] or {}
     if tails.get("rate_khz"):

@@ -1,131 +1,109 @@
-"""Scores in plain words: agrees with the data within errors, or off by N sigma.
+"""Do translated pulses agree with the data?  A p-value for each quantity, and words.
 
-A score is compared with its expectation for two samples of one distribution: the IoU with
-its ceiling, the Wasserstein distance and the classifier's AUC with their nulls, the A/E
-survival and the baseline noise with those of the data.  The question is whether chance
-alone explains a score, so deviations are measured in units of the spread of the *null*.
-The spread of the score itself under resampling tells how well the score is known; that of
-a poor translation would make it appear closer to the ceiling than it is.
+Each p-value is the probability that two samples of one distribution differ by more.  It
+contains the sampling of both sides and, of a REN with a covariance, the errors of the fit; that
+of the classifier contains the sampling alone.  What is less likely than `ALARM`, three standard
+deviations, is off.  ``benchmarks/p_values.py`` shows that p is uniform where nothing is wrong.
 
-IoU, Wasserstein distance and AUC are worse than chance on one side only.  A score on the
-other side, such as an IoU above its ceiling, agrees.  Up to `AGREES` sigma is agreement.
-A perfect translation exceeds it in 2 … 5 % of IoU, 4 … 7 % of Wasserstein distances (which
-scatter with an upward tail) and 8 % of parameters in either, so of twenty parameters one or
-two are off by chance.
+An agreement says no more than its sensitivity: the difference is quoted with its error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
+
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from cpunet.plotting import label
 from cpunet.pulses.parameters import PARAMETERS
+from cpunet.pulses.shape_parameters import A_OVER_E, LABELLED
+from cpunet.pulses.two_sample import SHUFFLES
+from cpunet.tables import NO_VALUE, with_std
 
-AGREES = 2.0  # sigma
-TOO_CLOSE = 4.0  # sigma on the good side: not by chance, but the same events on both sides
-WITHIN = "agrees within errors"
+ALARM = 2.7e-3  # p of three standard deviations
+SAME = 3e-5  # 1 - p of samples that agree too well
+SMALLEST = 1e-12  # p that is stated
 
-Worse = Literal["lower", "higher", "both"]
 Words = dict[str, float | str | None]
 Metrics = Mapping[str, Any]  # content of ``metrics.json``
 
+# Quantities of the main table, those of LEGEND; the first needs the double-escape peak.
+MAIN = (A_OVER_E, "rise_time", "tail_slope", "lq")
+RIVALS = ("rc", "rc_late")
+
 _SHORT = {"ren": "REN", "iren": "IREN"}
-_W1, _SPECTRUM = "_wasserstein", "_spectrum"
-_SECOND = (_W1, _SPECTRUM)  # suffixes of verdicts that are combined with the quantity's
-_AUC, _SURVIVAL, _NOISE = "auc", "ae_survival", "noise"
+_AUC, _SURVIVAL, _NOISE, _SPECTRUM = "auc", "ae_survival", "noise", "noise_spectrum"
+QUANTITIES = {
+    A_OVER_E: "A/E",
+    "current_amplitude": "A",
+    "rise_time": "T(10–90 %)",
+    "tail_slope": "tail slope",
+    "lq": "LQ",
+    _AUC: "classifier AUC",
+    _SURVIVAL: "A/E survival",
+}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a score agrees with its expectation by chance, and its deviation.
+    """Whether a quantity agrees with the data.
 
     Attributes
     ----------
-    sigma
-        Deviation from the expectation in units of its spread, positive if worse than
-        expected (if both sides are worse: score minus expectation); None if undefined.
-    agrees
-        Whether the score agrees; None if there is no value.
-    words
-        Verdict in words: ``agrees within errors``, ``off by 3.1 sigma``, or the reason why
-        there is no verdict.
+    p
+        Probability of a larger difference if both are of one distribution; None if unknown.
     numbers
-        The score and its expectation, as quoted.
+        Difference and its error, as quoted.
+    reason
+        Why there is no verdict.
     """
 
-    sigma: float | None
-    agrees: bool | None
-    words: str
+    p: float | None
     numbers: str = ""
+    reason: str = ""
 
     @property
-    def severity(self) -> float:
-        """Deviation of a score that is off; infinite if it is unknown by how much."""
-        if self.agrees:
-            return 0.0
-        return math.inf if self.sigma is None else abs(self.sigma)
+    def sigma(self) -> float | None:
+        """Standard deviations of a two-sided difference as unlikely."""
+        return None if self.p is None else float(norm.isf(max(self.p, 1e-300) / 2))
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether the difference may be statistical; None without a verdict."""
+        return None if self.p is None else self.p >= ALARM
+
+    @property
+    def words(self) -> str:
+        """The verdict, such as ``off by 3.4 sigma``."""
+        if self.p is None or self.sigma is None:
+            return self.reason
+        if not self.agrees:
+            return f"off by {self.sigma:.1f} sigma"
+        if 1 - self.p < SAME:
+            return "closer than statistics permit: are the same events on both sides?"
+        return "agrees"
+
+    def __str__(self) -> str:
+        if self.p is None:
+            return f"not judged ({self.reason})"
+        return f"{self.numbers}, {_p(self.p)}" if self.numbers else _p(self.p)
 
 
-def verdict(
-    value: float | None,
-    expected: float | None,
-    spread: float | None,
-    worse: Worse,
-    numbers: str = "",
-    reason: object = None,
-) -> Verdict:
-    r"""Verdict on one score.
-
-    .. math:: z = \pm (v - \langle v \rangle_0) / \sigma_0
-
-    with the mean and the standard deviation of the score :math:`v` for two samples of one
-    distribution, and the sign such that :math:`z > 0` is worse than expected.
-
-    Parameters
-    ----------
-    value
-        Score.
-    expected, spread
-        Mean and standard deviation of the score for two samples of one distribution, for
-        example the ceiling of an IoU.
-    worse
-        Side that is worse than chance: ``"lower"`` (IoU), ``"higher"`` (a distance, an
-        AUC) or ``"both"`` (a difference).
-    numbers
-        How to quote ``value`` and ``expected``, in Python's format.
-    reason
-        Why there is no verdict, if known.
+def two_sided(value: float | None, error: float | None) -> float | None:
+    """P of a difference of 0 with a normal error; None if either is unknown or without error.
 
     Examples
     --------
-    >>> verdict(83.1, 85.9, 0.9, "lower").words
-    'off by 3.1 sigma'
-    >>> verdict(86.5, 85.9, 0.9, "lower").words
-    'agrees within errors'
-    >>> verdict(None, 85.9, 0.9, "lower").words
-    'no value'
+    >>> round(two_sided(-9.5, 5.0), 3)
+    0.057
     """
-    if value is None or expected is None or spread is None:
-        words = "no value" if value is None else "nothing to compare with"
-        return Verdict(None, None, str(reason or words))
-    quoted = numbers.format(value=value, expected=expected)
-    apart = (expected - value) if worse == "lower" else (value - expected)
-    off = abs(apart) if worse == "both" else apart
-    if spread <= 0:
-        # for example all events in one bin: chance gives exactly one value
-        if off <= 1e-9 * max(abs(expected), 1.0):
-            return Verdict(0.0, True, WITHIN, quoted)
-        return Verdict(None, False, "off", quoted)
-    sigma = apart / spread
-    if off / spread > AGREES:
-        return Verdict(sigma, False, f"off by {abs(sigma):.1f} sigma", quoted)
-    if worse != "both" and sigma < -TOO_CLOSE:
-        words = f"closer than chance by {-sigma:.1f} sigma: are the same events on both sides?"
-        return Verdict(sigma, True, words, quoted)
-    return Verdict(sigma, True, WITHIN, quoted)
+    if value is None or not error:
+        return None
+    return float(2 * norm.sf(abs(value) / error))
 
 
 def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdict]:
@@ -141,52 +119,161 @@ def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdi
     Returns
     -------
     dict
-        For each parameter, under its name, its IoU against the ceiling and, with the suffix
-        ``_wasserstein``, its distance against the null.  ``auc``: the classifier against
-        its null.  ``ae_survival``: the difference from the data, for peaks other than that
-        which defines the cut.  ``noise``: its RMS against that of the data;
-        ``noise_spectrum``: the worst frequency band.
+        For each parameter, under its name, chi-square of its distribution.  ``auc``: the
+        classifier against shuffled labels.  ``ae_survival``: the difference from the data,
+        for peaks other than that which defines the cut.  ``noise``: its RMS against that of
+        the data; ``noise_spectrum``: the worst frequency band.
     """
     found: dict[str, Verdict] = {}
     scores = part(metrics, "peaks", peak)
-    for name, one in part(scores, "parameters").items():
-        found[name] = verdict(
-            number(one, "iou", method),
-            number(one, "iou", "ceiling"),
-            number(one, "iou_std", "ceiling"),
-            "lower",
-            "IoU {value:.1f} of {expected:.1f}",
-        )
-        unit = f" {PARAMETERS[name].unit}" if name in PARAMETERS else ""
-        found[name + _W1] = verdict(
-            number(one, "wasserstein", method),
-            number(one, "wasserstein_null"),
-            number(one, "wasserstein_null_std"),
-            "higher",
-            f"W₁ {{value:.3g}}{unit}, by chance {{expected:.3g}}{unit}",
-        )
+    for name, one in judged_parameters(scores).items():
+        p = number(one, "p", method)
+        found[name] = Verdict(p, shifted(name, one, method), "too few pulses")
     if tested := part(scores, "two_sample", method):
         auc, mean, std = (number(tested, key) for key in ("auc", "null_mean", "null_std"))
-        numbers = "AUC {value:.2f}, by chance {expected:.2f}"
-        found[_AUC] = verdict(auc, mean, std, "higher", numbers, tested.get("missing"))
+        p = None
+        if auc is not None and mean is not None and std:
+            apart = (auc - mean) / (std * math.sqrt(1 + 1 / SHUFFLES))
+            p = float(student.sf(apart, SHUFFLES - 1))
+        numbers = f"AUC {with_std(auc, std)}, {number_text(mean)} expected"
+        found[_AUC] = Verdict(p, numbers, tested.get("missing", "no value"))
     survival = part(metrics, "ae_survival", peak)
     if "difference" in survival:
         off, std = (number(survival, k, method) for k in ("difference", "difference_std"))
         reason = "too few events of the double-escape peak, or none of this one"
-        found[_SURVIVAL] = verdict(off, 0.0, std, "both", "{value:+.1f} points", reason)
+        numbers = f"{signed(off, std)} points" if std else ""
+        found[_SURVIVAL] = Verdict(two_sided(off, std), numbers, reason)
     own, data = part(scores, "noise", method), part(scores, "noise", "data")
     if own:
         errors = number(own, "rms_std"), number(data, "rms_std")
-        spread = None if None in errors else math.hypot(*filter(None, errors))
-        ratio = number(own, "rms_ratio")
-        size = "" if ratio is None else f"RMS {ratio:.2f} of the data's"
-        reason = own.get("missing", data.get("missing"))
         rms = number(own, "rms"), number(data, "rms")
-        found[_NOISE] = verdict(*rms, spread, "both", size, reason)
+        reason = own.get("missing", data.get("missing", "no noise"))
+        p, size = None, ""
+        if None not in (*errors, *rms) and rms[1]:
+            spread = math.hypot(*filter(None, errors))
+            p = two_sided((rms[0] or 0.0) - rms[1], spread)
+            size = f"RMS {with_std((rms[0] or 0.0) / rms[1], spread / rms[1])} of the data's"
+        found[_NOISE] = Verdict(p, size, reason)
         if (worst := number(own, "spectrum_sigma")) is not None:
-            band = "; ".join(filter(None, ("worst band of its spectrum", size)))
-            found[_NOISE + _SPECTRUM] = verdict(worst, 0.0, 1.0, "higher", band)
+            numbers = "worst band of the spectrum"
+            found[_SPECTRUM] = Verdict(float(norm.sf(worst)), numbers)
     return found
+
+
+def judged_parameters(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Comparisons of the paper's parameters, and of those of LEGEND that the table has."""
+    known = {**part(scores, "parameters"), **part(scores, "further")}
+    return {name: known[name] for name in (*PARAMETERS, *MAIN) if name in known}
+
+
+def held_out(metrics: Metrics) -> list[str]:
+    """Scored peaks that took no part in the training; all scored ones if there are none."""
+    peaks = part(metrics, "peaks")
+    scored = [peak for peak, one in peaks.items() if part(one, "parameters")]
+    trained = str(part(metrics, "training").get("peak")).split(",")
+    return [peak for peak in scored if peak not in trained] or scored
+
+
+def headline(metrics: Metrics, method: str = "ren") -> tuple[bool, str]:
+    """Whether nothing is off at peaks that were not trained on, and that in a sentence."""
+    peaks = held_out(metrics)
+    verdicts = [v for peak in peaks for v in method_verdicts(metrics, peak, method).values()]
+    p = [v.p for v in verdicts if v.p is not None]
+    off, where = sum(value < ALARM for value in p), " and ".join(peaks)
+    name = _SHORT.get(method, label(method))
+    if not p:
+        return False, f"{name}: not judged"
+    if not off:
+        text = f"{name} agrees with the data in all {len(p)} quantities of {where}"
+        return True, f"{text}; the least likely has {_p(min(p))}"
+    text = f"{name} is off in {off} of {len(p)} quantities of {where}"
+    return False, f"{text}; the least likely has {_p(min(p))}"
+
+
+def main_table(metrics: Metrics, peaks: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Differences from the data with errors and p, by peak and quantity.
+
+    Returns
+    -------
+    head, rows
+        Peak, quantity, the data, the REN with its p, and rivals; overlap with the data.
+    """
+    rivals = [m for m in RIVALS if any(m in methods_of(metrics, peak) for peak in peaks)]
+    head = ["Peak", "Quantity", "Data", "REN − data", "p"]
+    head += [f"{label(m)} − data" for m in rivals] + ["IoU: REN [%]", "data vs data"]
+    rows = []
+    for peak in peaks:
+        scores = part(metrics, "peaks", peak)
+        judged, verdicts = judged_parameters(scores), method_verdicts(metrics, peak, "ren")
+        first = A_OVER_E if A_OVER_E in judged else "current_amplitude"
+        for name in (first, *MAIN[1:], _AUC, _SURVIVAL):
+            if name not in verdicts or (p := verdicts[name].p) is None:
+                continue
+            unit = "%" if name == _SURVIVAL else LABELLED[name].unit if name in judged else ""
+            own, one = QUANTITIES[name], judged.get(name, {})
+            overlap = [
+                with_std(*(number(one, key, m) for key in ("iou", "iou_std")))
+                for m in ("ren", "ceiling")
+            ]
+            rows.append([
+                *(peak, f"{own} [{unit}]" if unit else own),
+                _of_data(metrics, peak, name, one),
+                signed(*_difference(metrics, peak, name, "ren")),
+                f"{p:.2g}" if p > SMALLEST else f"< {SMALLEST:g}",
+                *(signed(*_difference(metrics, peak, name, m)) for m in rivals),
+                *overlap,
+            ])  # fmt: skip
+    return head, rows
+
+
+def _difference(
+    metrics: Metrics, peak: str, name: str, method: str
+) -> tuple[float | None, float | None]:
+    """A quantity of a method minus that of the data, and its error."""
+    scores = part(metrics, "peaks", peak)
+    if name == _SURVIVAL:
+        row = part(metrics, "ae_survival", peak)
+        return number(row, "difference", method), number(row, "difference_std", method)
+    if name == _AUC:
+        found = part(scores, "two_sample", method)
+        auc, null = number(found, "auc"), number(found, "null_mean")
+        known = None if auc is None or null is None else auc - null
+        return known, None if known is None else number(found, "null_std")
+    one = judged_parameters(scores).get(name, {})
+    return number(one, "shift", method), number(one, "shift_std", method)
+
+
+def _of_data(metrics: Metrics, peak: str, name: str, one: Mapping[str, Any]) -> str:
+    """What the data have: mean of a parameter, AUC of shuffled labels, survival."""
+    if name == _AUC:
+        null = part(metrics, "peaks", peak, "two_sample", "ren")
+        return with_std(number(null, "null_mean"), number(null, "null_std"))
+    if name == _SURVIVAL:
+        row = part(metrics, "ae_survival", peak)
+        return with_std(*(number(row, key, "data") for key in ("survival", "survival_std")))
+    return number_text(number(one, "mean"), "#.4g")
+
+
+def shifted(name: str, compared: Mapping[str, Any], method: str) -> str:
+    """Mean of a parameter minus that of the data, with its error and unit."""
+    shift, error = number(compared, "shift", method), number(compared, "shift_std", method)
+    if shift is None or error is None:
+        return ""
+    unit, mean = LABELLED[name].unit, number(compared, "mean")
+    if name == "current_amplitude" and mean:
+        shift, error, unit = 100 * shift / mean, 100 * error / mean, "%"
+    return f"{signed(shift, error)} {unit}".rstrip()
+
+
+def signed(value: float | None, error: float | None) -> str:
+    """A difference with its sign and error."""
+    text = with_std(value, error)
+    return text if value is None or text.startswith("-") else f"+{text}"
+
+
+def number_text(value: float | None, digits: str = ".2f") -> str:
+    """A number in a format; a dash for none."""
+    return NO_VALUE if value is None else f"{value:{digits}}"
 
 
 def verdict_table(metrics: Metrics) -> dict[str, dict[str, dict[str, Words]]]:
@@ -200,13 +287,13 @@ def verdict_table(metrics: Metrics) -> dict[str, dict[str, dict[str, Words]]]:
     Returns
     -------
     dict
-        ``{"sigma": …, "words": …}`` by peak, method and quantity, see `method_verdicts`.
-        A peak that is not scored has no methods.
+        ``{"p": …, "sigma": …, "numbers": …, "words": …}`` by peak, method and quantity, see
+        `method_verdicts`.  A peak that is not scored has no methods.
     """
     return {
         peak: {
             method: {
-                quantity: {"sigma": v.sigma, "words": v.words}
+                quantity: {"p": v.p, "sigma": v.sigma, "numbers": v.numbers, "words": v.words}
                 for quantity, v in method_verdicts(metrics, peak, method).items()
             }
             for method in methods_of(metrics, peak)
@@ -216,41 +303,28 @@ def verdict_table(metrics: Metrics) -> dict[str, dict[str, dict[str, Words]]]:
 
 
 def summary(metrics: Metrics, peak: str, method: str) -> str:
-    """Return one line with the quantities that agree with the data and those that are off.
-
-    A parameter is off if its IoU or its Wasserstein distance is; the noise is off if its RMS
-    or its spectrum is.  The larger deviation is quoted.
+    """One line: what is off, the least likely first, and with what p the others agree.
 
     Returns
     -------
     str
-        For instance ``REN, SEP: current amplitude and tail slope agree with the data
-        within errors; drift time off by 3.1 sigma (IoU 83.1 of 85.9)``.
+        For instance ``REN, SEP: drift time off by 3.1 sigma (+12 ± 3 ns, p = 0.002); current
+        amplitude agrees (+0.02 ± 0.11 %, p = 0.4)``.
     """
     verdicts = method_verdicts(metrics, peak, method)
-    agreeing: list[str] = []
-    off: list[tuple[float, str]] = []
-    silent: list[str] = []
-    for name in [n for n in verdicts if not n.endswith(_SECOND)]:
-        both = (name, *(name + ending for ending in _SECOND))
-        pair = {n: verdicts[n] for n in both if n in verdicts}
-        known = {n: v for n, v in pair.items() if v.agrees is not None}
-        if not known:
-            silent.append(f"{_called(name)} not judged ({pair[name].words})")
-        elif all(v.agrees for v in known.values()):
-            agreeing.append(_called(name))
-        else:
-            worst = max(known.values(), key=lambda v: v.severity)
-            quoted = f" ({worst.numbers})" if worst.numbers else ""
-            off.append((worst.severity, f"{_called(name)} {worst.words}{quoted}"))
-    parts = []
-    if agreeing:
-        *first, last = agreeing
-        names = f"{', '.join(first)} and {last}" if first else last
-        parts = [f"{names} {'agree' if first else 'agrees'} with the data within errors"]
-    parts += [text for _, text in sorted(off, key=lambda pair: -pair[0])]
+    off = sorted(
+        (v.p, name) for name, v in verdicts.items() if v.p is not None and not v.agrees
+    )
+    parts = [f"{called(name)} {verdicts[name].words} ({verdicts[name]})" for _, name in off]
+    same = [f"{called(n)} ({v})" for n, v in verdicts.items() if v.words == "agrees"]
+    parts += [f"agreement in {', '.join(same)}"] if same else []
+    parts += [
+        f"{called(name)} {v.words if v.agrees else v}"
+        for name, v in verdicts.items()
+        if v.p is None or (v.agrees and v.words != "agrees")
+    ]
     head = f"{_SHORT.get(method, label(method))}, {peak}"
-    return f"{head}: {'; '.join(parts + silent) or 'not scored'}"
+    return f"{head}: {'; '.join(parts) or 'not scored'}"
 
 
 def methods_of(metrics: Metrics, peak: str) -> list[str]:
@@ -278,9 +352,14 @@ def number(metrics: Any, *keys: str) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _called(quantity: str) -> str:
-    named = {_AUC: "classifier", _SURVIVAL: "A/E survival"}
+def called(quantity: str) -> str:
+    """Name of a quantity in a sentence."""
+    named = QUANTITIES | {_AUC: "classifier", "current_amplitude": "current amplitude"}
     return named.get(quantity, quantity.replace("_", " "))
+
+
+def _p(value: float) -> str:
+    return f"p = {value:.2g}" if value > SMALLEST else f"p < {SMALLEST:g}"
 
 
 def judged_scores(metrics: Metrics, method: str) -> tuple[int, int]:

@@ -33,7 +33,7 @@ class FileOptions:
     ----------
     table
         Table of the pulses, if the file has several, or rows in it, as ``raw/channel=3``;
-        ``all``: each for itself.
+        ``all``: every table separately.
     energy
         Energy column, or ``FILE:path/to/column``, as of a hit tier.
     kev_per_adc
@@ -56,7 +56,7 @@ class ReadOptions:
     ----------
     data_table
         Table of the measured pulses, if the file has several, or rows in it, as
-        ``raw/channel=3``; ``all``: each for itself.
+        ``raw/channel=3``; ``all``: every table separately.
     data_energy
         Energy column of the data, or ``FILE:path/to/column``, as of a hit tier.
     kev_per_adc
@@ -66,7 +66,7 @@ class ReadOptions:
     sim_table
         Table of the simulated pulses, if the file has several.
     insist
-        Pulses are simulated or measured as given, whatever they look like.
+        Skip the check whether pulses are simulated or measured.
     """
 
     data_table: str | None = None
@@ -94,7 +94,7 @@ class PulseFile:
     table, energy, kev_per_adc, dt_ns
         As of `FileOptions`.
     insist
-        Pulses are simulated or measured as given, whatever they look like.
+        Skip the check whether pulses are simulated or measured.
     pulses
         Pulses in memory, which are read in place of a file.
     """
