@@ -19,7 +19,8 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import Parabola, minimum
 from cpunet.training.chain_parameters import SmoothParameters
-from cpunet.training.comparison import Difference
+from cpunet.training.comparison import NONE, Difference
+from cpunet.training.derivatives import Basis
 from cpunet.training.joint import SHRUNK
 
 # Residual that keeps a step within the reach of the derivatives: its size at the reach.
@@ -50,6 +51,9 @@ class JointParameters:
         The chain before any fit, on which the priors of the same parameters are centred; those
         of others on their current values. Centred on the last fit, they would make a result
         depend on where the first one ended.
+    modes
+        Deviations of the step response that are free, with priors of 0 ± 1, if the response
+        has any.
     """
 
     def __init__(
@@ -60,33 +64,51 @@ class JointParameters:
         free: Sequence[int],
         given: Mapping[str, tuple[float, float]],
         start: ElectronicsResponse,
+        modes: Values = NONE,
     ) -> None:
         self.chain, self.given, self.start = SmoothParameters(response, start), given, start
         self.coordinates, self.free = coordinates.copy(), list(free)
-        self.n_chain = len(self.chain.labels)
+        self.modes = modes
+        self.along: Values = np.empty(0)
+        if response.config.deviations:
+            self.along = np.asarray(np.linalg.lstsq(modes, response.deviation)[0])
+        n_modes = len(self.along)
+        self.n_chain = len(self.chain.labels) + n_modes
         chosen = [physics.nuisances[i] for i in self.free]
         centres, widths = physics.priors(given)
-        self.centre = np.concatenate([self.chain.centre, centres[self.free]])
-        self.widths = np.concatenate([self.chain.widths, widths[self.free]])
+        self.centre = np.r_[self.chain.centre, np.zeros(n_modes), centres[self.free]]
+        self.widths = np.r_[self.chain.widths, np.ones(n_modes), widths[self.free]]
         # a prior may lie far from what was simulated, and its centre must be reached
         self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
         self.reach = np.array([nuisance.reach for nuisance in chosen])
         self.names = tuple(nuisance.name for nuisance in chosen)
         bounds = [n.bounds(physics.nominal(n)) for n in chosen]
         low, high = np.reshape(bounds, (len(chosen), 2)).T
-        self.low = np.concatenate([self.chain.low, low])
-        self.high = np.concatenate([self.chain.high, high])
+        unlimited = np.full(n_modes, np.inf)
+        self.low = np.r_[self.chain.low, -unlimited, low]
+        self.high = np.r_[self.chain.high, unlimited, high]
 
     def vector(self) -> Values:
         """Current values of all parameters as one vector."""
-        return np.concatenate([self.chain.vector(), self.coordinates[self.free]])
+        free = self.coordinates[self.free]
+        return np.concatenate([self.chain.vector(), self.along, free])
 
     def set(self, vector: Values) -> None:
         """Set all parameters from a vector. Coordinates are limited to their bounds."""
-        self.chain.set(vector[: self.n_chain])
+        n, own = self.n_chain, len(self.chain.labels)
+        self.chain.set(vector[:own])
+        self.along = vector[own:n].copy()
+        if len(self.along):
+            self.chain.response.set_deviation(self.modes @ self.along)
         self.coordinates = self.coordinates.copy()
-        n = self.n_chain
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
+
+    def basis(self, padded: int) -> Basis:
+        """Changes of the step response with each parameter of the readout."""
+        basis = self.chain.basis(padded)
+        if not len(self.along):
+            return basis
+        return Basis(basis.first, np.column_stack([basis.changes, self.modes]))
 
 
 @dataclass(eq=False)
@@ -251,7 +273,7 @@ class JointProblem:
         response = parameters.chain.response
         padded = self.functions[0].sides.padded
         transfer = response.transfer(padded)
-        basis = parameters.chain.basis(padded) if slopes else None
+        basis = parameters.basis(padded) if slopes else None
         if not slopes:
             return [one.difference(transfer) for one in self.here()]
         most, steps = events(self.functions), STEP * parameters.reach

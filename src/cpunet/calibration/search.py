@@ -25,7 +25,8 @@ from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import POOR, WIDER, Fitter, Parabola, fit_chain
-from cpunet.training.chain_parameters import SmoothParameters, with_decay, with_settings
+from cpunet.training.chain_parameters import with_decay, with_settings
+from cpunet.training.comparison import NONE
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
 
@@ -44,7 +45,6 @@ NEEDED, MAX_MORE = 25.0, 3
 # forecast, and are alternatives if it does so by less than the second; most, and their rounds.
 LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
 USUAL_ROUNDS = 4  # of most searches, for the remaining time
-MAX_DEVIATED = 2  # times that deviations of the step response are learned
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
 
@@ -88,6 +88,7 @@ class Search:
         dt_ns = self.simulator.physics.settings.dt_ns
         self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
         with_decay(self._start, self.sets.tail_slope)
+        self._modes = NONE
 
     def plan(self) -> Information:
         """Information of the pulses on all parameters that may become free, before a fit."""
@@ -115,7 +116,7 @@ class Search:
             response = self._deviated(before) or response
             free = self._first_free(response, nearby)
             problem, found = self._from_far(response, nearby, free)
-        deviated, more, last = 0, 0, np.zeros(self._n)
+        more, last = 0, np.zeros(self._n)
         for number in range(1, ROUNDS + 1):
             if number > 1:
                 problem = self._problem(response, nearby, free)
@@ -124,8 +125,8 @@ class Search:
             response = problem.parameters.chain.response
             moved = problem.parameters.coordinates - nearby.centre
             settled = number > 1 and _settled(problem, found, moved)
-            if settled and deviated < MAX_DEVIATED:
-                other, deviated = self._deviated(problem), deviated + 1
+            if settled and not response.config.deviations:
+                other = self._deviated(problem)
                 response, settled = other or response, settled and other is None
             added = self._needed(problem) if settled and more < MAX_MORE else None
             if number == ROUNDS or (settled and added is None):
@@ -185,7 +186,8 @@ class Search:
         """Comparison near the point at which pulses were simulated."""
         response, physics = copy.deepcopy(response), self.simulator.physics
         at = nearby.centre if at is None else at
-        parameters = JointParameters(response, physics, at, free, self.given, self._start)
+        chain = response, physics, at, free, self.given, self._start
+        parameters = JointParameters(*chain, self._modes)
         sets = parameters, functions or self._functions, nearby
         return JointProblem(*sets, self.recipe, self.known, held, weights)
 
@@ -200,11 +202,11 @@ class Search:
             return None
         chain = with_settings(problem.parameters.chain.response, deviations=False)
         sides = [functions.sides for functions in problem.here()]
-        response = with_deviations(chain, sides, lambda _: None).response
-        parameters = copy.copy(problem.parameters)
-        parameters.chain = SmoothParameters(response, self._start)
-        other = replace(problem, parameters=parameters)
-        return response if other.chi_square() < problem.chi_square() - NEEDED else None
+        found = with_deviations(chain, sides, lambda _: None)
+        if not found.response.config.deviations:
+            return None
+        self._modes = found.modes
+        return found.response
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
         """Parameters that are free initially."""

@@ -112,8 +112,8 @@ def all_parameters(
     >>> recipe = load_recipe("paper")
     >>> ramp = np.clip((np.arange(800) - 300) / 100, 0, 1)[np.newaxis]
     >>> found = all_parameters(Pulses.of(ramp, dt_ns=16), recipe.preparation, recipe.scores)
-    >>> found["rise_10_90"].round(3), found["dt_eff"].round(1)
-    (array([1280.]), array([800.]))
+    >>> found["rise_10_90"].round(3), found["dt_eff"].round(1)  # 800 less part of a sample
+    (array([1280.]), array([789.2]))
     """
     preparation = preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:

@@ -34,7 +34,7 @@ from scipy.special import expit
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
 from cpunet.training.aligned import Values
 from cpunet.training.chain_parameters import SmoothParameters
-from cpunet.training.comparison import MOST, Comparison, Moved, Sides, Spectrum
+from cpunet.training.comparison import MOST, NONE, Comparison, Moved, Sides, Spectrum
 from cpunet.training.derivatives import Basis
 from cpunet.training.joint import Joint
 
@@ -235,10 +235,13 @@ class Deviated(NamedTuple):
         The chain with deviations; the chain itself if they gain nothing.
     evidence
         Logarithm of the evidence of deviations, where they were first tried.
+    modes
+        Deviations of unit prior variance that the pulses determine, shape (lags, modes).
     """
 
     response: ElectronicsResponse
     evidence: float
+    modes: Values = NONE
 
 
 def with_deviations(
@@ -312,7 +315,9 @@ def with_deviations(
     moves = Basis(basis.first, knots.between @ modes)
     place = place + modes @ _with_amplitude(own, [side.of(MOST) for side in bands], moves)
     own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))
-    return Deviated(own, first)
+    root = np.linalg.cholesky(covariance)
+    sizes, axes = np.linalg.eigh(root.T @ problem.information @ root)
+    return Deviated(own, first, knots.between @ root @ axes[:, sizes > 1])
 
 
 def _modes(information: Values, covariance: Values) -> Values:
