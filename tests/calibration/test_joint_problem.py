@@ -14,13 +14,14 @@ from cpunet.calibration.joint_problem import HOLD, JointParameters, JointProblem
 from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.sliced_functions import SlicedJoint
-from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.chain_fit import Fitter, fit_chain
-from cpunet.training.chain_parameters import with_decay
+from cpunet.training.chain_parameters import with_decay, with_settings
+from cpunet.training.comparison import NONE
 from cpunet.training.joint import SHRUNK
 from cpunet.training.pulse_sets import PulseSets
 from synthetic import load_recipe
@@ -70,9 +71,9 @@ def fitted(start, functions) -> ElectronicsResponse:
 
 @pytest.fixture
 def problem(start, functions, nearby):
-    def made(*, free=(0, 1), at=(0.0, 0.0), few=False, response=start, **settings):
+    def made(*, free=(0, 1), at=(0.0, 0.0), few=False, response=start, modes=NONE, **settings):
         own = copy.deepcopy(response)
-        parameters = JointParameters(own, PHYSICS, np.array(at), free, {}, start)
+        parameters = JointParameters(own, PHYSICS, np.array(at), free, {}, start, modes)
         some = first([functions], 300) if few else [functions]
         return JointProblem(parameters, some, nearby, RECIPE, **settings)
 
@@ -165,6 +166,22 @@ def test_derivatives_are_those_of_wide_differences(problem, fitted):
             ends.append(both.residuals(there))
         wanted = (ends[0] - ends[1]) / (2 * step)
         assert np.linalg.norm(slope - wanted) < 0.2 * np.linalg.norm(wanted)
+
+
+def test_deviations_of_the_readout_are_free_with_the_physics(problem, fitted):
+    """What was added to a right response is taken out again by the modes that it is made of."""
+    time_ns = deviation_lags(DT_NS) * DT_NS
+    places = np.array([100.0, 400.0])
+    modes = 1e-3 * np.exp(-0.5 * ((time_ns[:, np.newaxis] - places) / 60) ** 2)
+    other = with_settings(fitted, deviations=True)
+    other.set_deviation(modes @ np.array([2.0, -1.0]))
+    both = problem(response=other, modes=modes)
+    n = both.parameters.n_chain
+    assert both.parameters.vector()[n - 2 : n] == pytest.approx([2.0, -1.0])
+    before, end = both.chi_square(), both.fitted()
+    assert before > 1.5 * end.chi_square
+    errors = np.sqrt(np.linalg.inv(end.information).diagonal()[n - 2 : n])
+    assert np.abs(both.parameters.along / errors).max() < 5
 
 
 def test_the_fit_finds_chain_and_physics(problem, fitted):
