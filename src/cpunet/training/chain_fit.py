@@ -211,7 +211,7 @@ def minimum(
     steps
         Most steps.
     fall
-        Expected fall of the cost below which there is no other step.
+        Fall of the cost, expected or by the last step, below which there is no other step.
     count
         Called with chi-square after each evaluation.
 
@@ -240,7 +240,8 @@ def minimum(
             break
         gained = best.cost - tried.cost
         best, damping = tried, damping / MORE if damping > DAMPING else 0.0
-        if best.chi_square > POOR * best.functions and gained < SLOW * best.cost:
+        poor = best.chi_square > POOR * best.functions
+        if gained < (SLOW * best.cost if poor else fall):
             break
     if not np.isfinite(best.cost):
         raise CpunetError(
