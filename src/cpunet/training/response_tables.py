@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import median_abs_deviation
 
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.recipes.schema import ResponseConfig
 from cpunet.settings import plain, yaml_text
+from cpunet.training.aligned import Values
 from cpunet.training.chain_description import DescribedChain
 from cpunet.training.closed_forms import chain_numbers, error_ends, learned_chain
 
@@ -28,8 +28,6 @@ SHOWN = {
     "chi_square_per_moment": "chi-square per moment",
 }
 FAR, FEW = 4.0, 5
-
-Values = npt.NDArray[np.float64]
 
 
 def correlations(one: DescribedChain) -> tuple[list[str], Values]:
