@@ -18,6 +18,6 @@ def test_a_slew_rate_is_found_where_there_is_one(tmp_path, slew) -> None:
         seed=41,
     )
     run = cpunet.train(stand.sim, stand.data, tmp_path / "run", peak="FEP,1000-1580")
-    assert run.fit.good
-    found = cpunet.response(run).runs[0].values.get("slew_kev_per_ns")
+    assert run.ok
+    found = run.parameters.get("slew_kev_per_ns")
     assert found == (None if slew is None else pytest.approx(slew, rel=0.1))
