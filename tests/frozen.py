@@ -132,7 +132,7 @@ def results(path: Path) -> Iterator[tuple[str, Any]]:
     elif path.name == "calibration.json":
         content = json.loads(path.read_text())
         yield f"{path.name}:parameters", content["parameters"]
-        yield f"{path.name}:pulls", digest(json.dumps(content["pulls"]))
+        yield f"{path.name}:pulls", digest(json.dumps(content["pulls_after"]))
 
 
 def run_lane(lane: Mapping[str, list[str]], folder: Path) -> dict[str, dict[str, Any]]:

@@ -10,7 +10,7 @@ import pytest
 from cpunet.calibration.identifiability import Information
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
+from cpunet.calibration.result import Calibrated, described
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -58,7 +58,7 @@ def calibrated(values=(), given=None) -> Calibrated:
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_a_parameter_at_its_bound_is_told(factor):
     """Rounding in a coordinate does not hide it."""
-    told = described(calibrated((85.0, factor)))["notes"]
+    told = described(calibrated((85.0, factor))).notes
     assert any(
         "the fit uses impurity_factor" in note and "at its bound" in note for note in told
     )
@@ -77,29 +77,26 @@ def test_a_parameter_at_its_bound_is_told(factor):
 )
 def test_what_cannot_be_is_no_finding(values, name, why):
     """In remarks, numbers, and the files that hold the physics."""
-    one = calibrated(values)
-    told = described(one)
-    doubtful = {n for n, each in told["parameters"].items() if each["doubt"]}
-    assert doubtful == {name}
-    assert why in told["parameters"][name]["doubt"]
+    result = described(calibrated(values))
+    doubts = {n: each.doubt for n, each in result.parameters.items() if each.doubt}
+    assert [*doubts] == [name]
+    assert why in doubts[name]
     assert any(
         note.startswith(f"the fit uses {name} = ")
         and "to make up for something else" in note
         and "`prior`" in note
-        for note in told["notes"]
+        for note in result.notes
     )
-    assert not any("no other physics are needed" in note for note in told["notes"])
-    comment = doubts(free_parameters(one))
-    assert comment.startswith(f"# {name}: unreliable value, makes up for something else")
-    assert comment.count("\n") == 1
+    assert not any("no other physics are needed" in note for note in result.notes)
+    assert result.comment.startswith(f"# {name}: unreliable value, makes up for something")
+    assert result.comment.count("\n") == 1
 
 
 def test_what_can_be_is_a_finding():
-    one = calibrated((93.9, 1.1, 0.4, 1.0, 0.11))
-    told = described(one)
-    assert not any(each["doubt"] for each in told["parameters"].values())
-    assert not doubts(free_parameters(one))
-    assert not told["together"]
+    result = described(calibrated((93.9, 1.1, 0.4, 1.0, 0.11)))
+    assert not any(each.doubt for each in result.parameters.values())
+    assert not result.comment
+    assert not result.together
 
 
 def test_of_a_degenerate_pair_the_direction_is_told():
@@ -108,9 +105,9 @@ def test_of_a_degenerate_pair_the_direction_is_told():
     (t, i), widths = (n, n + 1), one.problem.parameters.widths
     for a, b, share in ((t, t, 1.0), (i, i, 1.0), (t, i, -0.99), (i, t, -0.99)):
         one.covariance[a, b] = 0.64 * share * widths[a] * widths[b]
-    (pair,) = described(one)["together"]
-    assert pair["components"] == pytest.approx(
+    (pair,) = described(one).together
+    assert pair.components == pytest.approx(
         {"temperature_K": 0.5**0.5, "impurity_factor": 0.5**0.5}
     )
-    assert pair["value"] == pytest.approx((8 / 3 + np.log(1.05) / 0.1) / 2**0.5)
-    assert pair["error"] == pytest.approx(0.08)
+    assert pair.value == pytest.approx((8 / 3 + np.log(1.05) / 0.1) / 2**0.5)
+    assert pair.error == pytest.approx(0.08)

@@ -22,6 +22,7 @@ from cpunet.training.diagnosis import beyond
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
+from cpunet.training.verdict import PARTS
 from synthetic import (
     FACTS,
     NOISE_BINS,
@@ -310,13 +311,17 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
         return response(run).runs[0].doubts
 
     assert doubts(FIT) == []
-    poor = FIT | {
-        "verdict": "chi-square is 9 per moment",
-        "causes": ["the detector", "energies"],
+    checks = {
+        "chi_square": 9.0,
+        "amplitude": 1.0,
+        "z": 30.0,
+        "z_ns": 40.0,
+        "beyond_ns": [40.0, 48.0],
     }
-    (said,) = doubts(poor)
-    assert said.startswith("the fit is chi-square is 9 per moment; ")
-    assert said.endswith("the detector")
+    checks |= {"off": {"onset": 30.0}, "pulses": [1000, 900]}
+    (said,) = doubts(FIT | {"verdict": "bad: chi-square is 9", "checks": checks})
+    assert said.startswith("the fit is bad: chi-square is 9; ")
+    assert said.endswith(PARTS["onset"][1])
     assert doubts(None) == doubts({}) == []
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
     (said,) = response(early).runs[0].doubts

@@ -20,7 +20,8 @@ from cpunet.training.chain_parameters import STRETCH, SmoothParameters
 from cpunet.training.comparison import Difference
 from cpunet.training.joint import SEGMENTS, Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_fit import Fit, amplitude_shift, fit_response
+from cpunet.training.response_fit import amplitude_shift, fit_response
+from cpunet.training.verdict import FitInfo
 from synthetic import load_recipe
 from unpaired import (
     CHAIN,
@@ -42,7 +43,7 @@ RECIPE = load_recipe("fast", FEW)
 
 class Told(NamedTuple):
     response: ElectronicsResponse
-    fit: Fit
+    fit: FitInfo
     steps: list[tuple[int, float]]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +13,6 @@ from typing import Any, Self
 
 import numpy as np
 
-import cpunet
-from cpunet.calibration.alternatives import side_by_side
 from cpunet.calibration.calibrated_run import (
     CALIBRATION,
     DETECTOR,
@@ -23,8 +20,8 @@ from cpunet.calibration.calibrated_run import (
     SETTINGS,
     SIM,
     Calibration,
+    ExpectedErrors,
     Plan,
-    calibration_figures,
 )
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import (
@@ -35,10 +32,11 @@ from cpunet.calibration.nuisances import (
     require_depletion,
     titled,
 )
-from cpunet.calibration.result import Calibrated, described, doubts, free_parameters
+from cpunet.calibration.result import described
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import drawn_like, noise_of, tails_of
 from cpunet.errors import CpunetError
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
@@ -49,18 +47,20 @@ from cpunet.pulses.loading import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed, yaml_text
 from cpunet.simulation.again import StoredSimulation
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_sources import HitFile
+from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.job import TrainingJob, train_chain
 from cpunet.training.pulse_sets import MIN_PULSES, PulseSets
-from cpunet.training.run import RUN
+from cpunet.training.run import RUN, Run
 
 log = logging.getLogger(__name__)
 
@@ -89,8 +89,7 @@ def calibrate(
 
     The folder is a run like those of `cpunet.train`, and contains the calibrated
     ``detector.yaml`` and ``settings.yaml``, ``sim.lh5`` (all events, simulated again with
-    them), ``calibration.json`` and its figures, ``profiles.png``, ``pulls.png`` and
-    ``directions.png``.
+    them), ``calibration.json`` and its figures, ``pulls.png`` and ``directions.png``.
 
     Parameters
     ----------
@@ -149,8 +148,9 @@ def calibrate(
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
     _ = settings.matching  # without a chain there is nothing to calibrate with a detector
-    given = settings, Freedom.of(free, prior), peak, events, require_seed(seed)
-    act = partial(_calibrated, given, plan, force)
+    freedom, act = Freedom.of(free, prior), _planned if plan else _calibrated
+    given = settings, freedom, peak, events, require_seed(seed), force
+    act = partial(act, given)
     if sides[1].table != ALL:
         return act("", sides, target)
     if target is None or CHANNEL not in str(sides[0].path):
@@ -161,33 +161,82 @@ def calibrate(
     return each_channel(paired(*sides), target, act)
 
 
+Given = tuple[Recipe, Freedom, str, int, int, bool]
+
+
 @one_thread_for_matrices()
-def _calibrated(
-    given: tuple[Recipe, Freedom, str, int, int],
-    plan: bool,
-    force: bool,
-    _name: str,
-    pair: Pair,
-    out: Path | None,
-) -> Calibration | Plan:
-    """Calibrate one channel, or plan to."""
+def _planned(given: Given, _name: str, pair: Pair, out: Path | None) -> Plan:
+    """Forecast how well the pulses of a channel constrain the physics, before any fit."""
     if out is not None:
-        refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
-    job = _Job.of(pair, *given)
-    if plan:
-        planned = job.plan()
-        if out is not None:
-            planned.save(out, force=force)
-        return planned
+        refuse_existing(out, *pair[0].files, *pair[1].files, force=given[-1])
+    with stage("Planning") as bar:
+        sides = _Sides.read(pair, *given[:-1])
+        search = sides.search(bar.update)
+        physics = search.simulator.physics
+        bar.total = 2 + 2 * len(physics.nuisances)
+        information = search.plan()
+    by_pulses = {str(n): information.for_pulses(n / 2) for n in PLANNED}
+    errors = {}
+    for i, (centre, width) in enumerate(zip(*physics.priors(search.given), strict=True)):
+        own = partial(physics.in_own_unit, i, float(centre))
+        errors[physics.nuisances[i].name] = ExpectedErrors(
+            simulated=physics.nominal(physics.nuisances[i]),
+            prior=own(width)[1],
+            alone={n: own(one.errors([i])[0])[1] for n, one in by_pulses.items()},
+            all_free={n: own(one.errors()[i])[1] for n, one in by_pulses.items()},
+        )
+    directions = {n: one.directions() for n, one in by_pulses.items()}
+    name = sides.stored.detector.name
+    plan = Plan(detector=name, errors_by_name=errors, directions=directions)
+    if out is not None:
+        plan.save(out, force=given[-1])
+    return plan
+
+
+@one_thread_for_matrices()
+def _calibrated(given: Given, _name: str, pair: Pair, out: Path | None) -> Calibration:
+    """Calibrate detector and readout of a channel together."""
     assert out is not None
-    with folder_written_aside(out, RUN, force=force) as folder:
-        job.run(folder, out)
+    refuse_existing(out, *pair[0].files, *pair[1].files, force=given[-1])
+    keep_freed_memory()
+    clock, started = time.perf_counter(), datetime.now(UTC)
+    sides = _Sides.read(pair, *given[:-1])
+    with folder_written_aside(out, RUN, force=given[-1]) as folder:
+        with stage("Calibrating") as bar:
+            search = sides.search(bar.update)
+            bar.total = search.simulations
+            calibrated = search.run()
+        if (per := calibrated.chi_square / calibrated.problem.moments) > HOPELESS:
+            raise CpunetError(
+                f"{sides.data.path}: no physics near those of {sides.stored.detector.name} "
+                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
+                "of another detector, or of other energies (`peak`)?"
+            )
+        result = described(calibrated)
+        for note in result.notes:
+            log.info(titled(note))
+        detector, settings = calibrated.physics.at(calibrated.problem.parameters.coordinates)
+        for file, config in ((DETECTOR, detector), (SETTINGS, settings)):
+            text = yaml_text(config.model_dump(mode="json"))
+            (folder / file).write_text(result.comment + text, encoding="utf-8")
+        sides.simulate(folder / SIM, detector, settings)
+        run = sides.trained(folder, with_settings(calibrated.response, deviations=False))
+        facts = {
+            "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
+            "started": started.isoformat(timespec="seconds"),
+            "seconds": round(time.perf_counter() - clock, 1),
+            "calibration": CALIBRATION,
+        }
+        run.model_copy(update=facts).write(folder)
+        (folder / CALIBRATION).write_text(result.model_dump_json(indent=1) + "\n")
+        for file, figure in result.figures.items():
+            figure.savefig(folder / f"{file}.png", dpi=DPI)
     return Calibration.load(out)
 
 
 @dataclass(frozen=True, eq=False)
-class _Job:
-    """A calibration to run or to plan, with its pulses, see `calibrate`.
+class _Sides:
+    """Pulses of both sides, see `calibrate`.
 
     `stored` is the physics of the simulated side, with the hits of each event of its file.
     """
@@ -195,14 +244,13 @@ class _Job:
     sim: InputSet
     data: InputSet
     stored: StoredSimulation
-    selection: EnergySelection
     recipe: Recipe
     freedom: Freedom
     peak: str
     seed: int
 
     @classmethod
-    def of(
+    def read(
         cls, pair: Pair, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
     ) -> Self:
         """Read and prepare both sides; of the simulated one some `events`."""
@@ -216,95 +264,22 @@ class _Job:
         fewest = min(len(sim.prepared), len(data.prepared))
         if fewest < MIN_PULSES:
             raise CpunetError(
-                f"{fewest} pulses of {peak} on a side tell nothing of the physics, nor of the "
+                f"{fewest} pulses of {peak} on a side determine neither the physics nor the "
                 f"readout, which takes {MIN_PULSES}",
-                "give more files, or more energies as `peak`; all stays known as it was",
+                "give more files, or more energies as `peak`",
             )
         # in random order, so that any first part is a representative sample
         rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
         some = replace(sim, prepared=sim.prepared[rows])
-        return cls(some, data, stored, selection, recipe.at(data.dt_ns), freedom, peak, seed)
+        return cls(some, data, stored, recipe.at(data.dt_ns), freedom, peak, seed)
 
-    def run(self, folder: Path, out: Path) -> None:
-        """Calibrate detector and readout together, and write all to a folder, later `out`."""
-        keep_freed_memory()
-        clock, started = time.perf_counter(), datetime.now(UTC)
-        with stage("Calibrating") as bar:
-            search = self._search(bar.update)
-            bar.total = search.simulations
-            calibrated = search.run()
-        per = calibrated.chi_square / calibrated.problem.moments
-        if per > HOPELESS:
-            raise CpunetError(
-                f"{self.data.path}: no physics near those of {self.stored.detector.name} "
-                f"make the simulation look like it (chi-square {per:.0f} per function); is it "
-                "of another detector, or of other energies (`peak`)?"
-            )
-        content = self._content(calibrated)
-        for note in content["notes"]:
-            log.info(titled(note))
-        self._simulate_calibrated(calibrated, folder)
-        again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, self.selection)
-        # not stretched: what is off in the drift is for the physics to explain
-        training = self.recipe.training.model_copy(update={"drift_terms": 0})
-        recipe = self.recipe.model_copy(update={"training": training})
-        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.data, folder)
-        run = train_chain(job, with_settings(calibrated.response, deviations=False))
-        seconds = round(time.perf_counter() - clock, 1)
-        assert run.fit is not None  # of a chain
-        content |= {
-            "seconds": seconds,
-            "fit": run.fit.model_dump(include={"chi_square", "moments", "verdict"}),
-        }
-        changes = {
-            "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
-            "started": started.isoformat(timespec="seconds"),
-            "seconds": seconds,
-            "calibration": CALIBRATION,
-        }
-        (folder / CALIBRATION).write_text(json.dumps(content, indent=1) + "\n")
-        for name, figure in calibration_figures(content).items():
-            figure.savefig(folder / f"{name}.png", dpi=DPI)
-        run.model_copy(update=changes).write(folder)
-
-    def plan(self) -> Plan:
-        """Forecast how well the pulses constrain the physics, before any fit."""
-        with stage("Planning") as bar:
-            search = self._search(bar.update)
-            physics = search.simulator.physics
-            bar.total = 2 + 2 * len(physics.nuisances)
-            information = search.plan()
-        by_pulses = {str(n): information.for_pulses(n / 2) for n in PLANNED}
-        errors = {}
-        for i, (centre, width) in enumerate(zip(*physics.priors(search.given), strict=True)):
-            own = partial(physics.in_own_unit, i, float(centre))
-            errors[physics.nuisances[i].name] = {
-                "simulated": physics.nominal(physics.nuisances[i]),
-                "prior": own(width)[1],
-                "alone": {n: own(one.errors([i])[0])[1] for n, one in by_pulses.items()},
-                "all_free": {n: own(one.errors()[i])[1] for n, one in by_pulses.items()},
-            }
-        return Plan(
-            {
-                "cpunet": cpunet.__version__,
-                "detector": self.stored.detector.name,
-                "pulses": list(PLANNED),
-                "errors": errors,
-                "directions": {
-                    n: [found.describe() for found in one.directions()]
-                    for n, one in by_pulses.items()
-                },
-            }
-        )
-
-    def _search(self, simulated: Callable[[], None]) -> Search:
-        """The search, ready to start."""
+    def search(self, simulated: Callable[[], None]) -> Search:
+        """The search, ready to start; it calls `simulated` after each simulation."""
         given = self.freedom.priors
-        preparation = self.recipe.preparation
         tails, _ = tails_of(self.data)
         drawn = None
         if tails is not None and tails.law is not None:
-            drawn = drawn_like(tails, self.data, preparation)
+            drawn = drawn_like(tails, self.data, self.recipe.preparation)
         noise = noise_of(self.data, tails)
         physics = Physics(self.stored.detector, self.stored.settings, self.freedom.looked_at)
         require_depletion(physics, given)
@@ -320,44 +295,18 @@ class _Job:
             chosen=self.freedom.chosen,
         )
 
-    def _content(self, calibrated: Calibrated) -> dict[str, Any]:
-        """Content of ``calibration.json``, but for the last fit."""
-        compared = [functions.sides for functions in calibrated.problem.functions]
-        content = {
-            "cpunet": cpunet.__version__,
-            "detector": self.stored.detector.name,
-            "data": str(self.data.path),
-            "peak": self.peak,
-            "seed": self.seed,
-            "events": {
-                "sim": sum(len(sides) for sides in compared),
-                "data": sum(len(sides.data) for sides in compared),
-            },
-            **described(calibrated),
-        }
-        fits = calibrated.alternatives
-        if len(fits) > 1:  # other physics explain the data about as well
-            rows, decide = side_by_side(fits, self.stored.hits, self.recipe, self.selection)
-            content |= {"alternatives": rows, "would_decide": decide}
-            remedy = f"`peak` {','.join([self.peak, *decide[:2]])} would decide"
-            if not decide:
-                remedy = f"none of the energies of {self.sim.path.name} would decide"
-            told = f"{len(rows) - 1} other physics explain {self.peak} as well"
-            content["notes"].append(f"{told} (alternatives): {remedy}")
-        return content
+    def simulate(self, out: Path, detector: Detector, settings: SimulationSettings) -> None:
+        """Simulate all events of the file again."""
+        hits = HitFile(self.sim.path, placed=True)
+        how: Any = {"hits": hits, "settings": dict(settings), "seed": self.seed}
+        simulate(out, detector=detector, **how)
 
-    def _simulate_calibrated(self, calibrated: Calibrated, folder: Path) -> None:
-        """Write the calibrated physics, and all events simulated with it."""
-        at = calibrated.problem.parameters.coordinates
-        detector, settings = calibrated.physics.at(at)
-        comment = doubts(free_parameters(calibrated))
-        for name, config in ((DETECTOR, detector), (SETTINGS, settings)):
-            text = yaml_text(config.model_dump(mode="json"))
-            (folder / name).write_text(comment + text, encoding="utf-8")
-        simulate(
-            folder / SIM,
-            detector=detector,
-            hits=HitFile(self.sim.path, placed=True),
-            settings=dict(settings),
-            seed=self.seed,
-        )
+    def trained(self, folder: Path, known: ElectronicsResponse) -> Run:
+        """The readout fitted to all events of the folder, starting from a known one."""
+        selection = parse_selection(self.peak, self.recipe.peaks)
+        again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, selection)
+        # not stretched: what is off in the drift is for the physics to explain
+        training = self.recipe.training.model_copy(update={"drift_terms": 0})
+        recipe = self.recipe.model_copy(update={"training": training})
+        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.data, folder)
+        return train_chain(job, known)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from matplotlib.figure import Figure
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from cpunet.calibration.nuisances import titled
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.plotting import COLOURS, styled
+from cpunet.pulses.loading import InfoPart
 from cpunet.settings import read_json, read_settings
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
@@ -36,6 +35,190 @@ PLAN = FolderKind(
     command="cpunet calibrate --plan",
     own=r"plan\.json|plan\.png",
 )
+_BY_LOAD: Any = {"default": None, "exclude": True, "repr": False}
+SHOWN = 0.25  # least component of a direction that is shown
+
+
+class Direction(InfoPart):
+    r"""A combination of parameters, and how well the pulses determine it.
+
+    Parameters
+    ----------
+    components
+        Components by name, in units of the priors.  Their squares add up to 1.
+    error
+        Standard deviation given prior and data, in units of the prior:
+        :math:`1/\sqrt{1 + \lambda}` with the eigenvalue :math:`\lambda` of the scaled
+        information.  It is 1 if the data contain no information.
+    value
+        Its value in errors of the priors, if it was fitted.
+    """
+
+    components: dict[str, float]
+    error: float
+    value: float | None = None
+
+    @property
+    def words(self) -> str:
+        """The larger components as a sum."""
+        parts = sorted(self.components.items(), key=lambda part: -abs(part[1]))
+        shown = [(n, c) for n, c in parts if abs(c) >= SHOWN]
+        text = " ".join(f"{'+' if c > 0 else '−'} {abs(c):.2f} {n}" for n, c in shown)
+        return text.removeprefix("+ ")
+
+
+class FreeParameter(InfoPart):
+    """A free parameter of the physics, in its unit.
+
+    Parameters
+    ----------
+    value, error
+        Value, and its error with the fixed parameters as simulated.
+    error_all
+        Error with all parameters considered free.
+    simulated
+        Value as simulated.
+    doubt
+        Why the value is unreliable, or None.
+    prior, prior_error, source
+        Prior, and where it is from.
+    """
+
+    value: float
+    error: float
+    error_all: float
+    simulated: float
+    doubt: str | None
+    prior: float
+    prior_error: float
+    source: str
+
+
+class FixedParameter(InfoPart):
+    """A parameter that was kept as simulated, and what would be if it were free."""
+
+    value: float
+    chi_square_would_fall_by: float
+    error_if_free: float
+
+
+class ChiSquare(InfoPart):
+    """Chi-square of the compared functions.
+
+    Parameters
+    ----------
+    before, after
+        With the physics as simulated, and calibrated.
+    moments
+        Number of functions.
+    expected, spread
+        Mean and standard deviation if simulation and data agree.
+    errors_scaled_by
+        Factor of the errors of the parameters, from imperfect agreement.
+    """
+
+    before: float
+    after: float
+    moments: int
+    expected: float
+    spread: float
+    errors_scaled_by: float
+
+
+class CalibratedPhysics(InfoPart):
+    """The calibrated physics: content of ``calibration.json``.
+
+    Parameters
+    ----------
+    parameters, fixed
+        By name.
+    together
+        Pairs of free parameters of which only a combination is determined.
+    others
+        A line on each of the other physics that explain the pulses about as well.
+    directions
+        Eigenvectors of the covariance of all physics, best determined first.
+    chi_square
+        Of all that is compared.
+    covariance
+        Of the coordinates of the free parameters, in their order.
+    functions, pulls_before, pulls_after
+        Names of the functions, and their deviations in standard deviations.
+    rounds, settled
+        Number of rounds, and whether the physics was unchanged in the last.
+    notes
+        Remarks on the result.
+    """
+
+    parameters: dict[str, FreeParameter]
+    fixed: dict[str, FixedParameter]
+    together: list[Direction]
+    others: list[str]
+    directions: list[Direction]
+    chi_square: ChiSquare
+    covariance: list[list[float]]
+    functions: list[str]
+    pulls_before: list[float]
+    pulls_after: list[float]
+    rounds: int
+    settled: bool
+    notes: list[str]
+
+    @property
+    def comment(self) -> str:
+        """Comment on unreliable values, for the files of the physics."""
+        return "".join(
+            f"# {name}: unreliable value, makes up for something else ({one.doubt})\n"
+            for name, one in self.parameters.items()
+            if one.doubt
+        )
+
+    @property
+    def shown(self) -> dict[str, str]:
+        """Each value with its error, or why none is given."""
+        pairs = {name for pair in self.together for name in pair.components}
+        texts = {}
+        for name, one in self.parameters.items():
+            texts[name] = f"{one.value:.5g} ± {one.error:.2g}"
+            if one.doubt:
+                texts[name] = f"unreliable value: {one.value:.5g} makes up for something else"
+            elif name in pairs:
+                texts[name] = "determined only together with another"
+        return texts
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """``pulls``, and ``directions`` if any parameter was free."""
+        drawn = {"pulls": pulls_figure(self)}
+        if self.directions:
+            drawn["directions"] = directions_figure(self.directions)
+        return drawn
+
+    def __str__(self) -> str:
+        lines = [
+            f"{titled(name)} {text} (simulated with {one.simulated:.5g}; "
+            f"± {one.error_all:.2g} if all physics were free)"
+            for (name, text), one in zip(
+                self.shown.items(), self.parameters.values(), strict=True
+            )
+        ] or ["no parameter of the physics is determined better than by its prior"]
+        lines += [
+            f"only together: {titled(pair.words, units=False)} = {pair.value:.2f} ± "
+            f"{pair.error:.2g} (errors of the priors)"
+            for pair in self.together
+        ]
+        if self.fixed:
+            falls = ", ".join(
+                f"{titled(name)} (± {one.error_if_free:.2g} if free, chi-square would fall "
+                f"by {one.chi_square_would_fall_by:.1f})"
+                for name, one in self.fixed.items()
+            )
+            lines.append(f"left as simulated: {falls}")
+        chi = self.chi_square
+        before, after = chi.before / chi.moments, chi.after / chi.moments
+        lines.append(f"chi-square per function {before:.2f} before, {after:.2f} after")
+        lines += [f"explains the pulses as well: {titled(text)}" for text in self.others]
+        return "\n".join(lines)
 
 
 class Calibration(Run):
@@ -43,11 +226,11 @@ class Calibration(Run):
 
     Parameters
     ----------
-    content
-        Content of ``calibration.json``.
+    result
+        The calibrated physics.
     """
 
-    content: dict[str, Any] = Field({}, exclude=True, repr=False)
+    result: CalibratedPhysics = Field(**_BY_LOAD)
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -64,19 +247,19 @@ class Calibration(Run):
                 f"{folder}: no calibrated run (no {CALIBRATION}); open it with "
                 "cpunet.Run.load, or calibrate"
             )
-        content = read_json(path, "calibrate again")
-        return run.model_copy(update={"content": content})
+        try:
+            result = CalibratedPhysics.model_validate(read_json(path, "calibrate again"))
+        except ValidationError as error:
+            where = ".".join(map(str, error.errors()[0]["loc"]))
+            raise CpunetError(f"{path}: damaged ({where}); calibrate again") from error
+        return run.model_copy(update={"result": result})
 
     @cached_property
     def physics(self) -> DataFrame:
         """A row per free parameter: its value, error, simulated value, prior and others."""
         from pandas import DataFrame
 
-        rows = {
-            name: {k: v for k, v in told.items() if k != "prior"}
-            | {"prior": told["prior"]["value"], "prior_error": told["prior"]["error"]}
-            for name, told in self.content["parameters"].items()
-        }
+        rows = {name: one.model_dump() for name, one in self.result.parameters.items()}
         return DataFrame.from_dict(rows, orient="index")
 
     @property
@@ -95,95 +278,55 @@ class Calibration(Run):
         return read_settings(SimulationSettings, self._folder / SETTINGS)
 
     @property
+    def figures(self) -> dict[str, Figure]:
+        """``pulls``, and ``directions`` if any parameter was free."""
+        return self.result.figures
+
+    @property
     def _folder(self) -> Path:
         assert self.folder is not None  # a calibration always has one
         return self.folder
 
-    @property
-    def figures(self) -> dict[str, Figure]:
-        """``pulls``; ``profiles`` and ``directions``, if any parameter was free."""
-        return calibration_figures(self.content)
-
-    @property
-    def alternatives(self) -> DataFrame:
-        """Physics that explain the data about as well, the calibrated ones first.
-
-        Values of what is free in any of them, the rise of chi-square, and the medians of
-        current amplitude and drift time (ns) that they predict for energies that were not used.
-        Empty if there are none.
-        """
-        from pandas import DataFrame
-
-        return DataFrame(self.content.get("alternatives", ()))
-
     def __str__(self) -> str:
-        content = self.content
-        chi, fixed = content["chi_square"], content["fixed"]
-        before, after = (chi[key] / chi["moments"] for key in ("before", "after"))
-        lines = [
-            f"{titled(name)} {shown} (simulated with {told['simulated']:.5g}; "
-            f"± {told['error_all']:.2g} if all physics were free)"
-            for (name, shown), told in zip(
-                self._shown().items(), content["parameters"].values(), strict=True
-            )
-        ] or ["no parameter of the physics is determined better than it was known"]
-        lines += [
-            f"only together: {titled(pair['words'], units=False)} = {pair['value']:.2f} ± "
-            f"{pair['error']:.2g} (errors of the priors)"
-            for pair in content["together"]
-        ]
-        if fixed:
-            falls = ", ".join(
-                f"{titled(name)} (± {told['error_if_free']:.2g} if free, chi-square would fall "
-                f"by {told['chi_square_would_fall_by']:.1f})"
-                for name, told in fixed.items()
-            )
-            lines.append(f"left as simulated: {falls}")
-        lines.append(f"chi-square per function {before:.2f} before, {after:.2f} after")
-        if len(others := self.alternatives):
-            rows = [[titled(n), *(f"{v:.5g}" for v in others[n])] for n in others]
-            lines.append(text_table(["alternatives", "calibrated", *others.index[1:]], rows))
-        return "\n".join([*lines, str(self.folder)])
-
-    def _shown(self) -> dict[str, str]:
-        """Each value with its error, or why there is none to tell."""
-        pairs = {name for pair in self.content["together"] for name in pair["components"]}
-        found = {}
-        for name, told in self.content["parameters"].items():
-            value = f"{told['value']:.5g} ± {told['error']:.2g}"
-            if told["doubt"]:
-                value = f"unreliable value: {told['value']:.5g} makes up for something else"
-            elif name in pairs:
-                value = "known only together with another"
-            found[name] = value
-        return found
+        return f"{self.result}\n{self.folder}"
 
     def _repr_html_(self) -> str:
         from cpunet.html_pages import part
 
+        of = self.result.parameters
         rows = [
-            [titled(name), shown, f"{self.content['parameters'][name]['simulated']:.5g}"]
-            for name, shown in self._shown().items()
+            [titled(name), text, f"{of[name].simulated:.5g}"]
+            for name, text in self.result.shown.items()
         ]
-        head = ["physics", "calibrated", "as simulated"]
-        shown = part(
-            "object", "", head=head, rows=rows, lines=map(titled, self.content["notes"])
-        )
-        return shown + super()._repr_html_()
+        head, notes = ["physics", "calibrated", "as simulated"], map(titled, self.result.notes)
+        return part("object", "", head=head, rows=rows, lines=notes) + super()._repr_html_()
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Plan:
-    """What pulses know of the physics before any fit: ``cpunet.calibrate(..., plan=True)``.
+class ExpectedErrors(InfoPart):
+    """Errors of a parameter: of its prior, and by number of pulses alone and with all free."""
+
+    simulated: float
+    prior: float
+    alone: dict[str, float]
+    all_free: dict[str, float]
+
+
+class Plan(InfoPart):
+    """Expected sensitivity to the physics: ``cpunet.calibrate(..., plan=True)``.
 
     Parameters
     ----------
-    content
-        ``errors`` of each parameter by number of pulses, alone and with all parameters free;
-        ``directions`` by number of pulses.
+    detector
+        Name of the detector.
+    errors
+        Expected errors by parameter.
+    directions
+        Eigenvectors of the covariance by number of pulses.
     """
 
-    content: dict[str, Any]
+    detector: str
+    errors_by_name: dict[str, ExpectedErrors]
+    directions: dict[str, list[Direction]]
 
     @property
     def errors(self) -> DataFrame:
@@ -191,15 +334,15 @@ class Plan:
         from pandas import DataFrame
 
         rows = {
-            (name, kind): told[kind]
-            for name, told in self.content["errors"].items()
+            (name, kind): getattr(one, kind)
+            for name, one in self.errors_by_name.items()
             for kind in ("alone", "all_free")
         }
         return DataFrame.from_dict(rows, orient="index")
 
     def plot(self) -> Figure:
         """Draw the directions with a middling number of pulses."""
-        return directions_figure(self.content["directions"][self._middle])
+        return directions_figure(self.directions[self._middle])
 
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write ``plan.json`` and ``plan.png``.
@@ -210,112 +353,52 @@ class Plan:
             If the folder exists and `force` is off, or is no plan.
         """
         with folder_written_aside(Path(folder), PLAN, force=force) as aside:
-            (aside / "plan.json").write_text(json.dumps(self.content, indent=1) + "\n")
+            (aside / "plan.json").write_text(self.model_dump_json(indent=1) + "\n")
             self.plot().savefig(aside / "plan.png", dpi=DPI)
 
     def __str__(self) -> str:
-        counts = [f"N={n}" for n in self.content["pulses"]]
-        tables = []
+        counts, tables = [f"N={n}" for n in self.directions], []
         for kind, title in (("alone", "error of one alone"), ("all_free", "with all free")):
             rows = [
-                [titled(name), *(f"{e:.3g}" for e in (told["prior"], *told[kind].values()))]
-                for name, told in self.content["errors"].items()
+                [titled(name), *(f"{e:.3g}" for e in (one.prior, *getattr(one, kind).values()))]
+                for name, one in self.errors_by_name.items()
             ]
             tables.append(text_table([title, "prior", *counts], rows))
         directions = [
-            f"{d['error']:8.3f}  {titled(d['words'], units=False)}"
-            for d in self.content["directions"][self._middle]
+            f"{one.error:8.3f}  {titled(one.words, units=False)}"
+            for one in self.directions[self._middle]
         ]
-        unit = "error in units of the prior:"
         about = (
-            f"eigenvectors of the covariance with {self._middle} pulses of each side, {unit}"
+            f"eigenvectors of the covariance with {self._middle} pulses of each side, error in "
+            "units of the prior:"
         )
         return "\n".join([*tables, about, *directions])
 
     def __repr__(self) -> str:
-        return f"<Plan of {self.content['detector']}: {', '.join(self.content['errors'])}>"
+        return f"<Plan of {self.detector}: {', '.join(self.errors_by_name)}>"
 
     @property
     def _middle(self) -> str:
-        pulses = self.content["pulses"]
-        return str(pulses[len(pulses) // 2])
+        return [*self.directions][len(self.directions) // 2]
 
 
 BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]
-# Columns of panels.
-COLUMNS = 3
-# Pulls up to which the axis is linear.
-LINEAR = 3.0
-
-
-def calibration_figures(content: Mapping[str, Any]) -> dict[str, Figure]:
-    """``pulls``; ``profiles`` and ``directions``, if any parameter was free.
-
-    Parameters
-    ----------
-    content
-        Content of ``calibration.json``.
-    """
-    found = {"pulls": pulls_figure(content)}
-    if content["profiles"]:
-        found["profiles"] = profiles_figure(content)
-    if content["directions"]:
-        found["directions"] = directions_figure(content["directions"])
-    return found
+LINEAR = 3.0  # pulls up to which the axis is linear
 
 
 @styled
-def profiles_figure(content: Mapping[str, Any]) -> Figure:
-    """Profile chi-square of each free parameter, one panel each.
-
-    Parameters
-    ----------
-    content
-        Content of ``calibration.json``, with at least one free parameter.
-    """
-    profiles = content["profiles"]
-    rows = -(-len(profiles) // COLUMNS)
-    columns = min(COLUMNS, len(profiles))
-    figure = Figure(figsize=(0.6 + 3.1 * columns, 0.4 + 2.5 * rows))
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel in panels[len(profiles) :]:
-        panel.set_axis_off()
-    for panel, (name, profile) in zip(panels, profiles.items(), strict=False):
-        values, cost = np.array(profile["value"]), np.array(profile["chi_square"])
-        told = content["parameters"][name]
-        grid = np.linspace(values.min(), values.max(), 200)
-        parabola = ((grid - told["value"]) / told["error"]) ** 2
-        panel.plot(grid, parabola, color="0.6", label="error quoted")
-        panel.plot(values, cost - cost.min(), "o", color=AFTER, label="profile")
-        if values.min() <= told["simulated"] <= values.max():
-            panel.axvline(told["simulated"], color=BEFORE, ls="--", label="as simulated")
-        panel.set_xlabel(titled(name))
-        panel.set_ylim(-0.5, 12)
-        panel.set_ylabel("Δχ²")
-    panels[0].legend()
-    return figure
-
-
-@styled
-def pulls_figure(content: Mapping[str, Any]) -> Figure:
-    """Pulls of all functions before and after the calibration.
-
-    Parameters
-    ----------
-    content
-        Content of ``calibration.json``.
-    """
-    pulls = content["pulls"]
-    groups = [_group(name) for name in pulls["names"]]
+def pulls_figure(result: CalibratedPhysics) -> Figure:
+    """Pulls of all functions before and after a calibration."""
+    groups = [_group(name) for name in result.functions]
     names = list(dict.fromkeys(groups))
     figure = Figure(figsize=(9.5, 3.6))
     panel = figure.subplots()
     x = np.arange(len(groups))
-    for key, colour, label in (
-        ("before", BEFORE, "as simulated, chain alone"),
-        ("after", AFTER, "calibrated"),
+    for pulls, colour, label in (
+        (result.pulls_before, BEFORE, "as simulated, chain alone"),
+        (result.pulls_after, AFTER, "calibrated"),
     ):
-        panel.plot(x, pulls[key], ".", ms=4, color=colour, label=label)
+        panel.plot(x, pulls, ".", ms=4, color=colour, label=label)
     panel.set_yscale("symlog", linthresh=LINEAR)
     panel.axhspan(-2, 2, color="0.9", zorder=0)
     starts = [groups.index(name) for name in names]
@@ -332,17 +415,11 @@ def pulls_figure(content: Mapping[str, Any]) -> Figure:
 
 
 @styled
-def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
-    """Principal axes of the information matrix as a colour table, with the error of each.
-
-    Parameters
-    ----------
-    directions
-        Directions from ``calibration.json`` or ``plan.json``.
-    """
-    names = list(directions[0]["components"])
-    matrix = np.array([[d["components"][name] for name in names] for d in directions])
-    errors = np.array([d["error"] for d in directions])
+def directions_figure(directions: Sequence[Direction]) -> Figure:
+    """Eigenvectors of the covariance as a colour table, with the error of each."""
+    names = list(directions[0].components)
+    matrix = np.array([[one.components[name] for name in names] for one in directions])
+    errors = np.array([one.error for one in directions])
     size = 0.34 * len(names)
     figure = Figure(figsize=(5.6 + size, 2.0 + size))
     left, right = figure.subplots(
@@ -352,7 +429,7 @@ def directions_figure(directions: Sequence[Mapping[str, Any]]) -> Figure:
     titles = [titled(name, units=False) for name in names]
     left.set_xticks(range(len(names)), titles, rotation=60, ha="right", fontsize=8)
     left.set_yticks(range(len(errors)), [str(i + 1) for i in range(len(errors))])
-    left.set_ylabel("direction, best known first")
+    left.set_ylabel("eigenvector, best determined first")
     left.grid(visible=False)
     right.barh(range(len(errors)), errors, color=np.where(errors < 0.5, AFTER, "0.75"))
     right.set_xscale("log")

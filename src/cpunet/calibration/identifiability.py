@@ -20,6 +20,7 @@ from itertools import combinations
 
 import numpy as np
 
+from cpunet.calibration.calibrated_run import Direction
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values
 
@@ -28,38 +29,6 @@ TOLD = 0.5
 # Error of a combination of two parameters, relative to their own, below which it is told in
 # their place if one of them is not determined.
 PARALLEL = 0.3
-# Minimum component of a direction that is shown.
-SHOWN = 0.25
-
-
-@dataclass(frozen=True)
-class Direction:
-    r"""A combination of parameters, and how well it is known.
-
-    Parameters
-    ----------
-    components
-        Components by name, in units of the priors. Their squares add up to 1.
-    error
-        Standard deviation given prior and data, in units of the prior:
-        :math:`1/\sqrt{1 + \lambda}` with the eigenvalue :math:`\lambda` of the scaled
-        information. It is 1 if the data contain no information.
-    """
-
-    components: dict[str, float]
-    error: float
-
-    @property
-    def words(self) -> str:
-        """The larger components as a sum."""
-        parts = sorted(self.components.items(), key=lambda part: -abs(part[1]))
-        shown = [(n, c) for n, c in parts if abs(c) >= SHOWN]
-        text = " ".join(f"{'+' if c > 0 else '−'} {abs(c):.2f} {n}" for n, c in shown)
-        return text.removeprefix("+ ")
-
-    def describe(self) -> dict[str, dict[str, float] | float | str]:
-        """Content for JSON."""
-        return {"components": self.components, "error": self.error, "words": self.words}
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +127,8 @@ class Information:
         for size, axis in zip(sizes[::-1], axes.T[::-1], strict=True):
             sign = np.sign(axis[np.argmax(np.abs(axis))])
             components = dict(zip(names, (sign * axis).tolist(), strict=True))
-            found.append(Direction(components, float(1 / np.sqrt(1 + max(size, 0.0)))))
+            error = float(1 / np.sqrt(1 + max(size, 0.0)))
+            found.append(Direction(components=components, error=error))
         return found
 
 
@@ -192,7 +162,7 @@ def together(names: Sequence[str], covariance: Values) -> list[Direction]:
         if errors.max() > TOLD and known < PARALLEL * errors.min():
             axis = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
             components = {names[i]: float(axis[0]), names[j]: float(axis[1])}
-            found.append(Direction(components, known))
+            found.append(Direction(components=components, error=known))
     return found
 
 

@@ -338,7 +338,7 @@ class Search:
         moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
         parameters.set(moved)
         rises = [(fit, minimum.cost - found.cost) for fit, minimum in fits]
-        rises.sort(key=lambda one: (one[0] is not problem, one[1]))
+        rises.sort(key=lambda fit: fit[1])
         return Calibrated(
             problem=problem,
             covariance=covariance,
@@ -350,7 +350,7 @@ class Search:
             promised=promised,
             rounds=rounds,
             settled=settled,
-            alternatives=[one for one in rises if one[1] < SAME],
+            alternatives=[fit for fit in rises if fit[0] is not problem and fit[1] < SAME],
         )
 
     def _tell(self, when: str, problem: JointProblem, found: Parabola | None = None) -> None:

@@ -29,7 +29,8 @@ from cpunet.training.closed_forms import (
     with_noise,
 )
 from cpunet.training.diagnosis import beyond, stretched
-from cpunet.training.run import FitInfo, Run
+from cpunet.training.run import Run
+from cpunet.training.verdict import FitInfo
 
 # The division of a chain into parts is degenerate, and times of slow parts and decays are
 # fixed: a true part between two of them is split, which the errors do not contain.

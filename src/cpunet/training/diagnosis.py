@@ -7,6 +7,7 @@ from collections.abc import Mapping
 # Limits of the fraction of charge that arrives late; an overshoot makes it a few percent
 # negative.
 MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
+DRIFT = {1: "drift-time scale", 2: "its change with time"}  # by number of terms
 
 
 def beyond(parameters: Mapping[str, float]) -> list[str]:
@@ -56,7 +57,7 @@ with other impurities: cpunet calibrate tells which
     size = f"charges drift for {_longer(stretch + change)} than simulated"
     if change:
         size += f" in the last microsecond, {_longer(stretch)} near its end"
-    if (gain := gains.get("a stretch of the drift", "").partition("; ")[2]) != "":
+    if (gain := gains.get(DRIFT[1], "").partition("; ")[2]) != "":
         size += f" ({gain})"
     cause = (
         "warmer detector, at a lower bias" if stretch > 0 else "colder one, at a higher bias"

@@ -8,12 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -38,14 +38,13 @@ from cpunet.recipes.schema import PunetConfig, Recipe
 from cpunet.training.chain_fit import Fitter, Listener
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.diagnosis import beyond, stretched
+from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
-from cpunet.training.response_fit import DRIFT, Fit, fit_response
+from cpunet.training.response_fit import fit_response
 from cpunet.training.run import (
     INFO,
     RUN,
-    FitInfo,
     Record,
     Run,
     RunLike,
@@ -54,6 +53,7 @@ from cpunet.training.run import (
     read_losses,
     versions,
 )
+from cpunet.training.verdict import FitInfo
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +88,41 @@ class TrainingJob:
     init: Run | None = None
     resume: bool = False
     continuum: Continuum | None = None
+
+    @classmethod
+    def of(
+        cls,
+        pair: Pair,
+        folder: Path,
+        *,
+        recipe: Recipe,
+        peak: str,
+        init: Run | None,
+        **how: Any,
+    ) -> Self:
+        """Read and prepare both sides, and warn of what makes a training on them doubtful."""
+        selection = parse_selection(peak, recipe.peaks)
+
+        def read(energies: EnergySelection, tell: bool = True) -> tuple[InputSet, InputSet]:
+            sim = load_pulses(pair[0], "simulated", recipe, energies, tell=tell)
+            return sim, load_pulses(pair[1], "measured", recipe, energies, tell=tell)
+
+        sim, data = read(selection)
+        require_same_sampling(sim, data)
+        require_both_sides(sim, data, selection)
+        for finding in compare_sides(sim, data, selection, recipe.preparation):
+            if finding.level != Level.FINE:
+                log.warning(finding)
+        if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
+            kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
+            raise CpunetError(f"{init.name}: {kinds}; resample them")
+        away = continuum(recipe)
+        fewest = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
+        more = None
+        if fewest >= MIN_PULSES and not selection.ranges_kev:
+            more = partial(read, away, tell=False)
+        how |= {"sim": sim, "data": data, "init": init, "continuum": more}
+        return cls(recipe.at(data.dt_ns), peak, folder=folder, **how)
 
     def trained(self, out: Path | None) -> Run:
         """Train, and write the folder of the job, which becomes `out`."""
@@ -150,79 +185,37 @@ class TrainingJob:
         )
 
 
-@dataclass(frozen=True)
-class Training:
-    """How to train, whatever the pulses; see `cpunet.train`."""
-
-    recipe: Recipe
-    peak: str
-    init: RunLike | None
-    seed: int
-    device: str
-    resume: bool
-    force: bool
-
-    def of_channel(self, name: str, pair: Pair, folder: Path) -> Path:
-        """The folder of the run of a channel, trained in a process of its own."""
-        if self.resume and (folder / INFO).is_file():
-            log.info(f"{name}: trained already")
-            return folder
-        init = self.init
-        if isinstance(init, str | Path):
-            init = own_folder(Path(init), name, INFO)
-        start = None if init is None else as_run(init)
-        self.run(pair, folder, start)
+def of_channel(
+    name: str, pair: Pair, folder: Path, *, init: RunLike | None, force: bool, **how: Any
+) -> Path:
+    """The folder of the run of a channel, trained in a process of its own."""
+    if how["resume"] and (folder / INFO).is_file():
+        log.info(f"{name}: trained already")
         return folder
+    if isinstance(init, str | Path):
+        init = own_folder(Path(init), name, INFO)
+    trained_in(folder, pair, init, force, **how)
+    return folder
 
-    def run(self, pair: Pair, out: Path | None, start: Run | None) -> Run:
-        """Read, train and write a run."""
-        files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
-        place: AbstractContextManager[Path | str]
-        if out is None:
-            place = TemporaryDirectory()
-        elif self.recipe.networks:
-            require_torch()
-            from cpunet.training.unfinished import unfinished_folder
 
-            place = unfinished_folder(out, *files, resume=self.resume, force=self.force)
-        else:
-            place = folder_written_aside(out, RUN, *files, force=self.force)
-        with place as folder:
-            return self._job(pair, Path(folder), start).trained(out)
+def trained_in(
+    out: Path | None, pair: Pair, init: RunLike | None, force: bool, **how: Any
+) -> Run:
+    """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes."""
+    start = None if init is None else as_run(init)
+    files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
+    place: AbstractContextManager[Path | str]
+    if out is None:
+        place = TemporaryDirectory()
+    elif how["recipe"].networks:
+        require_torch()
+        from cpunet.training.unfinished import unfinished_folder
 
-    def _job(self, pair: Pair, folder: Path, init: Run | None) -> TrainingJob:
-        """Read and prepare both sides, and warn of what makes a training on them doubtful."""
-        recipe, selection = self.recipe, parse_selection(self.peak, self.recipe.peaks)
-
-        def read(energies: EnergySelection, tell: bool = True) -> tuple[InputSet, InputSet]:
-            sim = load_pulses(pair[0], "simulated", recipe, energies, tell=tell)
-            return sim, load_pulses(pair[1], "measured", recipe, energies, tell=tell)
-
-        sim, data = read(selection)
-        require_same_sampling(sim, data)
-        require_both_sides(sim, data, selection)
-        for finding in compare_sides(sim, data, selection, recipe.preparation):
-            if finding.level != Level.FINE:
-                log.warning(finding)
-        away = continuum(recipe)
-        there = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
-        enough = there >= MIN_PULSES and not selection.ranges_kev
-        beside = partial(read, away, tell=False) if enough else None
-        if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
-            kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-            raise CpunetError(f"{init.name}: {kinds}; resample them")
-        return TrainingJob(
-            recipe.at(data.dt_ns),
-            self.peak,
-            self.seed,
-            self.device,
-            sim,
-            data,
-            folder,
-            init,
-            self.resume,
-            beside,
-        )
+        place = unfinished_folder(out, *files, resume=how["resume"], force=force)
+    else:
+        place = folder_written_aside(out, RUN, *files, force=force)
+    with place as folder:
+        return TrainingJob.of(pair, Path(folder), init=start, **how).trained(out)
 
 
 def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
@@ -245,10 +238,10 @@ def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
     return known
 
 
-def match(
+def fitted(
     job: TrainingJob, known: ElectronicsResponse | None, listen: Listener
 ) -> tuple[ResponseGenerator, FitInfo]:
-    """Measure the noise, fit the response, and tell how well it describes the data.
+    """Measure the noise, fit the response, and say how well it describes the data.
 
     Parameters
     ----------
@@ -273,56 +266,35 @@ def match(
     rng, drawn = np.random.default_rng(job.seed), noise.tails
     sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)
     decay = None if drawn is None else drawn.known_decay
-    fitter = Fitter(recipe.matching.training, decay, listen)
-    response, fit = fit_response(sets, fitter, known)
-    parameters = response.describe()
-    stretches = stretched(parameters, fit.gains)
-    told = asdict(fit) | {
-        "checks": fit.checks,
-        "parameters": parameters,
-        "delay_ns": response.delay_ns(),
-        "verdict": "; ".join([fit.verdict, *stretches]),
-        "causes": fit.checks.causes,
-        "in_no_band": {
-            "sim": len(sim) - sum(len(band.sim) for band, _ in sets.parted),
-            "data": len(data) - sum(len(band.data) for band, _ in sets.parted),
-        },
-        "noise": {
-            "baselines": noise.noise.n_baselines,
-            "rms": noise.noise.rms,
-            "rms_error": noise.noise.rms_error,
-        },
-        "tails": tails,
-    }
+    response, info = fit_response(sets, Fitter(recipe.matching.training, decay, listen), known)
     chain = ResponseGenerator(response.config, job.sim.dt_ns)
-    chain.response = response
+    chain.response, chain.tails = response, drawn
     chain.set_noise(noise.noise)
-    chain.tails = drawn
-    info = FitInfo.model_validate(told)
-    _tell(fit, info, [*beyond(parameters), *stretches])
-    return chain, info
+    of_noise = {
+        "baselines": noise.noise.n_baselines,
+        "rms": noise.noise.rms,
+        "rms_error": noise.noise.rms_error,
+    }
+    return chain, info.model_copy(update={"noise": of_noise, "tails": tails})
 
 
-def _tell(fit: Fit, info: FitInfo, doubts: list[str]) -> None:
-    """Tell which pulses were compared, how well the fit describes them, and why not."""
-    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in fit.bands.items())
+def _say(info: FitInfo) -> None:
+    """Log which pulses were compared, how well the fit describes them, and why not."""
+    compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in info.bands.items())
     log.info(f"compared (simulated/measured pulses): {compared}")
-    beside = info.in_no_band
-    if any(beside.values()):
+    if any(info.in_no_band.values()):
         log.info(
-            f"in no band, since one side has too few of their energies: {beside['sim']} "
-            f"simulated and {beside['data']} measured pulses"
+            "in no band, since one side has too few of their energies: "
+            f"{info.in_no_band['sim']} simulated and {info.in_no_band['data']} measured pulses"
         )
-    if not fit.checks.good:
-        log.warning(f"the fit is {fit.verdict}")
-    else:
-        log.info(f"the fit is {fit.verdict}")
-    for part, gain in fit.gains.items():
-        if part != DRIFT[1] or "drift_stretch" not in info.parameters:
+    good = info.checks is not None and info.checks.good
+    log.log(logging.INFO if good else logging.WARNING, f"the fit is {info.verdict}")
+    for part, gain in info.gains.items():
+        if part != DRIFT[1] or "drift_stretch" not in info.parameters:  # else in the verdict
             log.info(f"{part}: {gain}")
     for number, cause in enumerate(info.causes, 1):
         log.info(f"  {number}. {cause}")
-    for doubt in doubts:
+    for doubt in beyond(info.parameters):
         log.warning(doubt)
 
 
@@ -341,7 +313,8 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
             bar.update(1)
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
-        chain, info = match(job, known, listen)
+        chain, info = fitted(job, known, listen)
+    _say(info)
     # a stretch or deviations may have been added
     recipe = job.recipe.model_copy(update={"generator": chain.response.config})
     sim = job.sim.prepared.pulses

@@ -30,9 +30,10 @@ from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.recipes.schema import Recipe, TrainingConfig
 from cpunet.training.adversarial import Game, Generator, Residual, train
-from cpunet.training.run import FitInfo, Record, Run
+from cpunet.training.run import Record, Run
 from cpunet.training.sides import Side, Sides
 from cpunet.training.unfinished import UnfinishedRun
+from cpunet.training.verdict import FitInfo
 
 if TYPE_CHECKING:
     from cpunet.training.job import TrainingJob

@@ -16,7 +16,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -26,75 +25,20 @@ from cpunet.training.chain_fit import Fitted, Fitter, chi_square, fit_chain
 from cpunet.training.chain_parameters import Parameters, with_decay, with_settings
 from cpunet.training.comparison import AMPLITUDE, Comparison, Difference, Sides
 from cpunet.training.deviations import with_deviations
+from cpunet.training.diagnosis import DRIFT, stretched
 from cpunet.training.heights import with_heights
 from cpunet.training.pulse_sets import SINGLE, PulseSets
-from cpunet.training.verdict import WIDTH, Verdict, verdict
+from cpunet.training.verdict import WIDTH, FitInfo, Verdict, verdict
 
 # What stretches the drift must lower chi-square of held-out pulses by this much.  Drift that is
 # longer or shorter by more than a third is that of another detector.
 NEEDED, MAX_STRETCH = 16.0, 1 / 3
 BY_HEIGHT = "slew rate and curve"
-DRIFT = {1: "drift-time scale", 2: "its change with time"}  # by number of terms
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well a response describes the data.
-
-    Parameters
-    ----------
-    checks
-        What every sample says.
-    chi_square, moments
-        Chi-square of all that is compared, and how much that is.
-    steps
-        Number of steps taken, by all fits together.
-    errors
-        Standard deviations of the parameters by name, from the curvature of chi-square.
-    pulls
-        Deviation of the mean pulse in its standard errors, by time from the half height.
-    data_left_out
-        Number of measured pulses excluded: those with a piled-up pulse, or without a baseline.
-    covariance
-        Covariance of the parameters, in the order of `errors`.
-    bands
-        Energies compared, with the pulses of each side.
-    amplitude_shift, amplitude_shift_error
-        Relative change of the translated current amplitudes that would bring them closest to
-        the data's, see `amplitude_shift`.
-    gains
-        What held-out pulses say of each part that was tried.
-    """
-
-    checks: Verdict
-    chi_square: float
-    moments: int
-    steps: int
-    errors: dict[str, float]
-    pulls: dict[str, float]
-    data_left_out: int
-    covariance: list[list[float]]
-    bands: dict[str, list[int]]
-    amplitude_shift: float
-    amplitude_shift_error: float
-    gains: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def verdict(self) -> str:
-        """Remaining difference between translation and data, in a sentence."""
-        shift, error = 100 * self.amplitude_shift, 100 * self.amplitude_shift_error
-        off = abs(shift) >= 2 * error
-        size = f"is off by {shift:+.2f} ± {error:.2f} %"
-        if not off:
-            size = f"has a statistical error of {error:.2g} % (1σ)"
-        # a shift that is small compared with its error does not make the shape right
-        more = f"; the current amplitude {size}" if off or self.checks.good else ""
-        return f"{self.checks}{more}"
 
 
 def fit_response(
     sets: PulseSets, fitter: Fitter, known: ElectronicsResponse | None = None
-) -> tuple[ElectronicsResponse, Fit]:
+) -> tuple[ElectronicsResponse, FitInfo]:
     """Fit a response to unpaired prepared pulses.
 
     Parameters
@@ -226,7 +170,9 @@ def held_out(
     return found
 
 
-def described(best: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: Fitter) -> Fit:
+def described(
+    best: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: Fitter
+) -> FitInfo:
     """Describe the fit of a response."""
     response, pulls, quantiles = best.response, dict[str, float](), []
     parameters, covariance = Parameters(best.chain.response), best.chain.covariance
@@ -240,23 +186,36 @@ def described(best: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: F
         quantiles += [d for d in differences if d.name == f"{AMPLITUDE} quantiles"]
     total, functions = chi_square(response, bands)
     fitter.count(total)
-    shift, shift_error = amplitude_shift(quantiles)
-    return Fit(
+    shift, error = amplitude_shift(quantiles)
+    verdict = str(best.checks)
+    if abs(shift) >= 2 * error:
+        verdict += f"; the current amplitude is off by {100 * shift:+.2f} ± {100 * error:.2f} %"
+    elif best.checks.good:  # else, that the shift is small does not make the shape right
+        verdict += (
+            f"; the current amplitude has a statistical error of {100 * error:.2g} % (1σ)"
+        )
+    values = response.describe()
+    compared = zip(sets.names, bands, strict=True)
+    return FitInfo(
         checks=best.checks,
+        verdict="; ".join([verdict, *stretched(values, fitter.gains)]),
         chi_square=total,
         moments=round(functions),
         steps=fitter.steps,
-        gains=fitter.gains,
+        parameters=values,
         errors=parameters.by_name(np.sqrt(covariance.diagonal())),
-        pulls=pulls,
-        data_left_out=sum(sides.left_out for sides in bands),
         covariance=covariance.tolist(),
-        bands={
-            name: [len(sides), len(sides.data)]
-            for name, sides in zip(sets.names, bands, strict=True)
+        delay_ns=response.delay_ns(),
+        pulls=pulls,
+        gains=fitter.gains,
+        bands={name: [len(sides), len(sides.data)] for name, sides in compared},
+        in_no_band={
+            "sim": len(sets.sim) - sum(len(band.sim) for band, _ in sets.parted),
+            "data": len(sets.data) - sum(len(band.data) for band, _ in sets.parted),
         },
+        data_left_out=sum(sides.left_out for sides in bands),
         amplitude_shift=shift,
-        amplitude_shift_error=shift_error,
+        amplitude_shift_error=error,
     )
 
 

@@ -32,7 +32,6 @@ from safetensors.numpy import load, save
 
 import cpunet
 from cpunet.electronics.drawn_pile_up import DrawnTails
-from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.errors import CpunetError
 from cpunet.networks import require_torch
 from cpunet.networks.stored import Array, Stored
@@ -41,7 +40,7 @@ from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import checked, read_json, read_values, yaml_text
 from cpunet.tables import aligned
-from cpunet.training.verdict import Verdict
+from cpunet.training.verdict import FitInfo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,39 +73,10 @@ RUN = FolderKind(
     name="run",
     command="cpunet train",
     own=r"run\.json|recipe\.yaml|losses\.jsonl|weights\.safetensors"
-    r"|calibration\.json|(profiles|pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
+    r"|calibration\.json|(pulls|directions)\.png|detector\.yaml|settings\.yaml|sim\.lh5",
 )
 Network = TypeVar("Network", bound="Stored | nn.Module")
 _NOT_STORED: Any = {"exclude": True, "repr": False}
-
-
-class FitInfo(InfoPart):
-    """Fit of a readout chain: its parameters, their errors and covariance, and its quality.
-
-    ``delay_ns`` is the half rise of its step response.
-    """
-
-    delay_ns: float = 0.0
-    chi_square: float | None = None
-    moments: int | None = None
-    checks: Verdict | None = None
-    verdict: str = ""
-    causes: list[str] = []
-    parameters: dict[str, float] = {}
-    errors: dict[str, float] = {}
-    covariance: list[list[float]] = []
-    pulls: dict[str, float] = {}
-    gains: dict[str, str] = {}
-    noise: dict[str, float] = {}
-    in_no_band: dict[str, int] = {}
-    tails: TailsInfo | None = None
-
-    @property
-    def chi_square_per_moment(self) -> float | None:
-        """Fit quality; well above 1 if more than the readout differs."""
-        if self.chi_square is None or not self.moments:
-            return None
-        return self.chi_square / self.moments
 
 
 class Run(InfoPart):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,8 +96,8 @@ def train(
     from cpunet.recipes import load_recipe
     from cpunet.recipes.schema import Recipe
     from cpunet.settings import require_seed
-    from cpunet.training.job import Training
-    from cpunet.training.run import Run, as_run, resolve_device
+    from cpunet.training.job import of_channel, trained_in
+    from cpunet.training.run import Run, resolve_device
 
     target = None if out is None else Path(out)
     if target is not None and not isinstance(recipe, Recipe):
@@ -106,18 +107,18 @@ def train(
     device = resolve_device(device, chosen)
     sides = read.files(sim, data)
 
-    training = Training(chosen, peak, init, seed, device, resume, force)
+    how: dict[str, Any] = {"init": init, "force": force, "recipe": chosen, "peak": peak}
+    how |= {"seed": seed, "device": device, "resume": resume}
     trained: Run | Outcome[Run]
     of_all: list[str] = []
     if sides[1].table != ALL:
-        start = None if init is None else as_run(init)
-        trained = training.run(sides, target, start)
+        trained = trained_in(target, sides, **how)
     elif target is None:
         raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
     else:
-        found = each_channel(paired(*sides), target, training.of_channel)
-        runs = {name: Run.load(run) for name, run in found.done.items()}
-        trained, of_all = Outcome(runs, found.failed), ["--data-table", ALL]
+        folders = each_channel(paired(*sides), target, partial(of_channel, **how))
+        runs = {name: Run.load(folder) for name, folder in folders.done.items()}
+        trained, of_all = Outcome(runs, folders.failed), ["--data-table", ALL]
     if target is not None and all(side.pulses is None for side in sides):
         words: list[object] = ["--sim", sides[0].path, "--data", sides[1].path, *of_all]
         if trained.ok:

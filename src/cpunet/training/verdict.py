@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import InfoPart
 from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
@@ -131,6 +132,71 @@ class Verdict(InfoPart):
             f"{self.chi_square:.2f} per sample, of the amplitude {self.amplitude:.2f}, a "
             f"classifier has an AUC of {self.auc:.2f}"
         )
+
+
+class FitInfo(InfoPart):
+    """Fit of a readout chain, or what was measured for a network.
+
+    Parameters
+    ----------
+    checks
+        What every sample says.
+    verdict
+        The same in a sentence, with how well the current amplitude is known.
+    chi_square, moments, steps
+        Chi-square of all that is compared, how much that is, and the steps of all fits.
+    parameters
+        Of the response by name, with the unit at the end.
+    errors, covariance
+        Standard deviations of the fitted parameters by name, from the curvature of chi-square,
+        and their covariance in this order.
+    delay_ns
+        Half rise of the step response.
+    pulls
+        Deviation of the mean pulse in its standard errors, by time from the half height.
+    gains
+        What held-out pulses say of each part that was tried.
+    bands, in_no_band
+        Energies compared, with the pulses of each side; pulses of energies that one side lacks.
+    data_left_out
+        Number of measured pulses excluded: those with a piled-up pulse, or without a baseline.
+    amplitude_shift, amplitude_shift_error
+        Relative change of the translated current amplitudes that would bring them closest to
+        the data's.
+    noise, tails
+        Baselines and RMS of the noise; pile-up tails.
+    """
+
+    checks: Verdict | None = None
+    verdict: str = ""
+    chi_square: float | None = None
+    moments: int | None = None
+    steps: int = 0
+    parameters: dict[str, float] = {}
+    errors: dict[str, float] = {}
+    covariance: list[list[float]] = []
+    delay_ns: float = 0.0
+    pulls: dict[str, float] = {}
+    gains: dict[str, str] = {}
+    bands: dict[str, list[int]] = {}
+    in_no_band: dict[str, int] = {}
+    data_left_out: int = 0
+    amplitude_shift: float | None = None
+    amplitude_shift_error: float | None = None
+    noise: dict[str, float] = {}
+    tails: TailsInfo | None = None
+
+    @property
+    def causes(self) -> list[str]:
+        """What is off, why that may be, and what to try."""
+        return [] if self.checks is None else self.checks.causes
+
+    @property
+    def chi_square_per_moment(self) -> float | None:
+        """Fit quality; well above 1 if more than the readout differs."""
+        if self.chi_square is None or not self.moments:
+            return None
+        return self.chi_square / self.moments
 
 
 def _size(z: float) -> str:
