@@ -147,7 +147,7 @@ def calibrate(
     if target is not None and not isinstance(recipe, Recipe):
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
-    _ = settings.matching  # without a chain there is nothing to calibrate with a detector
+    _ = settings.matching  # without a chain nothing is calibrated with a detector
     freedom, act = Freedom.of(free, prior), _planned if plan else _calibrated
     given = settings, freedom, peak, events, require_seed(seed), force
     act = partial(act, given)
@@ -182,10 +182,15 @@ def _planned(given: Given, _name: str, pair: Pair, out: Path | None) -> Plan:
         errors[physics.nuisances[i].name] = ExpectedErrors(
             simulated=physics.nominal(physics.nuisances[i]),
             prior=own(width)[1],
-            alone={n: own(one.errors([i])[0])[1] for n, one in by_pulses.items()},
-            all_free={n: own(one.errors()[i])[1] for n, one in by_pulses.items()},
+            alone={
+                n: own(information_of.errors([i])[0])[1]
+                for n, information_of in by_pulses.items()
+            },
+            all_free={
+                n: own(information_of.errors()[i])[1] for n, information_of in by_pulses.items()
+            },
         )
-    directions = {n: one.directions() for n, one in by_pulses.items()}
+    directions = {n: information_of.directions() for n, information_of in by_pulses.items()}
     name = sides.stored.detector.name
     plan = Plan(detector=name, errors_by_name=errors, directions=directions)
     if out is not None:
@@ -253,7 +258,7 @@ class _Sides:
     def read(
         cls, pair: Pair, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
     ) -> Self:
-        """Read and prepare both sides; of the simulated one some `events`."""
+        """Read and prepare both sides; of the simulated side some `events`."""
         selection = parse_selection(peak, recipe.peaks)
         data = load_pulses(pair[1], "measured", recipe, selection)
         stored = StoredSimulation.read(pair[0].path)
@@ -291,7 +296,7 @@ class _Sides:
             sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
             recipe=self.recipe,
             given={k: v for k, v in given.items() if k != DEPLETION},
-            known=known_depletion(physics, given.get(DEPLETION)),
+            knowledge=known_depletion(physics, given.get(DEPLETION)),
             chosen=self.freedom.chosen,
         )
 
@@ -301,12 +306,12 @@ class _Sides:
         how: Any = {"hits": hits, "settings": dict(settings), "seed": self.seed}
         simulate(out, detector=detector, **how)
 
-    def trained(self, folder: Path, known: ElectronicsResponse) -> Run:
-        """The readout fitted to all events of the folder, starting from a known one."""
+    def trained(self, folder: Path, start: ElectronicsResponse) -> Run:
+        """The readout fitted to all events of the folder, starting from a chain."""
         selection = parse_selection(self.peak, self.recipe.peaks)
         again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, selection)
         # not stretched: what is off in the drift is for the physics to explain
         training = self.recipe.training.model_copy(update={"drift_terms": 0})
         recipe = self.recipe.model_copy(update={"training": training})
         job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.data, folder)
-        return train_chain(job, known)
+        return train_chain(job, start)

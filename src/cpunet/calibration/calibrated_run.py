@@ -1,4 +1,4 @@
-"""Results of a calibration: a run with its physics, the plan of one, and their figures."""
+"""Results of a calibration: a run with its physics, a plan, and their figures."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class FreeParameter(InfoPart):
 
 
 class FixedParameter(InfoPart):
-    """A parameter that was kept as simulated, and what would be if it were free."""
+    """A parameter that stays as simulated, and what would be if it were free."""
 
     value: float
     chi_square_would_fall_by: float
@@ -168,9 +168,9 @@ class CalibratedPhysics(InfoPart):
     def comment(self) -> str:
         """Comment on unreliable values, for the files of the physics."""
         return "".join(
-            f"# {name}: unreliable value, makes up for something else ({one.doubt})\n"
-            for name, one in self.parameters.items()
-            if one.doubt
+            f"# {name}: unreliable value, makes up for something else ({parameter.doubt})\n"
+            for name, parameter in self.parameters.items()
+            if parameter.doubt
         )
 
     @property
@@ -178,10 +178,12 @@ class CalibratedPhysics(InfoPart):
         """Each value with its error, or why none is given."""
         pairs = {name for pair in self.together for name in pair.components}
         texts = {}
-        for name, one in self.parameters.items():
-            texts[name] = f"{one.value:.5g} ± {one.error:.2g}"
-            if one.doubt:
-                texts[name] = f"unreliable value: {one.value:.5g} makes up for something else"
+        for name, parameter in self.parameters.items():
+            texts[name] = f"{parameter.value:.5g} ± {parameter.error:.2g}"
+            if parameter.doubt:
+                texts[name] = (
+                    f"unreliable value: {parameter.value:.5g} makes up for something else"
+                )
             elif name in pairs:
                 texts[name] = "determined only together with another"
         return texts
@@ -196,9 +198,9 @@ class CalibratedPhysics(InfoPart):
 
     def __str__(self) -> str:
         lines = [
-            f"{titled(name)} {text} (simulated with {one.simulated:.5g}; "
-            f"± {one.error_all:.2g} if all physics were free)"
-            for (name, text), one in zip(
+            f"{titled(name)} {text} (simulated with {parameter.simulated:.5g}; "
+            f"± {parameter.error_all:.2g} if all physics were free)"
+            for (name, text), parameter in zip(
                 self.shown.items(), self.parameters.values(), strict=True
             )
         ] or ["no parameter of the physics is determined better than by its prior"]
@@ -209,9 +211,9 @@ class CalibratedPhysics(InfoPart):
         ]
         if self.fixed:
             falls = ", ".join(
-                f"{titled(name)} (± {one.error_if_free:.2g} if free, chi-square would fall "
-                f"by {one.chi_square_would_fall_by:.1f})"
-                for name, one in self.fixed.items()
+                f"{titled(name)} (± {fixed.error_if_free:.2g} if free, chi-square would fall "
+                f"by {fixed.chi_square_would_fall_by:.1f})"
+                for name, fixed in self.fixed.items()
             )
             lines.append(f"left as simulated: {falls}")
         chi = self.chi_square
@@ -259,7 +261,9 @@ class Calibration(Run):
         """A row per free parameter: its value, error, simulated value, prior and others."""
         from pandas import DataFrame
 
-        rows = {name: one.model_dump() for name, one in self.result.parameters.items()}
+        rows = {
+            name: parameter.model_dump() for name, parameter in self.result.parameters.items()
+        }
         return DataFrame.from_dict(rows, orient="index")
 
     @property
@@ -284,7 +288,7 @@ class Calibration(Run):
 
     @property
     def _folder(self) -> Path:
-        assert self.folder is not None  # a calibration always has one
+        assert self.folder is not None  # a calibration always has a folder
         return self.folder
 
     def __str__(self) -> str:
@@ -334,8 +338,8 @@ class Plan(InfoPart):
         from pandas import DataFrame
 
         rows = {
-            (name, kind): getattr(one, kind)
-            for name, one in self.errors_by_name.items()
+            (name, kind): getattr(expected, kind)
+            for name, expected in self.errors_by_name.items()
             for kind in ("alone", "all_free")
         }
         return DataFrame.from_dict(rows, orient="index")
@@ -358,15 +362,18 @@ class Plan(InfoPart):
 
     def __str__(self) -> str:
         counts, tables = [f"N={n}" for n in self.directions], []
-        for kind, title in (("alone", "error of one alone"), ("all_free", "with all free")):
+        for kind, title in (("alone", "error of each alone"), ("all_free", "with all free")):
             rows = [
-                [titled(name), *(f"{e:.3g}" for e in (one.prior, *getattr(one, kind).values()))]
-                for name, one in self.errors_by_name.items()
+                [
+                    titled(name),
+                    *(f"{e:.3g}" for e in (expected.prior, *getattr(expected, kind).values())),
+                ]
+                for name, expected in self.errors_by_name.items()
             ]
             tables.append(text_table([title, "prior", *counts], rows))
         directions = [
-            f"{one.error:8.3f}  {titled(one.words, units=False)}"
-            for one in self.directions[self._middle]
+            f"{expected.error:8.3f}  {titled(expected.words, units=False)}"
+            for expected in self.directions[self._middle]
         ]
         about = (
             f"eigenvectors of the covariance with {self._middle} pulses of each side, error in "
@@ -418,8 +425,10 @@ def pulls_figure(result: CalibratedPhysics) -> Figure:
 def directions_figure(directions: Sequence[Direction]) -> Figure:
     """Eigenvectors of the covariance as a colour table, with the error of each."""
     names = list(directions[0].components)
-    matrix = np.array([[one.components[name] for name in names] for one in directions])
-    errors = np.array([one.error for one in directions])
+    matrix = np.array(
+        [[direction.components[name] for name in names] for direction in directions]
+    )
+    errors = np.array([direction.error for direction in directions])
     size = 0.34 * len(names)
     figure = Figure(figsize=(5.6 + size, 2.0 + size))
     left, right = figure.subplots(

@@ -3,13 +3,13 @@ r"""Fisher information of pulses on the physics when the readout chain is free a
 The derivatives of the compared functions with respect to chain and physics give the information
 of a number of pulses. What the chain can absorb is projected out of the physics part.
 The principal axes of the remainder, in units of the priors, are the directions that the data do
-or do not constrain. Two parameters with the same effect on the pulses are reported as one
+or do not constrain. Two parameters with the same effect on the pulses are reported as a
 direction, never as two values with small errors.
 
 Free should be the parameters that describe held-out pulses better. Both sides are halved, every
 second event. Near the current point the deviations are linear, so chain and any set of
-parameters can be fitted to one half, and the deviations of the other half be told, without any
-simulation. A parameter that only follows fluctuations makes the other half worse.
+parameters can be fitted to one half, and the deviations of the other half predicted, without
+any simulation. A parameter that only follows fluctuations makes the other half worse.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values
 
 # A parameter is determined by the data if its error is below this fraction of its prior.
-TOLD = 0.5
-# Error of a combination of two parameters, relative to their own, below which it is told in
-# their place if one of them is not determined.
+DETERMINED = 0.5
+# Error of a combination of two parameters, relative to their own, below which it is given in
+# their place if either is not determined.
 PARALLEL = 0.3
 
 
@@ -52,16 +52,16 @@ class Information:
         Standard deviations of their priors.
     pairs
         Number of pulses it refers to (the harmonic sum of both datasets).
-    known
+    knowledge
         Derivatives :math:`K` of further knowledge, such as a depletion voltage, in units of its
-        errors, shape (numbers known, parameters).
+        errors, shape (numbers, parameters).
 
     Examples
     --------
     Information of 3 and a prior of width 1 give an error of :math:`1/\sqrt{3 + 1}`.
 
-    >>> one = Information((), np.array([[3.0]]), np.array([1.0]), pairs=100.0)
-    >>> one.errors().tolist(), one.for_pulses(500.0).errors().tolist()
+    >>> few = Information((), np.array([[3.0]]), np.array([1.0]), pairs=100.0)
+    >>> few.errors().tolist(), few.for_pulses(500.0).errors().tolist()
     ([0.5], [0.25])
     """
 
@@ -69,7 +69,7 @@ class Information:
     matrix: Values
     widths: Values
     pairs: float
-    known: Values | None = None
+    knowledge: Values | None = None
 
     @classmethod
     def of(cls, problem: JointProblem, jacobian: Values) -> Information:
@@ -84,15 +84,15 @@ class Information:
         physics = problem.nearby.simulator.physics
         nuisances = tuple(physics.nuisances[i] for i in parameters.free)
         pairs = sum(functions.pairs for functions in problem.functions)
-        known = jacobian[problem.moments + len(widths) :, n:]
-        return cls(nuisances, 0.5 * (left + left.T), widths[n:], pairs, known)
+        knowledge = jacobian[problem.moments + len(widths) :, n:]
+        return cls(nuisances, 0.5 * (left + left.T), widths[n:], pairs, knowledge)
 
     def for_pulses(self, pairs: float) -> Information:
         """Information of `pairs` pulses; it scales linearly with their number."""
         return replace(self, matrix=self.matrix * (pairs / self.pairs), pairs=pairs)
 
     def errors(self, chosen: Sequence[int] | None = None) -> Values:
-        r"""Standard errors of the coordinates given their priors and what else is known.
+        r"""Standard errors of the coordinates given their priors and further knowledge.
 
         .. math:: \sigma_i^2 = \left[(F + P^{-1} + K^T K)^{-1}\right]_{ii}
 
@@ -103,12 +103,12 @@ class Information:
         """
         rows = list(range(len(self.widths))) if chosen is None else list(chosen)
         matrix = self.matrix[np.ix_(rows, rows)] + np.diag(self.widths[rows] ** -2.0)
-        if self.known is not None:
-            matrix += self.known[:, rows].T @ self.known[:, rows]
+        if self.knowledge is not None:
+            matrix += self.knowledge[:, rows].T @ self.knowledge[:, rows]
         return np.asarray(np.sqrt(np.linalg.inv(matrix).diagonal()))
 
     def directions(self) -> list[Direction]:
-        r"""Principal axes of the information in units of the priors, best known first.
+        r"""Principal axes of the information in units of the priors, best determined first.
 
         They are the eigenvectors of :math:`P^{1/2} F P^{1/2}` with the diagonal matrix
         :math:`P` of the prior variances.
@@ -116,24 +116,24 @@ class Information:
         Examples
         --------
         >>> from cpunet.calibration.nuisances import named
-        >>> one = Information((named("bias"),), np.array([[3.0]]), np.array([1.0]), 1.0)
-        >>> one.directions()[0].error
+        >>> bias = Information((named("bias"),), np.array([[3.0]]), np.array([1.0]), 1.0)
+        >>> bias.directions()[0].error
         0.5
         """
         scaled = self.matrix * self.widths[:, np.newaxis] * self.widths
         sizes, axes = np.linalg.eigh(scaled)
         names = [nuisance.name for nuisance in self.nuisances]
-        found = []
+        directions = []
         for size, axis in zip(sizes[::-1], axes.T[::-1], strict=True):
             sign = np.sign(axis[np.argmax(np.abs(axis))])
             components = dict(zip(names, (sign * axis).tolist(), strict=True))
             error = float(1 / np.sqrt(1 + max(size, 0.0)))
-            found.append(Direction(components=components, error=error))
-        return found
+            directions.append(Direction(components=components, error=error))
+        return directions
 
 
 def together(names: Sequence[str], covariance: Values) -> list[Direction]:
-    """Combinations of two parameters of which only the combination is known.
+    """Combinations of two parameters of which only the combination is determined.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def together(names: Sequence[str], covariance: Values) -> list[Direction]:
     Returns
     -------
     list of Direction
-        For each such pair the combination that is known.
+        For each such pair the combination that is determined.
 
     Examples
     --------
@@ -153,17 +153,17 @@ def together(names: Sequence[str], covariance: Values) -> list[Direction]:
     >>> pair[0].words, round(pair[0].error, 6)
     ('0.71 a + 0.71 b', 0.1)
     """
-    found = []
+    pairs = []
     for i, j in combinations(range(len(names)), 2):
         pair = covariance[np.ix_([i, j], [i, j])]
         errors = np.sqrt(pair.diagonal())
         sizes, axes = np.linalg.eigh(pair)
-        known = float(np.sqrt(max(sizes[0], 0.0)))
-        if errors.max() > TOLD and known < PARALLEL * errors.min():
+        error = float(np.sqrt(max(sizes[0], 0.0)))
+        if errors.max() > DETERMINED and error < PARALLEL * errors.min():
             axis = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
             components = {names[i]: float(axis[0]), names[j]: float(axis[1])}
-            found.append(Direction(components=components, error=known))
-    return found
+            pairs.append(Direction(components=components, error=error))
+    return pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,12 +182,12 @@ class Selection:
 
     Examples
     --------
-    Of two parameters the first one explains both halves:
+    Of two parameters the first explains both halves:
 
     >>> rows = np.eye(4)[:, :2]
-    >>> one = Selection(rows, np.array([9.0, 0, 0, 0]), np.array([[9.0, 1, 0], [9.0, -1, 0]]),
-    ...     np.zeros(2))
-    >>> [round(one.score(chosen)) for chosen in ([], [0], [1], [0, 1])]
+    >>> halves = np.array([[9.0, 1, 0], [9.0, -1, 0]])
+    >>> linear = Selection(rows, np.array([9.0, 0, 0, 0]), halves, np.zeros(2))
+    >>> [round(linear.score(chosen)) for chosen in ([], [0], [1], [0, 1])]
     [82, 1, 85, 4]
     """
 
@@ -209,13 +209,13 @@ class Selection:
         return total
 
     def cost(self, chosen: Sequence[int]) -> tuple[float, Values]:
-        """Chi-square of all pulses with priors, and the coordinates of the physics there."""
+        """Chi-square of all pulses with priors, and the coordinates at its minimum."""
         move = self._move(self.jacobian, self.residuals, chosen)
         left = self.residuals + self.jacobian @ move
         return float(left @ left), self.coordinates + move[self._n_chain :]
 
     def begin(self, information: Information) -> list[int]:
-        """Parameters that the pulses determine, the one that held-out pulses need most first.
+        """Parameters that the pulses determine, those that held-out pulses need most first.
 
         Parameters
         ----------
@@ -224,19 +224,19 @@ class Selection:
         """
         chosen: list[int] = []
         while True:
-            known = [
+            determined = [
                 i
                 for i in range(len(self.coordinates))
                 if i not in chosen
-                and information.errors([*chosen, i])[-1] < TOLD * information.widths[i]
+                and information.errors([*chosen, i])[-1] < DETERMINED * information.widths[i]
             ]
-            scores = {i: self.score([*chosen, i]) for i in known}
+            scores = {i: self.score([*chosen, i]) for i in determined}
             if not scores:
                 return sorted(chosen)
             chosen.append(min(scores, key=lambda i: scores[i]))
 
     def others(self, chosen: Sequence[int]) -> Iterator[list[int]]:
-        """Sets that lack one of the parameters, or have another one in its place."""
+        """Sets that lack a parameter, or have another in its place."""
         every = range(len(self.coordinates))
         for i in chosen:
             rest = [k for k in chosen if k != i]

@@ -33,7 +33,7 @@ STEPS, FALL = 12, 0.2  # most of a fit; expected fall of chi-square with which i
 
 
 class JointParameters:
-    """Parameters of the chain and free coordinates of the physics as one vector.
+    """Parameters of the chain and free coordinates of the physics as a vector.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class JointParameters:
     start
         The chain before any fit, on which the priors of the same parameters are centred; those
         of others on their current values. Centred on the last fit, they would make a result
-        depend on where the first one ended.
+        depend on where the first fit ended.
     modes
         Deviations of the step response that are free, with priors of 0 ± 1, if the response
         has any.
@@ -89,7 +89,7 @@ class JointParameters:
         self.high = np.r_[self.chain.high, unlimited, high]
 
     def vector(self) -> Values:
-        """Current values of all parameters as one vector."""
+        """Current values of all parameters as a vector."""
         free = self.coordinates[self.free]
         return np.concatenate([self.chain.vector(), self.along, free])
 
@@ -136,7 +136,7 @@ class JointProblem:
         Pulses near a point of the physics.
     recipe
         Recipe with the preparation of simulated pulses.
-    known
+    knowledge
         Deviations from further knowledge of the coordinates, in standard deviations.
     held
         Whether steps beyond the reach of the derivatives are penalised. This is for the first
@@ -149,7 +149,7 @@ class JointProblem:
     functions: Sequence[SlicedJoint]
     nearby: Nearby
     recipe: Recipe
-    known: Callable[[Values], Values] = lambda _: np.empty(0)
+    knowledge: Callable[[Values], Values] = lambda _: np.empty(0)
     held: bool = False
     weights: Sequence[Values] = ()
     _roots: list[Values] = field(init=False)
@@ -161,7 +161,9 @@ class JointProblem:
         if not self.weights:
             own = [self._data_alone, self._both_sides][not self.held]
             self.weights = own()
-        self._roots = [np.asarray(np.linalg.cholesky(one)) for one in self.weights]
+        self._roots = [
+            np.asarray(np.linalg.cholesky(covariance)) for covariance in self.weights
+        ]
 
     def _data_alone(self) -> list[Values]:
         return [functions.covariance(np.cov(functions.data.T)) for functions in self.functions]
@@ -195,8 +197,8 @@ class JointProblem:
     def pulls(self) -> Values:
         """Deviations of the functions in standard deviations; they are correlated."""
         return np.concatenate([
-            one.values / np.sqrt(weights.diagonal())
-            for one, weights in zip(self._differences(), self.weights, strict=True)
+            difference.values / np.sqrt(weights.diagonal())
+            for difference, weights in zip(self._differences(), self.weights, strict=True)
         ])  # fmt: skip
 
     def chi_square(self) -> float:
@@ -237,16 +239,16 @@ class JointProblem:
         differences = self._differences(slopes=True)
         rows = [
             *(
-                scipy.linalg.solve_triangular(root, one.slopes, lower=True)
-                for root, one in zip(self._roots, differences, strict=True)
+                scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
+                for root, difference in zip(self._roots, differences, strict=True)
             ),
             np.diag(1 / parameters.widths),
         ]
         at, physics = parameters.coordinates, []
         for i, step in zip(parameters.free, STEP * parameters.reach, strict=True):
-            there = at + step * np.eye(len(at))[i]
-            physics.append((self.known(there) - self.known(at)) / step)
-        columns = np.reshape(physics, (len(physics), len(self.known(at)))).T
+            moved = at + step * np.eye(len(at))[i]
+            physics.append((self.knowledge(moved) - self.knowledge(at)) / step)
+        columns = np.reshape(physics, (len(physics), len(self.knowledge(at)))).T
         if self.held:
             columns = np.concatenate([columns, np.diag(HOLD / parameters.reach)])
         rows.append(np.pad(columns, ((0, 0), (parameters.n_chain, 0))))
@@ -256,11 +258,11 @@ class JointProblem:
         parameters = self.parameters
         rows = [
             *(
-                scipy.linalg.solve_triangular(root, one.values, lower=True)
-                for root, one in zip(self._roots, differences, strict=True)
+                scipy.linalg.solve_triangular(root, difference.values, lower=True)
+                for root, difference in zip(self._roots, differences, strict=True)
             ),
             (vector - parameters.centre) / parameters.widths,
-            self.known(parameters.coordinates),
+            self.knowledge(parameters.coordinates),
         ]
         if self.held:
             moved = (parameters.coordinates - self.nearby.centre)[parameters.free]
@@ -275,7 +277,7 @@ class JointProblem:
         transfer = response.transfer(padded)
         basis = parameters.basis(padded) if slopes else None
         if not slopes:
-            return [one.difference(transfer) for one in self.here()]
+            return [functions.difference(transfer) for functions in self.here()]
         most, steps = events(self.functions), STEP * parameters.reach
         windows = self.windows(at, most)
         changes = [
@@ -283,15 +285,17 @@ class JointProblem:
             for i, step in zip(parameters.free, steps, strict=True)
         ]
         return [
-            one.difference(transfer, basis, [each[one.sides.rows] for each in changes])
-            for one in self.here()
+            functions.difference(
+                transfer, basis, [each[functions.sides.rows] for each in changes]
+            )
+            for functions in self.here()
         ]
 
     def here(self, coordinates: Values | None = None) -> list[SlicedJoint]:
         """Functions with the simulated pulses at some coordinates."""
         at = self.parameters.coordinates if coordinates is None else coordinates
         windows = self.windows(at, events(self.functions))
-        return [one.taking(windows[one.sides.rows]) for one in self.functions]
+        return [functions.taking(windows[functions.sides.rows]) for functions in self.functions]
 
     def windows(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Prepared simulated pulses of the first `most` events, as input of a readout.
@@ -309,10 +313,10 @@ def _starts(nearby: Nearby, recipe: Recipe) -> npt.NDArray[np.int64]:
     pulses = Pulses.of(base, dt_ns=nearby.simulator.physics.settings.dt_ns)
     prepared = prepare(pulses, preparation, "simulated")
     if len(prepared) < len(base):
-        told = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+        counts = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
         raise CpunetError(
             f"with these physics {len(base) - len(prepared)} of {len(base)} events "
-            f"give no pulse ({told}); narrow the `prior` of what is free"
+            f"give no pulse ({counts}); narrow the `prior` of what is free"
         )
     return prepared.align_sample - preparation.samples_before
 
@@ -326,10 +330,10 @@ def _counted(weights: Values) -> Values:
 
 def events(functions: Sequence[SlicedJoint]) -> int:
     """Number of first events of which these are functions."""
-    return 1 + max(int(one.sides.rows.max()) for one in functions)
+    return 1 + max(int(band.sides.rows.max()) for band in functions)
 
 
 def first(functions: Sequence[SlicedJoint], most: int = FOR_DERIVATIVES) -> list[SlicedJoint]:
     """Functions of the first events, sufficient for derivatives, with some of each band."""
-    most = max(most, *(int(np.sort(one.sides.rows)[:OF_BAND][-1]) + 1 for one in functions))
-    return [one.of_events(one.sides.rows < most) for one in functions]
+    most = max(most, *(int(np.sort(band.sides.rows)[:OF_BAND][-1]) + 1 for band in functions))
+    return [band.of_events(band.sides.rows < most) for band in functions]

@@ -1,4 +1,4 @@
-r"""Pulses of the same hits for physics close to the simulated one.
+r"""Pulses of the same hits for physics close to those simulated.
 
 A fit needs pulses for many sets of physics, and each simulation takes seconds. Pulses are
 therefore simulated once on either side of a point and interpolated linearly in between,
@@ -28,7 +28,7 @@ from cpunet.simulation.again import SameHits
 from cpunet.simulation.hits import Hits
 
 FloatArray = npt.NDArray[np.float32]
-# Factors by which the sampling period is divided for alignment; the first possible one is used.
+# Factors by which the sampling period is divided for alignment; the first possible is used.
 FINER = (4, 5, 3, 2, 1)
 # Root mean square of the moves of the edges, in samples, for which a derivative is moved along.
 # A longer move loses shape between the samples: a third at half a sample.
@@ -46,15 +46,15 @@ def _sample(pulse: Any, at: int, length: int) -> Any:  # pragma: no cover - comp
 @kernel(parallel=True)
 def half_maxima(pulses: Any, otherwise: Any) -> Any:  # pragma: no cover - compiled
     """Sample at which each pulse reaches half its final value; `otherwise` if it does not."""
-    found = otherwise.copy()
+    halves = otherwise.copy()
     for i in prange(len(pulses)):
         pulse = pulses[i]
         level = 0.5 * pulse[-1]
         for j in range(1, len(pulse)):
             if pulse[j] >= level > pulse[j - 1]:
-                found[i] = j - 1 + (level - pulse[j - 1]) / (pulse[j] - pulse[j - 1])
+                halves[i] = j - 1 + (level - pulse[j - 1]) / (pulse[j] - pulse[j - 1])
                 break
-    return found
+    return halves
 
 
 @kernel(parallel=True)
@@ -132,7 +132,7 @@ class Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Derivative:
-    """Change of the pulses with one coordinate.
+    """Change of the pulses with a coordinate.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class Derivative:
     point
         Coordinates at which they were simulated.
     half
-        Half maxima of the pulses there in samples, shape (events,).
+        Half maxima of the pulses at this point in samples, shape (events,).
     """
 
     pulses: FloatArray
@@ -212,21 +212,21 @@ class Nearby:
         """
 
         def is_known(i: int) -> bool:
-            known = self.derivatives.get(i)
-            if known is None or len(known.pulses) < len(self.base):
+            derivative = self.derivatives.get(i)
+            if derivative is None or len(derivative.pulses) < len(self.base):
                 return False
-            near = np.abs(self.centre - known.point) <= reach
-            return bool(near[list(of)].all()) and self._still(known)
+            near = np.abs(self.centre - derivative.point) <= reach
+            return bool(near[list(of)].all()) and self._still(derivative)
 
         return [i for i in of if not is_known(i)]
 
     def unknown(self, of: Sequence[int]) -> list[int]:
         """Coordinates without derivatives for any events here."""
-        known = self.derivatives
-        return [i for i in of if i not in known or not self._still(known[i])]
+        derivatives = self.derivatives
+        return [i for i in of if i not in derivatives or not self._still(derivatives[i])]
 
-    def _still(self, known: Derivative) -> bool:
-        moved = self.half[: len(known.half)] - known.half
+    def _still(self, derivative: Derivative) -> bool:
+        moved = self.half[: len(derivative.half)] - derivative.half
         return bool((moved @ moved) <= MOVED**2 * len(moved))
 
     def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
@@ -252,14 +252,14 @@ def _slopes(
         nuisance = physics.nuisances[i]
         low, high = nuisance.bounds(physics.nominal(nuisance))
         ends = [centre[i] - nuisance.step, centre[i] + nuisance.step]
-        if ends[0] < low:  # not possible below: one-sided upwards
+        if ends[0] < low:  # not possible below: upwards only
             ends = [low, max(low, centre[i]) + 2 * nuisance.step]
         ends[1] = min(ends[1], high)
         shapes = []
         for end in ends:
-            there = centre.copy()
-            there[i] = end
-            pulses = simulator.quick(there, most)
+            moved = centre.copy()
+            moved[i] = end
+            pulses = simulator.quick(moved, most)
             shapes.append(simulator.coarse(move(pulses, half_maxima(pulses, half) - half)))
         slopes[i] = (shapes[1] - shapes[0]) / np.float32(ends[1] - ends[0])
     return slopes

@@ -1,4 +1,4 @@
-"""Poorly known parameters of a detector's physics: names, priors, and which are free."""
+"""Uncertain parameters of a detector's physics: names, priors, and which are free."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Nuisance:
     kind
         Relation of the coordinate to the parameter.
     unit
-        Unit, or the kind of a number without one.
+        Unit, or the kind of a number without unit.
     prior
         Standard deviation of the coordinate before any data.
     step
@@ -51,7 +51,7 @@ class Nuisance:
     first
         Whether it is considered before the others.
     possible
-        Range of values that can be true, if narrower than the allowed one.
+        Range of values that can be true, if narrower than what is allowed.
     field
         Field of `Detector` or `SimulationSettings`, if not the name.
     """
@@ -99,7 +99,7 @@ class Nuisance:
     def slope(self, nominal: float, value: float) -> float:
         """Derivative of the parameter with respect to its coordinate, to convert errors."""
         if self.kind == "square":
-            # near 0: the increase by one step of the coordinate
+            # near 0: the increase by a step of the coordinate
             return 0.5 / max(value, math.sqrt(self.step))
         return value if self.kind == "factor" else 1.0
 
@@ -118,7 +118,7 @@ _MOBILITIES = (
 NUISANCES = (
     Nuisance(
         "temperature_K", "temperature", "added", "[K]", 3.0, 0.5, 1.5, 40, 120,
-        "sensors sit beside crystals, not in them", first=True,
+        "sensors sit next to crystals, not in them", first=True,
     ),
     Nuisance(
         "impurity_factor", "impurity", "factor", "(factor)", 0.1, 0.01, 0.03, 1e-3, 1e3,
@@ -186,8 +186,8 @@ def titled(text: str, *, units: bool = True) -> str:
     ('bias [V]', '0.94 self repulsion')
     """
 
-    def title(found: re.Match[str]) -> str:
-        nuisance = named(found[1])
+    def title(match: re.Match[str]) -> str:
+        nuisance = named(match[1])
         words = nuisance.short.replace("_", " ")
         return f"{words} {nuisance.unit}" if units else words
 
@@ -200,7 +200,7 @@ def named(text: str) -> Nuisance:
     Raises
     ------
     CpunetError
-        If there is none with this name.
+        If none has this name.
 
     Examples
     --------
@@ -210,8 +210,8 @@ def named(text: str) -> Nuisance:
     for nuisance in NUISANCES:
         if text.strip() in (nuisance.name, nuisance.short):
             return nuisance
-    known = ", ".join(nuisance.short for nuisance in NUISANCES)
-    raise CpunetError(f"{text.strip()!r}: no such parameter of the physics; there are {known}")
+    names = ", ".join(nuisance.short for nuisance in NUISANCES)
+    raise CpunetError(f"{text.strip()!r}: no such parameter of the physics; these are {names}")
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ class Physics:
     nuisances: tuple[Nuisance, ...]
 
     def nominal(self, nuisance: Nuisance) -> float:
-        """Simulated value; 1 for a factor that is not one of the settings."""
+        """Simulated value; 1 for a factor that is not in the settings."""
         if nuisance.name == "impurity_factor":
             return 1.0
         of_detector = nuisance.field in Detector.model_fields
@@ -250,12 +250,12 @@ class Physics:
         }
 
     def at(self, coordinates: Values) -> tuple[Detector, SimulationSettings]:
-        """Detector and settings at some coordinates. Fields at coordinate 0 are kept exactly.
+        """Detector and settings at some coordinates. Fields at coordinate 0 stay exactly.
 
         Raises
         ------
         CpunetError
-            If there is no valid detector with these values.
+            If no detector can have these values.
         """
         of_detector, of_settings = self.detector.model_dump(), self.settings.model_dump()
         values = self.values(coordinates)
@@ -269,10 +269,10 @@ class Physics:
                 of_detector[nuisance.field] = value
             else:
                 of_settings[nuisance.field] = value
-        told = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
+        sizes = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
         source = (
-            f"detector {self.detector.name}: with {told} there can be none; narrow a `prior`, "
-            "or leave one of them out of `free`"
+            f"detector {self.detector.name}: {sizes} is impossible; narrow a `prior`, "
+            "or leave any of them out of `free`"
         )
         return (
             checked(Detector, of_detector, source),
@@ -349,16 +349,16 @@ class Freedom:
         """
         chosen = _parameters(free)
         # another lithium layer requires new field solutions: only on request
-        kept = chosen or tuple(n for n in NUISANCES if n.name != "li_thickness_mm")
+        looked_at = chosen or tuple(n for n in NUISANCES if n.name != "li_thickness_mm")
         given = prior.items() if isinstance(prior, Mapping) else map(_split, prior)
         priors = dict(_prior(name, *of_name) for name, of_name in given)
-        without_use = priors.keys() - {DEPLETION, *(n.name for n in kept)}
+        without_use = priors.keys() - {DEPLETION, *(n.name for n in looked_at)}
         if without_use:
             raise CpunetError(
                 f"`prior` {min(without_use)}: it stays as simulated",
                 "name it in `free`, or leave out its prior",
             )
-        return cls(kept, bool(chosen), priors)
+        return cls(looked_at, bool(chosen), priors)
 
 
 def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]) -> None:
@@ -367,7 +367,7 @@ def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]
     Raises
     ------
     CpunetError
-        If a depletion voltage, as simulated, with the values of the priors, one step of the
+        If a depletion voltage, as simulated, with the values of the priors, a step of the
         impurities higher, or as measured, is above the bias.
     """
     centres, _ = physics.priors(given)
@@ -411,14 +411,14 @@ def known_depletion(
     tilted = superposition.depletion_V(scale, tilt + _TILT)
     with_factor, with_tilt = (scaled - at_first) / _FACTOR, (tilted - at_first) / _TILT
 
-    def known(coordinates: Values) -> Values:
+    def deviation(coordinates: Values) -> Values:
         values = physics.values(coordinates)
         factor = values.get("impurity_factor", 1.0)
         more = values.get("impurity_tilt_1e10_per_cm4", tilt) - tilt
         voltage = at_first + with_factor * (factor - 1) + with_tilt * more
         return np.array([(voltage - wanted) / error])
 
-    return known
+    return deviation
 
 
 def _parameters(names: str | Sequence[str]) -> tuple[Nuisance, ...]:
@@ -428,10 +428,10 @@ def _parameters(names: str | Sequence[str]) -> tuple[Nuisance, ...]:
 
 
 def _split(text: str) -> tuple[str, tuple[float, float]]:
-    found = _PRIOR.fullmatch(text)
+    match = _PRIOR.fullmatch(text)
     try:
-        if found is not None:
-            return found[1], (float(found[2]), float(found[3]))
+        if match is not None:
+            return match[1], (float(match[2]), float(match[3]))
     except ValueError:
         pass
     raise CpunetError(f"`prior` {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5")

@@ -23,7 +23,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 FAR = 3.0
 # Chi-square beyond chance, in its standard deviations, that is too much.
 BEYOND_CHANCE = 4.0
-# Advice where a parameter is unexpected, besides the general one.
+# Advice where a parameter is unexpected, besides the general advice.
 ADVICE = {
     "self_repulsion": "it acts within each hit, so hits that are not merged within "
     "0.2 mm (cluster_mm), as tracks are long, need more of it"
@@ -53,7 +53,7 @@ class Calibrated:
     promised
         Expected decrease of chi-square for each fixed parameter if it were free, by position.
     rounds, settled
-        Number of rounds, and whether the physics was unchanged in the last one.
+        Number of rounds, and whether the physics was unchanged in the last.
     alternatives
         Other physics that explain the data about as well, and by how much chi-square with
         priors is larger.
@@ -116,11 +116,11 @@ def _notes(calibrated: Calibrated, free: Mapping[str, FreeParameter]) -> list[st
     """Remarks on the result of a calibration."""
     problem = calibrated.problem
     remarks = [
-        f"the fit uses {name} = {one.value:.4g} to make up for something else "
-        f"({one.doubt}): free what else moves pulses so, or give a `prior` if it can be"
+        f"the fit uses {name} = {parameter.value:.4g} to make up for something else "
+        f"({parameter.doubt}): free what else moves pulses so, or give a `prior` if it can be"
         + (f"; {ADVICE[name]}" if name in ADVICE else "")
-        for name, one in free.items()
-        if one.doubt
+        for name, parameter in free.items()
+        if parameter.doubt
     ]
     per = calibrated.chi_square / problem.moments
     mean, spread = (number / problem.moments for number in problem.by_chance)

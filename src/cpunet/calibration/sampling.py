@@ -23,7 +23,7 @@ from cpunet.calibration.nuisances import Values
 
 PARTS = 8
 # Largest share of the information along a direction that is taken for noise: the parts of the
-# events do not tell a larger one well enough.
+# events do not determine a larger share well enough.
 MOST = 0.9
 
 
@@ -36,11 +36,11 @@ def of_events(problem: JointProblem, scale: float) -> tuple[Values, Values]:
     _, jacobian = problem.both(vector)
     deviations, slopes = [], []
     for k in range(PARTS):
-        part = problem.of_parts([one.of_events(slice(k, None, PARTS)) for one in functions])
+        part = problem.of_parts([band.of_events(slice(k, None, PARTS)) for band in functions])
         residuals, derivatives = part.both(vector)
         deviations.append(residuals[: problem.moments])
         slopes.append(derivatives[: problem.moments])
-    n = sum(len(one.sides) + len(one.sides.data) for one in functions)
+    n = sum(len(band.sides) + len(band.sides.data) for band in functions)
     factor = scale**2 * of_weights(n, problem.by_chance[0], len(vector))
     return of_parts(jacobian, np.array(slopes), np.array(deviations), factor)
 

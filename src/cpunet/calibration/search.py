@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 ROUNDS = 8
 # The search ends when all coordinates move by less than this fraction of their error.
 SETTLED = 0.4
-# Maximum move of a coordinate in one round, in units of the reach of its derivative, and number
-# of times the move is halved if pulses cannot be simulated there.
+# Maximum move of a coordinate in a round, in units of the reach of its derivative, and number
+# of times the move is halved if pulses cannot be simulated after it.
 FARTHEST, HALVINGS = 1.5, 4
 # Decrease of chi-square of held-out pulses (five standard deviations) for which a fixed
 # parameter is freed, and maximum number of such parameters.
@@ -63,7 +63,7 @@ class Search:
         Recipe of the chain.
     given
         Priors that replace the defaults: value and error by name.
-    known
+    knowledge
         Deviations from further knowledge of the coordinates.
     chosen
         Whether all parameters are free, since a user chose them; else those that the data
@@ -74,7 +74,7 @@ class Search:
     sets: PulseSets
     recipe: Recipe
     given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    known: Callable[[Values], Values] = lambda _: np.empty(0)
+    knowledge: Callable[[Values], Values] = lambda _: np.empty(0)
     chosen: bool = False
 
     def __post_init__(self) -> None:
@@ -110,21 +110,21 @@ class Search:
         before = self._problem(response, nearby, [], held=True)
         self._tell("as simulated", before)
         free = self._first_free(response, nearby)
-        problem, found = self._from_far(response, nearby, free)
+        problem, end = self._from_far(response, nearby, free)
         if problem.chi_square() > POOR * problem.moments:  # as if the readout rings
-            self._tell("without deviations", problem, found)
+            self._tell("without deviations", problem, end)
             response = self._deviated(before) or response
             free = self._first_free(response, nearby)
-            problem, found = self._from_far(response, nearby, free)
+            problem, end = self._from_far(response, nearby, free)
         more, last = 0, np.zeros(self._n)
         for number in range(1, ROUNDS + 1):
             if number > 1:
                 problem = self._problem(response, nearby, free)
-                found = problem.fitted()
-            self._tell(f"round {number}", problem, found)
+                end = problem.fitted()
+            self._tell(f"round {number}", problem, end)
             response = problem.parameters.chain.response
             moved = problem.parameters.coordinates - nearby.centre
-            settled = number > 1 and _settled(problem, found, moved)
+            settled = number > 1 and _settled(problem, end, moved)
             if settled and not response.config.deviations:
                 other = self._deviated(problem)
                 response, settled = other or response, settled and other is None
@@ -135,7 +135,7 @@ class Search:
                 free, more = sorted([*free, added]), more + 1
             last = _relaxed(moved, last)
             nearby = self._moved(nearby, last, free)
-        return self._ended(problem, found, before, number, settled=settled)
+        return self._ended(problem, end, before, number, settled=settled)
 
     def _from_far(
         self, response: ElectronicsResponse, nearby: Nearby, free: Sequence[int]
@@ -145,9 +145,9 @@ class Search:
         for wider in (*WIDER, 1.0):
             functions = first(self._wide(wider))
             problem = self._problem(response, nearby, free, functions, held=True, at=at)
-            found = problem.fitted()
+            end = problem.fitted()
             response, at = problem.parameters.chain.response, problem.parameters.coordinates
-        return problem, found
+        return problem, end
 
     @property
     def simulations(self) -> int:
@@ -189,7 +189,7 @@ class Search:
         chain = response, physics, at, free, self.given, self._start
         parameters = JointParameters(*chain, self._modes)
         sets = parameters, functions or self._functions, nearby
-        return JointProblem(*sets, self.recipe, self.known, held, weights)
+        return JointProblem(*sets, self.recipe, self.knowledge, held, weights)
 
     def _deviated(self, problem: JointProblem) -> ElectronicsResponse | None:
         """The chain with deviations of its step response, if these physics leave too much.
@@ -202,11 +202,11 @@ class Search:
             return None
         chain = with_settings(problem.parameters.chain.response, deviations=False)
         sides = [functions.sides for functions in problem.here()]
-        found = with_deviations(chain, sides, lambda _: None)
-        if not found.response.config.deviations:
+        deviated = with_deviations(chain, sides, lambda _: None)
+        if not deviated.response.config.deviations:
             return None
-        self._modes = found.modes
-        return found.response
+        self._modes = deviated.modes
+        return deviated.response
 
     def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
         """Parameters that are free initially."""
@@ -223,7 +223,7 @@ class Search:
         move = np.clip(moved, -farthest, farthest)
         for _ in range(HALVINGS):
             try:
-                there = nearby.moved(nearby.centre + move)
+                place = nearby.moved(nearby.centre + move)
                 break
             except CpunetError as error:  # for example, if the detector is not depleted
                 log.info(f"{error}; going half as far")
@@ -233,8 +233,8 @@ class Search:
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
                 "that cannot be simulated; narrow a `prior`, or leave a parameter out of `free`"
             )
-        outdated = there.outdated(free, farthest / FARTHEST)
-        return there.again(outdated) if outdated else there
+        outdated = place.outdated(free, farthest / FARTHEST)
+        return place.again(outdated) if outdated else place
 
     def _needed(self, problem: JointProblem) -> int | None:
         """Fixed parameter that held-out pulses need most, if significant."""
@@ -291,43 +291,43 @@ class Search:
         free = problem.parameters.free
         here, _ = selection.cost(free)
         forecast = [(*selection.cost(other), other) for other in selection.others(free)]
-        forecast.sort(key=lambda one: one[0])
-        found = []
-        for cost, there, other in forecast[:MAX_OTHERS]:
+        forecast.sort(key=lambda forecasts: forecasts[0])
+        fits = []
+        for cost, place, other in forecast[:MAX_OTHERS]:
             if cost - here > LIKELY:
                 break
-            kept = np.isin(np.arange(self._n), other)
+            is_free = np.isin(np.arange(self._n), other)
             fit, nearby = problem, problem.nearby
             try:
                 for _ in range(OTHER_ROUNDS):
-                    move = np.where(kept, there, 0) - nearby.centre
+                    move = np.where(is_free, place, 0) - nearby.centre
                     nearby = self._moved(nearby, move, other)
                     chain = fit.parameters.chain.response
                     fit = self._problem(chain, nearby, other, weights=problem.weights)
                     minimum = fit.fitted()
-                    there = fit.parameters.coordinates
-                    if _settled(fit, minimum, there - nearby.centre):
+                    place = fit.parameters.coordinates
+                    if _settled(fit, minimum, place - nearby.centre):
                         break
             except CpunetError:  # these physics cannot be simulated
                 continue
-            if not there[~kept].any():  # all that is not free is as simulated
-                found.append((fit, minimum))
-        return found
+            if not place[~is_free].any():  # all that is not free is as simulated
+                fits.append((fit, minimum))
+        return fits
 
     def _ended(
         self,
         problem: JointProblem,
-        found: Parabola,
+        end: Parabola,
         before: JointProblem,
         rounds: int,
         *,
         settled: bool,
     ) -> Calibrated:
         promised, information, selection = self._examined(problem)
-        fits = [(problem, found), *self._alternatives(problem, selection)]
+        fits = [(problem, end), *self._alternatives(problem, selection)]
         best = min(fits, key=lambda fit: fit[1].cost)
-        if best[1].cost < found.cost - NEEDED:
-            problem, found = best
+        if best[1].cost < end.cost - NEEDED:
+            problem, end = best
             promised, information, _ = self._examined(problem)
         before = replace(before, weights=problem.weights)
         mean, spread = problem.by_chance
@@ -337,7 +337,7 @@ class Search:
         parameters = problem.parameters
         moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
         parameters.set(moved)
-        rises = [(fit, minimum.cost - found.cost) for fit, minimum in fits]
+        rises = [(fit, minimum.cost - end.cost) for fit, minimum in fits]
         rises.sort(key=lambda fit: fit[1])
         return Calibrated(
             problem=problem,
@@ -353,20 +353,21 @@ class Search:
             alternatives=[fit for fit in rises if fit[0] is not problem and fit[1] < SAME],
         )
 
-    def _tell(self, when: str, problem: JointProblem, found: Parabola | None = None) -> None:
+    def _tell(self, when: str, problem: JointProblem, end: Parabola | None = None) -> None:
         parameters, physics = problem.parameters, self.simulator.physics
-        told = [f"{when}: chi-square {problem.chi_square() / problem.moments:.2f} per moment"]
-        errors = np.empty(0) if found is None else _errors(problem, found)
+        per = problem.chi_square() / problem.moments
+        words = [f"{when}: chi-square {per:.2f} per function"]
+        errors = np.empty(0) if end is None else _errors(problem, end)
         for i, error in zip(parameters.free, errors, strict=True):
             value, own = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
-            told.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
-        log.info(", ".join(told))
+            words.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
+        log.info(", ".join(words))
 
 
-def _errors(problem: JointProblem, found: Parabola) -> Values:
+def _errors(problem: JointProblem, end: Parabola) -> Values:
     """Standard deviations of the free coordinates."""
     parameters = problem.parameters
-    covariance = np.linalg.inv(found.information + np.diag(parameters.widths**-2.0))
+    covariance = np.linalg.inv(end.information + np.diag(parameters.widths**-2.0))
     return np.asarray(np.sqrt(covariance.diagonal())[parameters.n_chain :])
 
 
@@ -381,7 +382,7 @@ def _relaxed(moved: Values, last: Values) -> Values:
     return share * moved
 
 
-def _settled(problem: JointProblem, found: Parabola, moved: Values) -> bool:
+def _settled(problem: JointProblem, end: Parabola, moved: Values) -> bool:
     """Whether all coordinates have moved by a small fraction of their errors."""
     moves = np.abs(moved[problem.parameters.free])
-    return bool((moves < SETTLED * _errors(problem, found)).all())
+    return bool((moves < SETTLED * _errors(problem, end)).all())

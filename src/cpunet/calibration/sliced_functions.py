@@ -35,7 +35,7 @@ class SlicedJoint(Joint):
     sides, wider
         See `cpunet.training.joint.Joint`.
     band
-        Energies of the pulses, if there are several bands.
+        Energies of the pulses, if these are several bands.
     """
 
     def __init__(self, sides: Sides, wider: float = 1.0, band: str = "") -> None:
@@ -103,7 +103,7 @@ class SlicedJoint(Joint):
         n, coordinates = len(shape), changes.shape[2]
         (_, density), (slices, sliding), (amplitudes, turned) = self._sliced(shape, pulses)
         drift, others = changes[:, -1], slice(-2, -2 - OTHERS, -1)
-        found = [n * super()._slopes(pulses, moves), density.T @ drift]
+        slopes = [n * super()._slopes(pulses, moves), density.T @ drift]
         moved = (turned[:, :, np.newaxis] * moves.log_amplitude[:, np.newaxis]).reshape(n, -1)
         for values, own in (
             (shape[:, others], changes[:, others].reshape(n, -1)),
@@ -112,8 +112,8 @@ class SlicedJoint(Joint):
             along = (values[:, :, np.newaxis] * drift[:, np.newaxis]).reshape(n, -1)
             each = slices.T @ own + sliding.T @ along  # (slices, values * coordinates)
             each = each.reshape(len(each), -1, coordinates).swapaxes(0, 1)
-            found.append(each.reshape(-1, coordinates))
-        return np.concatenate(found) / n
+            slopes.append(each.reshape(-1, coordinates))
+        return np.concatenate(slopes) / n
 
     def _sliced(self, shape: Values, pulses: Aligned) -> list[tuple[Values, Values]]:
         """Bins of density, slices of drift time, and bins of the amplitude in these."""

@@ -7,7 +7,7 @@ input :math:`y` by a part of the distance that is left,
 
 and a curve adds to the signal what depends on its height alone, as an ADC or a preamplifier
 that compresses.  Both are tables.  They act on pulses with their noise, in absolute height:
-one line of energy cannot determine them, a line and a continuum can.
+a line of energy cannot determine them, a line and a continuum can.
 """
 
 from __future__ import annotations
@@ -87,13 +87,13 @@ class ByHeight(Stored):
 
     def describe(self, dt_ns: float) -> dict[str, float]:
         """Rate to which `SLEWED` times the largest step is limited, and largest part added."""
-        told = {}
+        values = {}
         if self.lag.any():
             lag = np.interp(SLEWED * PER_STEP, np.arange(LAG_KNOTS), self.lag)
-            told["slew_kev_per_ns"] = float(SLEWED * self.step_kev * np.exp(-lag)) / dt_ns
+            values["slew_kev_per_ns"] = float(SLEWED * self.step_kev * np.exp(-lag)) / dt_ns
         if self.curve.any():
-            told["nonlinearity"] = float(np.abs(self.curve).max())
-        return told
+            values["nonlinearity"] = float(np.abs(self.curve).max())
+        return values
 
 
 def _fine(knots: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -37,8 +37,8 @@ class KeptNoise(Stored):
 
     def set_noise(self, noise: BaselineNoise) -> None:
         """Store a measured spectrum."""
-        one = noise.density_of(record_samples(self.noise_dt_ns))[np.newaxis]
-        continua = one if noise.kinds is None else noise.kinds
+        whole = noise.density_of(record_samples(self.noise_dt_ns))[np.newaxis]
+        continua = whole if noise.kinds is None else noise.kinds
         lines = np.zeros_like(continua) if noise.lines is None else noise.lines
         shares = np.ones(1) if noise.shares is None else noise.shares
         for array, values in (
@@ -70,18 +70,18 @@ class KeptNoise(Stored):
 
 
 AFTER_NS = 2720.0  # from the half maximum until charge and slow response have arrived
-MIN_LEVEL = 1e-3  # below it, there is no pulse
+MIN_LEVEL = 1e-3  # of a pulse
 
 
 class LinearInverse(Stored):
     """Prepared measured windows → simulation-like, almost noise-free pulses.
 
-    Of all linear functions of a measured pulse it is the one that comes closest to the charge
-    pulse on average (the Wiener filter of these pulses in this noise).  Windows are aligned at
-    half maximum by whole samples: shifts by fractions of a sample would smooth the steep part,
+    Of all linear functions of a measured pulse it comes closest to the charge pulse on average
+    (the Wiener filter of these pulses in this noise).  Windows are aligned at half maximum by
+    whole samples: shifts by fractions of a sample would smooth the steep part,
     and degrade the map.
 
-    A new one holds zeros: load weights, or let `cpunet.training.inverse` fit them.
+    A new inverse holds zeros: load weights, or let `cpunet.training.inverse` fit them.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class LinearInverse(Stored):
         inside = self.region(windows, sample) - self.mean_in
         # charge is within 0 … 1; ripples beyond that would affect the scale of the pulses
         pulses = (self.mean_out + inside @ self.weights.T).clip(0, 1)
-        # 0 before the region and 1 after it: one sample on either side stands for the rest
+        # 0 before the region and 1 after it: a sample on either side stands for the rest
         pulses = np.pad(pulses, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
         start = 1 + self.before - sample
         whole = stretch(pulses, start, 0, self.length).astype(windows.dtype)

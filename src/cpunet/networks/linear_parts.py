@@ -94,8 +94,8 @@ class SolvedInverse(nn.Module):
             at = ((below * (index + 1)).amax(dim=1, keepdim=True) - 1).clamp_min(0)
 
         def span(first: int, stop: int) -> Tensor:
-            there = at + torch.arange(first, stop, device=windows.device)
-            return windows.gather(1, there.clamp(0, len(index) - 1))
+            places = at + torch.arange(first, stop, device=windows.device)
+            return windows.gather(1, places.clamp(0, len(index) - 1))
 
         base = span(*f.baseline).mean(dim=1, keepdim=True)
         level = span(*f.level).mean(dim=1, keepdim=True) - base
@@ -138,17 +138,17 @@ class LearnedResponse(Linear):
         rise = np.maximum(ns, 0) / RISE_NS
         begin = (1 - (1 + rise) * np.exp(-rise)) * np.exp(-decay * np.maximum(knots, 0))
         modes = vectors[:, -MODES:] * np.sqrt(values[-MODES:])
-        between = np.stack([np.interp(lags, knots, one) for one in np.eye(len(knots))], 1)
+        between = np.stack([np.interp(lags, knots, unit) for unit in np.eye(len(knots))], 1)
         for name, array in (("begin", begin), ("modes", modes), ("between", between)):
             self.register_buffer(name, torch.from_numpy(array).float())
         self.sizes = nn.Parameter(torch.zeros(MODES))
         self.late = int((lags > knots[-1]).sum())
-        self.apart = float(knots[-1] - knots[-4])
+        self.spacing = float(knots[-1] - knots[-4])
 
     def step(self) -> Tensor:
         """Response to a step at sample 0, from the first lag on."""
         knots = self.begin + self.modes @ self.sizes
-        rate = torch.log((knots[-1] / knots[-4]).clamp(0.5, 1.2)) / self.apart
+        rate = torch.log((knots[-1] / knots[-4]).clamp(0.5, 1.2)) / self.spacing
         late = torch.arange(1.0, 1 + self.late, device=rate.device)  # goes on as it ends
         return torch.cat(
             [(self.between @ knots)[: -self.late], knots[-1] * torch.exp(rate * late)]
@@ -158,7 +158,7 @@ class LearnedResponse(Linear):
         return self.spectrum_of(self.step())
 
     def spectrum_of(self, lags: Tensor) -> Tensor:
-        """Spectrum of values at lags from the first one on."""
+        """Spectrum of values at lags from the first on."""
         whole = pad(lags, (0, self.padded - len(lags))).roll(self.first)
         spectrum: Tensor = torch.fft.rfft(whole)
         return spectrum

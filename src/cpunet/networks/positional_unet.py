@@ -178,7 +178,7 @@ class PositionalUNet(nn.Module):
 
 
 # Cycles of the initial sines over the whole table.  Slow ones are nearly monotonic, so
-# that the slope at one value points towards distant ones; with 1 to 16 cycles the
+# that the slope at a value points towards distant values; with 1 to 16 cycles the
 # generator's edge did not move.
 LOWEST, HIGHEST = 0.1, 2.0
 
@@ -221,7 +221,7 @@ class GruDiscriminator(nn.Module):
     `forward` returns logits: the log of the odds that a pulse is real.
 
     In training mode, the batch norm on the context uses the statistics of the batch.
-    Real and translated pulses must then be in one batch, or the difference between
+    Real and translated pulses must then be in the same batch, or the difference between
     the two is normalised away.
     """
 

@@ -101,7 +101,7 @@ class DriftClock(Stored):
         return np.maximum(factor, MIN_STRETCH)
 
     def _duration(self, took: npt.NDArray[np.intp], dt_us: float) -> Values:
-        """Duration of a drift in samples in the detector, given the simulated one."""
+        """Duration of a drift in samples in the detector, given that simulated."""
         longer = took.astype(float)
         for _ in range(ROUNDS):  # t = u (1 + a + b t)
             longer = took * self._factor(longer, dt_us)
@@ -157,14 +157,14 @@ class ElectronicsResponse(Stored):
     r"""Charge pulses → noise-free records of any height, by physical parameters.
 
     With bandwidth poles :math:`\tau_k`, weights :math:`w_j` of slow parts of fixed times
-    :math:`T_j`, and shares :math:`a_i` of decays :math:`\tau_i` faster than the main one,
+    :math:`T_j`, and shares :math:`a_i` of decays :math:`\tau_i` faster than the main decay,
 
     .. math:: H(s) = \prod_k \frac{1}{1 + s \tau_k}
         \left[1 - \sum_j w_j + \sum_j \frac{w_j}{1 + s T_j}\right], \qquad
         d(t) = \left(1 - \sum_i a_i\right) e^{-t/\tau} + \sum_i a_i e^{-t/\tau_i}
 
     the current of a pulse is multiplied by :math:`H` and by the spectrum of :math:`d`.  Times
-    are kept as logarithms, so that they stay positive and steps are relative.  What no such
+    are stored as logarithms, so that they stay positive and steps are relative.  What no such
     chain does is a deviation of the step response at each lag, see
     `cpunet.training.deviations`; later, the step decays as from 4 to 6.4 µs.
 
@@ -181,7 +181,7 @@ class ElectronicsResponse(Stored):
 
     Examples
     --------
-    At :math:`s = i/\tau` one pole passes :math:`1/(1 + i)`, and 100 samples of 16 ns later a
+    At :math:`s = i/\tau` a pole passes :math:`1/(1 + i)`, and 100 samples of 16 ns later a
     decay of 100 µs has left :math:`e^{-1.6/100}`:
 
     >>> from cpunet.recipes import load_recipe
@@ -197,7 +197,7 @@ class ElectronicsResponse(Stored):
     """
 
     decay_known: float | None = None
-    """Relative error of the main decay, if it is known from baselines."""
+    """Relative error of the main decay, if baselines determine it."""
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         self.config, self.dt_ns = config, np.array(float(dt_ns))
@@ -330,30 +330,30 @@ class ElectronicsResponse(Stored):
         """
         poles = enumerate(np.exp(self.log_poles_ns).tolist(), 1)
         falling = enumerate(sorted(poles, key=lambda pole: -pole[1]), 1)
-        told = {f"pole_{i}_ns": (f"log_poles_ns.{k}", tau) for i, (k, tau) in falling}
+        values = {f"pole_{i}_ns": (f"log_poles_ns.{k}", tau) for i, (k, tau) in falling}
         slow = zip(self.slow_ns.tolist(), self.slow_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(slow, 1):
-            told[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
-        told["decay_us"] = "log_decay_us.1", float(np.exp(self.log_decay_us[0]))
+            values[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
+        values["decay_us"] = "log_decay_us.1", float(np.exp(self.log_decay_us[0]))
         fast = zip(self.fast_decays_us.tolist(), self.decay_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(fast, 1):
-            told[f"decay_{tau:g}_us"] = f"decay_weights.{i}", weight
+            values[f"decay_{tau:g}_us"] = f"decay_weights.{i}", weight
         stretch = {} if self.drift is None else self.drift.describe()
         for i, (name, value) in enumerate(stretch.items(), 1):
-            told[name] = f"drift.stretch.{i}", value
-        return told
+            values[name] = f"drift.stretch.{i}", value
+        return values
 
     def describe(self) -> dict[str, float]:
         """Fitted parameters by name, with the unit at the end of the name.
 
-        ``deviation`` is the largest one of the step response.
+        ``deviation`` is the largest of the step response.
         """
-        told = {name: value for name, (_, value) in self.named().items()}
+        values = {name: value for name, (_, value) in self.named().items()}
         if self.config.deviations:
-            told["deviation"] = float(np.abs(self.deviation).max())
+            values["deviation"] = float(np.abs(self.deviation).max())
         if self.by_height is not None:
-            told |= self.by_height.describe(float(self.dt_ns))
-        return told
+            values |= self.by_height.describe(float(self.dt_ns))
+        return values
 
 
 def _spline(frequency: Values) -> Values:

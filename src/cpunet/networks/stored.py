@@ -19,21 +19,21 @@ class Stored:
     >>> class Filter(Stored):
     ...     def __init__(self):
     ...         self.weights = np.zeros(2)
-    >>> one = Filter()
-    >>> one.fill({"weights": np.array([1, 2])})
-    >>> one.arrays()
+    >>> filter = Filter()
+    >>> filter.fill({"weights": np.array([1, 2])})
+    >>> filter.arrays()
     {'weights': array([1., 2.])}
     """
 
     def arrays(self) -> dict[str, Array]:
         """The arrays themselves, names of those of a part begin with its own."""
-        found = {}
+        arrays = {}
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
-                found[name] = value
+                arrays[name] = value
             elif isinstance(value, Stored):
-                found |= {f"{name}.{own}": values for own, values in value.arrays().items()}
-        return found
+                arrays |= {f"{name}.{own}": values for own, values in value.arrays().items()}
+        return arrays
 
     def fill(self, values: Mapping[str, Array]) -> None:
         """Set all arrays, of which each must be given in its shape."""

@@ -9,8 +9,8 @@
     identities                 REN(y) = y                   IREN(x) = x
 
 K is linear, solved or learned (`cpunet.networks.linear_parts`); U, a Positional U-Net, adds
-nothing at first.  As published, U is all there is.  Read from the top: generators, critic,
-losses, one iteration, the loop.  Critics see views of pulses (`cpunet.training.views`).
+nothing at first.  As published, U is all.  Read from the top: generators, critic,
+losses, an iteration, the loop.  Critics see views of pulses (`cpunet.training.views`).
 """
 
 from __future__ import annotations
@@ -124,9 +124,9 @@ def window_weights(config: schema.LossConfig, length: int) -> Tensor:
     return torch.cat([torch.full((n,), w / n) for n, w in zip(lengths, each, strict=True)])
 
 
-def weighted_l1(apart: Tensor, weights: Tensor, ignored: Tensor | float = 0.0) -> Tensor:
+def weighted_l1(difference: Tensor, weights: Tensor, ignored: Tensor | float = 0.0) -> Tensor:
     r"""Weighted L1 loss :math:`\langle \sum_k w_k \max(|d_k| - g, 0) \rangle`."""
-    return ((apart.abs() - ignored).clamp_min(0) * weights).sum(dim=1).mean()
+    return ((difference.abs() - ignored).clamp_min(0) * weights).sum(dim=1).mean()
 
 
 def adversarial_loss(better: Tensor, worse: Tensor, paired: bool) -> Tensor:
@@ -152,7 +152,7 @@ def slopes_squared(critic: nn.Module, views: Tensor) -> Tensor:
 
 
 class Game:
-    """Generators, critics of both sides, and one iteration of their training."""
+    """Generators, critics of both sides, and an iteration of their training."""
 
     def __init__(
         self, ren: Generator, iren: Generator, sides: Sides, settings: schema.CycleGanSettings
@@ -191,7 +191,7 @@ class Game:
         return x + noise
 
     def step(self) -> dict[str, float]:
-        """One iteration; its losses."""
+        """An iteration; its losses."""
         c, sim, data, ren, iren = *(self.config, *self.sides[:2]), self.ren, self.iren
         rows, y, losses = sim.draw(c.batch_size), data.draw(c.batch_size), dict[str, Tensor]()
         y, w, prepared = data.pulses[y], self.weights, self.sides.prepared
@@ -242,8 +242,8 @@ class Game:
         total = sum(weight[f"{k}_weight"] * loss for k, loss in kinds if k != "discriminator")
         self.optimisers.follow(total, "unet", "linear")
         keep = min(self.config.average, (1 + self.iteration) / (10 + self.iteration))
-        own, kept = (net.state_dict() for net in (self.generators, self.average))
-        for name, value in kept.items():
+        own, averages = (net.state_dict() for net in (self.generators, self.average))
+        for name, value in averages.items():
             new = own[name]
             value.copy_(new.lerp(value, keep) if value.is_floating_point() else new)
 
@@ -262,7 +262,7 @@ def train(
     save: Callable[[State], None] = lambda _: None,
     start: State | None = None,
 ) -> Game:
-    """Play a game to its end, from a state if there is one; its average is what counts.
+    """Play a game to its end, from a state if given; its average is what counts.
 
     The same seed on the same computer gives the same weights, interrupted or not.  Records are
     listened to before each state is saved: every ``checkpoint_interval`` iterations, in the end
@@ -293,7 +293,7 @@ def train(
                 save(state_of(game))
             if stop:
                 text = f"stopped after {done} of {c.iterations} iterations"
-                interruption.act(f"{text}; resume goes on from there")
+                interruption.act(f"{text}; resume goes on from it")
         if records:
             listener(records)
     if game.judge.over.get("data") == "won":

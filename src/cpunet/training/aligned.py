@@ -207,14 +207,14 @@ def cubic(part: Values) -> tuple[Values, Values]:
 def stretch(records: Floats, first: Samples, length: int) -> Floats:
     """``records[i, first[i] : first[i] + length]``; 0 before a record, its last value after."""
     at = first[:, np.newaxis] + np.arange(length)
-    found = np.take_along_axis(records, at.clip(0, records.shape[1] - 1), axis=1)
+    samples = np.take_along_axis(records, at.clip(0, records.shape[1] - 1), axis=1)
     if at.min(initial=0) < 0:
-        found[at < 0] = 0
-    return found
+        samples[at < 0] = 0
+    return samples
 
 
 def between(samples: Floats, weights: Values) -> Floats:
     """Rows of samples interpolated by the weights of `cubic`: three samples fewer."""
     length, own = samples.shape[1] - 3, weights.astype(samples.dtype)[:, :, np.newaxis]
-    found: Floats = sum(own[j] * samples[:, j : j + length] for j in range(4))
-    return found
+    values: Floats = sum(own[j] * samples[:, j : j + length] for j in range(4))
+    return values

@@ -37,7 +37,7 @@ from cpunet.training.verdict import FitInfo
 PARTS = re.compile(r"slow_|decay_|fast_decay_")
 # The parts of a chain that deviates are not what its step response consists of.
 HIDDEN = ("slow_", "pole_", "decay_", "ringing")
-_LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over one collected at once
+_LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over a prompt charge
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def describe_chain(run: Run) -> DescribedChain:
     if not isinstance(recipe.generator, ResponseConfig):
         raise CpunetError(
             f"{run.name}: recipe {recipe.name} trains a network (or imports one), which has no "
-            "response in closed form; give a run of the recipe fast, or score this one with "
+            "response in closed form; give a run of the recipe fast, or score it with "
             "`cpunet validate`"
         )
     network = run.fill("ren", ResponseGenerator(recipe.generator, run.dt_ns))
@@ -106,8 +106,8 @@ def describe_chain(run: Run) -> DescribedChain:
     if response.by_height is not None:
         doubts.append("the electronics act by the height of a pulse; this is their linear part")
     if fit.causes:
-        told = "these numbers stand in for what is wrong with the simulation, too"
-        doubts.insert(0, f"the fit is {fit.verdict}; {told}: {fit.causes[0]}")
+        substitute = "these numbers stand in for what is wrong with the simulation, too"
+        doubts.insert(0, f"the fit is {fit.verdict}; {substitute}: {fit.causes[0]}")
     of_values = {n: e for n, e in errors.items() if n in values and not PARTS.match(n)}
     of_values |= _noise_error(run, chain)
     return DescribedChain(run, chain, values, of_values, parameters, errors, doubts)
@@ -137,7 +137,7 @@ def summary(run: Run) -> list[tuple[str, str]]:
     where = run.name
     response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
     when = run.started[:16].replace("T", " ")
-    known = fit.tails
+    tails = fit.tails
     lines = [
         ("run", where),
         (
@@ -157,12 +157,12 @@ def summary(run: Run) -> list[tuple[str, str]]:
     if "baselines" in fit.noise:
         size = ""
         with suppress(CpunetError):  # no chain
-            told = describe_chain(run)
-            kev, error = (of.get("noise_rms_kev") for of in (told.values, told.errors))
+            chain = describe_chain(run)
+            kev, error = (of.get("noise_rms_kev") for of in (chain.values, chain.errors))
             size = f"{with_std(kev, error)} keV (RMS), "
         lines.append(("noise", f"{size}of {fit.noise['baselines']:.0f} baselines"))
-    if known is not None and "rate_khz" in known.model_fields_set:
-        lines += known.in_words()
+    if tails is not None and "rate_khz" in tails.model_fields_set:
+        lines += tails.in_words()
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]

@@ -36,7 +36,7 @@ FALL, CONVERGED = 20.0, 0.1
 # A step that leads up is damped by this much of the information's diagonal, then by so many
 # times more, so often.
 DAMPING, MORE, TRIES = 0.03, 8.0, 5
-# Chi-square per function above which a fit has missed its valley, or there is none.
+# Chi-square per function above which a fit has missed its valley, or has none.
 POOR = 5.0
 SLOW = 0.03  # share by which a step must lower a chi-square that is as poor as that
 STRETCHED = 0.004  # change of the stretch of the drift, for its derivatives
@@ -54,7 +54,7 @@ class Fitter:
     training
         Settings of the fits.
     decay
-        Main decay as known from pile-up tails, if it is.
+        Main decay from pile-up tails, if these determine it.
     listener
         Called with the number of steps so far, and chi-square.
     steps
@@ -84,7 +84,7 @@ class Fitted(NamedTuple):
     response
         The chain.
     chi_square, functions
-        Of the differences, and how many there are.
+        Of the differences, and their number.
     covariance
         Covariance of the parameters.
     """
@@ -126,7 +126,7 @@ def fit_chain(
     Raises
     ------
     CpunetError
-        If there is no finite chi-square.
+        If no chi-square is finite.
     """
     parameters = SmoothParameters(response)
 
@@ -149,12 +149,12 @@ def chi_square(response: ElectronicsResponse, bands: Sequence[Sides]) -> tuple[f
     """Of `Comparison` for a response, and number of functions; both kinds of slices are of the
     same pulses, and each counts half.
     """
-    found = []
+    compared = []
     for sides in bands:
         comparison = Comparison(sides.entering(response), WIDTH)
-        found += comparison.differences(response.transfer(sides.padded))
-    shares = [(0.5 if d.sliced else 1.0) * len(d.values) for d in found]
-    return sum(n * d.chi_square for n, d in zip(shares, found, strict=True)), sum(shares)
+        compared += comparison.differences(response.transfer(sides.padded))
+    shares = [(0.5 if d.sliced else 1.0) * len(d.values) for d in compared]
+    return sum(n * d.chi_square for n, d in zip(shares, compared, strict=True)), sum(shares)
 
 
 class Parabola(NamedTuple):
@@ -165,7 +165,7 @@ class Parabola(NamedTuple):
     place
         Coordinates.
     chi_square, functions
-        Of the differences, and how many there are.
+        Of the differences, and their number.
     information
         Products of the derivatives of all uncorrelated residuals but those of the priors.
     cost, gradient
@@ -211,7 +211,7 @@ def minimum(
     steps
         Most steps.
     fall
-        Fall of the cost, expected or by the last step, below which there is no other step.
+        Fall of the cost, expected or by the last step, below which the steps end.
     count
         Called with chi-square after each evaluation.
 
@@ -245,7 +245,7 @@ def minimum(
             break
     if not np.isfinite(best.cost):
         raise CpunetError(
-            "the fit of the response diverged; check that the sets hold single pulses of one "
+            "the fit of the response diverged; check that the sets hold single pulses of a "
             "detector (cpunet info), or train on other energies (`peak`)"
         )
     unknowns.set(best.place)
@@ -288,7 +288,7 @@ def differences(parameters: SmoothParameters, comparison: Joint) -> Difference:
     response, padded = parameters.response, comparison.sides.padded
     sim, changes = comparison.sides.sim, []
     for low, high in parameters.stretches(STRETCHED):  # the last coordinates
-        apart = (high.drifted(sim) - low.drifted(sim)) / (2 * STRETCHED)
-        changes.append(np.asarray(apart, np.float32))
+        change = (high.drifted(sim) - low.drifted(sim)) / (2 * STRETCHED)
+        changes.append(np.asarray(change, np.float32))
     transfer, basis = response.transfer(padded), parameters.basis(padded)
     return comparison.entering(response).difference(transfer, basis, changes)

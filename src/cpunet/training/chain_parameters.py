@@ -27,7 +27,7 @@ STEP = 1e-5
 
 
 class Parameters:
-    """The parameters of a response as one vector, with their priors.
+    """The parameters of a response as a vector, with their priors.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Parameters:
         self.widths[self.stretched] = STRETCH_WIDTHS[: len(self.stretched)]
 
     def vector(self) -> Values:
-        """Parameters as one vector."""
+        """Parameters as a vector."""
         return np.concatenate([*self.response.parameters.values()])
 
     def set(self, vector: Values) -> None:
@@ -65,13 +65,13 @@ class Parameters:
 
     def slopes_of_transfer(self, padded: int) -> list[tuple[float, Spectrum]]:
         """Widths of all parameters but a stretch, and how the spectrum changes with each."""
-        found: list[tuple[float, Spectrum]] = []
+        slopes: list[tuple[float, Spectrum]] = []
         for i, label in enumerate(self.labels):
             if label != STRETCH:
                 a, b, step = self.ends(i)
                 change = (b.transfer(padded) - a.transfer(padded)) / step
-                found.append((float(self.widths[i]), change))
-        return found
+                slopes.append((float(self.widths[i]), change))
+        return slopes
 
     def basis(self, padded: int) -> Basis:
         """Changes of the step response with each parameter but a stretch."""
@@ -82,26 +82,26 @@ class Parameters:
 
     def stretches(self, step: float) -> list[tuple[ElectronicsResponse, ElectronicsResponse]]:
         """Copies of the response with each term of a stretch smaller and larger by a step."""
-        found = []
+        pairs = []
         for i in self.stretched:
             ends = copy.deepcopy(self.response), copy.deepcopy(self.response)
             for end, sign in zip(ends, (-1, 1), strict=True):
                 assert end.drift is not None
                 end.drift.stretch[i - self.stretched[0]] += sign * step
-            found.append(ends)
-        return found
+            pairs.append(ends)
+        return pairs
 
     def ends(self, i: int) -> tuple[ElectronicsResponse, ElectronicsResponse, float]:
-        """Copies of the response on both sides of it along one coordinate, and their distance.
+        """Copies of the response on both sides of it along a coordinate, and their distance.
 
         What they compute in double precision differs in proportion.
         """
         here, step, ends = self.vector(), STEP * self.widths[i], []
         low, high = max(here[i] - step, self.low[i]), here[i] + step
         for end in (low, high):
-            there = here.copy()
-            there[i] = end
-            self.set(there)
+            moved = here.copy()
+            moved[i] = end
+            self.set(moved)
             ends.append(copy.deepcopy(self.response))
         self.set(here)
         return ends[0], ends[1], high - low
@@ -128,7 +128,7 @@ class SmoothParameters(Parameters):
     .. math:: r = \Big(1 - \sum_i a_i\Big) \left(\frac{\tau_0}{\tau} - 1\right).
 
     Tails determine all these together a hundred times better than each.  In other coordinates,
-    a step from one to another would curve out of this valley.
+    a step between them would curve out of this valley.
 
     Parameters
     ----------
@@ -152,9 +152,9 @@ class SmoothParameters(Parameters):
         poles: bool = True,
     ) -> None:
         super().__init__(response)
-        known = {} if start is None else (own := Parameters(start)).by_name(own.centre)
+        given = {} if start is None else (own := Parameters(start)).by_name(own.centre)
         current = self.by_name(self.centre)
-        centre = np.array([known.get(name, value) for name, value in current.items()])
+        centre = np.array([given.get(name, value) for name, value in current.items()])
         of_poles = [i for i, label in enumerate(self.labels) if poles and label == POLES]
         self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
         self._plain_widths = self.widths.copy()
@@ -227,8 +227,8 @@ class SmoothParameters(Parameters):
         return float(1 - plain[self._shares].sum())
 
 
-# Minimum relative error of a main decay known from pile-up tails: these are fitted
-# with one exponential, and a readout may have more.
+# Minimum relative error of a main decay from pile-up tails: these are fitted
+# with an exponential, and a readout may have more.
 MIN_DECAY_ERROR = 0.01
 
 
@@ -248,10 +248,10 @@ def with_settings(response: ElectronicsResponse, **settings: Any) -> Electronics
     """A copy of a response with other parts, which have no effect yet."""
     config = response.config.model_copy(update=settings)
     copied = ElectronicsResponse(config, float(response.dt_ns))
-    known = response.arrays()
+    old = response.arrays()
     for name, values in copied.arrays().items():
-        if name in known:
-            n = min(values.size, known[name].size)
-            values.reshape(-1)[:n] = known[name].reshape(-1)[:n]
+        if name in old:
+            n = min(values.size, old[name].size)
+            values.reshape(-1)[:n] = old[name].reshape(-1)[:n]
     copied.decay_known = response.decay_known
     return copied

@@ -51,7 +51,7 @@ OTHER_SPREAD, OTHER_SHARPER = 1.5, 1.4
 ROUNDING, SURE, PARTS = 2.0, 4.0, 8
 # Charge from which a pulse has begun, as much short of all of it has ended; quantile of times.
 BEGUN, LONGEST = 0.01, 0.99
-LOST = 0.1  # share of the selected pulses left out for one reason that causes a warning
+LOST = 0.1  # share of the selected pulses left out for a single reason that causes a warning
 MAX_PULSES = 2000  # maximum number of pulses per side for shapes
 RISES = (0.1, 0.5)  # of the height: a readout adds the same time between them to all pulses
 OFF_LINE = 1.5  # keV, maximum deviation of a line
@@ -75,7 +75,7 @@ class Finding:
     level
         How bad it is.
     text
-        What was found.
+        What was checked.
     remedy
         What to do; empty if nothing is to be done.
     channel
@@ -98,7 +98,7 @@ class CheckResult:
     Parameters
     ----------
     findings
-        What was found, in order.
+        In order.
     sides
         Prepared pulses of ``"sim"`` and ``"data"``; none if they cannot be read, or are of
         several channels.
@@ -118,23 +118,25 @@ class CheckResult:
         Raises
         ------
         CpunetError
-            If the pulses of a side could not be read, or there are several channels.
+            If the pulses of a side could not be read, or are of several channels.
         """
         from cpunet.training.figures import sides_figure
 
         if not self.sides:
-            raise CpunetError("there are no pulses of both sides to draw")
+            raise CpunetError("no pulses of both sides to draw")
         names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
         sides = {name: self.sides[side] for name, side in names.items()}
         axes = {
-            "Time from 10 to 50 % [ns]": lambda one: _rise_ns(_of_height_one(one), one.dt_ns),
+            "Time from 10 to 50 % [ns]": lambda inputs: _rise_ns(
+                _of_height_one(inputs), inputs.dt_ns
+            ),
             "Current amplitude [1/sample]": _amplitudes,
         }
         return sides_figure(
-            {name: _of_height_one(one) for name, one in sides.items()},
-            {axis: {n: of(one) for n, one in sides.items()} for axis, of in axes.items()},
+            {name: _of_height_one(inputs) for name, inputs in sides.items()},
+            {axis: {n: of(inputs) for n, inputs in sides.items()} for axis, of in axes.items()},
             self.sides["data"].dt_ns,
-            {name: len(one.prepared) for name, one in sides.items()},
+            {name: len(inputs.prepared) for name, inputs in sides.items()},
         )
 
     def save(self, path: str | Path, force: bool = False) -> None:
@@ -162,8 +164,8 @@ class CheckResult:
 
     def __repr__(self) -> str:
         counts = Counter(finding.level for finding in self.findings)
-        told = ", ".join(f"{n} {mark}" for mark, n in counts.items())
-        return f"<{type(self).__name__}: {told}>"
+        text = ", ".join(f"{n} {mark}" for mark, n in counts.items())
+        return f"<{type(self).__name__}: {text}>"
 
 
 def check(
@@ -203,7 +205,7 @@ def check(
     Returns
     -------
     CheckResult
-        What was found.
+        Findings on both sides.
 
     Raises
     ------
@@ -226,11 +228,11 @@ def check(
     chosen = load_recipe(recipe, settings)
     findings: list[Finding] = []
     for name, pair in ({"": both} if alone else paired(*both)).items():
-        one = _checked(pair, chosen, peak)
-        findings += [replace(finding, channel=name) for finding in one.findings]
-        if picture is not None and one.sides:
-            one.save(picture.with_stem(f"{picture.stem}-{name}") if name else picture, force)
-    return one if alone else CheckResult(findings)
+        result = _checked(pair, chosen, peak)
+        findings += [replace(finding, channel=name) for finding in result.findings]
+        if picture is not None and result.sides:
+            result.save(picture.with_stem(f"{picture.stem}-{name}") if name else picture, force)
+    return result if alone else CheckResult(findings)
 
 
 def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
@@ -263,10 +265,10 @@ def compare_sides(
         return findings
     too_short = [*_too_short(sim, preparation)]
     findings += too_short
-    for one, side in ((sim, "simulated"), (data, "measured")):
-        findings += [_count(one, side), *_lines(one, side, selection)]
+    for inputs, side in ((sim, "simulated"), (data, "measured")):
+        findings += [_count(inputs, side), *_lines(inputs, side, selection)]
         if not too_short:  # else pulses in their own baselines would be blamed on others
-            findings += _left_out(one, side)
+            findings += _left_out(inputs, side)
     if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
         return findings  # too few to compare shapes
     spreads = [] if too_short else [_spread(sim, data)]
@@ -300,9 +302,9 @@ def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iter
         yield from (Finding(Level.WARNING, note) for note in notes)
 
 
-def _count(one: InputSet, side: str) -> Finding:
-    n = len(one.prepared)
-    text = f"{one.path.name}: {n} {side} pulses of {one.prepared.n_read} can be used"
+def _count(inputs: InputSet, side: str) -> Finding:
+    n = len(inputs.prepared)
+    text = f"{inputs.path.name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
     if n >= FEW:
         return Finding(Level.FINE, text)
     level = Level.ERROR if n < MIN_PULSES else Level.WARNING
@@ -330,7 +332,7 @@ REMEDIES = {
     Rejection.BASELINE_SLOPE: ("baselines are not flat: pile-up tails (cpunet info --quality)"),
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.COPIES: "these rows were written twice; write the file anew",
-    Rejection.NO_AMPLITUDE: "the polarity may be the other one, or these are noise",
+    Rejection.NO_AMPLITUDE: "the polarity may be reversed, or these are noise",
 }
 
 
@@ -363,39 +365,41 @@ def _too_short(sim: InputSet, preparation: PreparationConfig) -> Iterator[Findin
             )
 
 
-def _left_out(one: InputSet, side: str) -> Iterator[Finding]:
+def _left_out(inputs: InputSet, side: str) -> Iterator[Finding]:
     """Warn of reasons for which a large share of the selected pulses is left out."""
-    counts = dict(one.prepared.rejections)
+    counts = dict(inputs.prepared.rejections)
     for reason in (Rejection.ENERGY_OUTSIDE_SELECTION, Rejection.ENERGY_UNKNOWN):
         counts.pop(reason.label, None)
-    selected = len(one.prepared) + sum(counts.values())
+    selected = len(inputs.prepared) + sum(counts.values())
     for label, n in counts.items():
         if n > LOST * selected or label == Rejection.COPIES.label:
-            text = f"{one.path.name}: {100 * n / selected:.0f} % of the {side} pulses left out"
+            text = (
+                f"{inputs.path.name}: {100 * n / selected:.0f} % of the {side} pulses left out"
+            )
             remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
             yield Finding(Level.WARNING, f"{text} ({label})", remedy)
 
 
-def _lines(one: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
+def _lines(inputs: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
     """Check the position of the highest gamma line."""
     # the highest line has no neighbours
     highest = sorted(selection.peaks.items(), key=lambda item: item[1].energy_kev)[-1:]
     for name, line in highest:
-        found = line_near(one.energies_kev, line.energy_kev)
-        if found is None:
+        line_kev = line_near(inputs.energies_kev, line.energy_kev)
+        if line_kev is None:
             continue
-        off = found - line.energy_kev
-        text = f"{one.path.name}: line {name} of the {side} pulses at {found:.1f} keV"
+        off = line_kev - line.energy_kev
+        text = f"{inputs.path.name}: line {name} of the {side} pulses at {line_kev:.1f} keV"
         fine = abs(off) <= OFF_LINE
         text += "" if fine else f", {off:+.1f} keV from where it should be"
-        factor = line.energy_kev / found
+        factor = line.energy_kev / line_kev
         how = ", as by `kev_per_adc`," if side == "measured" else " in its file"
         remedy = f"energies times {factor:.5f}{how} would put it right"
         yield _judged(text, remedy, fine)
 
 
 def _spread(sim: InputSet, data: InputSet) -> Finding:
-    """Compare the spreads of the drift times, behind a readout as slow as the measured one.
+    """Compare the spreads of the drift times, behind a readout as slow as that of the data.
 
     A readout adds nearly the same time to long rises, and hides differences of short ones.
     """
@@ -439,7 +443,7 @@ def _slowed_rises_ns(sim: InputSet, median_ns: float) -> Values:
 
 def _amplitude(sim: InputSet, data: InputSet) -> Finding:
     """Compare the current amplitudes, which no readout increases much."""
-    highest = [float(np.nanquantile(_amplitudes(one), 0.9)) for one in (sim, data)]
+    highest = [float(np.nanquantile(_amplitudes(inputs), 0.9)) for inputs in (sim, data)]
     ratio = highest[1] / highest[0]
     text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
     remedy = (
@@ -449,15 +453,15 @@ def _amplitude(sim: InputSet, data: InputSet) -> Finding:
     return _judged(text, remedy, ratio < SHARPER, ratio > OTHER_SHARPER)
 
 
-def _of_height_one(one: InputSet) -> FloatArray:
+def _of_height_one(inputs: InputSet) -> FloatArray:
     """Some pulses scaled to height 1, whatever the level of their prepared tails."""
-    waveforms = one.prepared.pulses.waveforms
+    waveforms = inputs.prepared.pulses.waveforms
     waveforms = waveforms[spread(len(waveforms), MAX_PULSES)]
     return np.asarray(waveforms / waveforms.max(axis=1, keepdims=True), np.float32)
 
 
-def _amplitudes(one: InputSet) -> Values:
-    return current_amplitude(_of_height_one(one), one.dt_ns)
+def _amplitudes(inputs: InputSet) -> Values:
+    return current_amplitude(_of_height_one(inputs), inputs.dt_ns)
 
 
 def _rise_ns(waveforms: FloatArray, dt_ns: float) -> Values:

@@ -1,7 +1,7 @@
 """Readout chains in closed form, fitted or true: sums of exponentials, and numbers of them.
 
 Parameters of a fit can be degenerate: two nearly equal poles are individually unconstrained, as
-is a long decay beside a fast one, while their rise time and common decay are well known.
+is a long decay with a fast decay, while their rise time and common decay are well determined.
 Errors of derived numbers are therefore propagated with the full covariance of the parameters,
 along each of its axes.
 """
@@ -191,7 +191,7 @@ def noise_numbers(chain: Chain) -> Numbers:
     if chain.noise is None:
         return {}
     frequency, density = chain.noise
-    # frequency 0 is the baseline; the last one represents half a step
+    # frequency 0 is the baseline; the last represents half a step
     numbers = {
         "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
     }

@@ -10,9 +10,9 @@ the shapes' :math:`S` from the simulation without noise and the noise's :math:`N
 draws of opposite sign leave of the simulated noise.  Compared are
 
 * the means of every sample in slices by rank of the current amplitude, and of the rise from 5
-  to 50 %.  Slices are ranks of each side, so they are equally full however far apart the sides
-  are.  Means are those of bounded functions, :math:`w \tanh((A - m) / w)`, which rare pulses
-  do not move;
+  to 50 %.  Slices are ranks of each side, so they are equally full however much the sides
+  differ.  Means are those of bounded functions, :math:`w \tanh((A - m) / w)`, which rare
+  pulses do not move;
 * the quantiles of both, which say what a rank means.
 """
 
@@ -44,7 +44,7 @@ Moved = Callable[["Sides", Aligned], Any]
 MOST = 4096  # pulses of each side that are compared
 PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
 # Times in ns from the half height between which every sample is compared, shortest and longest
-# stretches there and elsewhere, and samples compared per pulse at most.
+# stretches within and elsewhere, and samples compared per pulse at most.
 DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 0.5
 # Centres of the slices as ranks of either side.  The highest amplitudes are single sites, which
 # differ least in shape.
@@ -180,8 +180,8 @@ class Sides:
         return slice(self.frame.before + round(TAIL_NS / self.frame.dt_ns), None)
 
     def _late_rms(self, aligned: Aligned) -> Values:
-        apart = (aligned.pulses[:, self._late] - self.middle) / self.spread
-        return np.asarray(np.sqrt((apart**2).mean(axis=1)))
+        deviation = (aligned.pulses[:, self._late] - self.middle) / self.spread
+        return np.asarray(np.sqrt((deviation**2).mean(axis=1)))
 
     def single(self, aligned: Aligned) -> npt.NDArray[np.bool_]:
         """Which pulses have no other before them or on their tail."""
@@ -214,10 +214,10 @@ class Sides:
         spectra = scipy.fft.rfft(change, self.padded) * transfer.astype(np.complex64)
         records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)
         behind = self.length - self.before
-        found = np.empty((len(sim), self.length), np.float32)
-        found[:, self.before :] = records[:, :behind]
-        found[:, : self.before] = records[:, self.padded - self.before :]
-        return np.asarray(found / heights[:, np.newaxis], np.float32)
+        change_of_records = np.empty((len(sim), self.length), np.float32)
+        change_of_records[:, self.before :] = records[:, :behind]
+        change_of_records[:, : self.before] = records[:, self.padded - self.before :]
+        return np.asarray(change_of_records / heights[:, np.newaxis], np.float32)
 
     def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
         """Records with each draw of the noise, read."""
@@ -282,7 +282,7 @@ class Difference:
 
     @property
     def sliced(self) -> bool:
-        """Whether it is one of the slices."""
+        """Whether it is a slice."""
         return self.name[-1].isdigit()
 
 
@@ -321,7 +321,7 @@ class Comparison:
             moves = basis(sides, noisy[0])
         elif basis is not None:
             moves = Derivatives(sides, sides.first, noisy[0], heights, basis)
-        views = [sides.view(one.pulses) for one in noisy]
+        views = [sides.view(draw.pulses) for draw in noisy]
         clean_view = sides.view(sides.read(clean, heights).pulses)
         return [
             *(self._quantiles(by, noisy, moves) for by in RANKS),
@@ -336,12 +336,12 @@ class Comparison:
         """
         clean, heights = self.sides.translated(transfer)
         noisy = self.sides.noisy(clean, heights)
-        kept = self.sides.single(noisy[0])
-        if kept.sum() < 2:  # far from the data
-            kept[:] = True
-        views = [self.sides.view(one.pulses)[kept] for one in noisy]
-        clean_view = self.sides.view(self.sides.read(clean, heights).pulses)[kept]
-        n, ones = len(self.data), np.ones((len(views), int(kept.sum())))
+        single = self.sides.single(noisy[0])
+        if single.sum() < 2:  # far from the data
+            single[:] = True
+        views = [self.sides.view(draw.pulses)[single] for draw in noisy]
+        clean_view = self.sides.view(self.sides.read(clean, heights).pulses)[single]
+        n, ones = len(self.data), np.ones((len(views), int(single.sum())))
         data, simulated, pulses, _ = self._bounded(
             np.ones(n), views, clean_view, np.arange(len(clean_view)), _rms(views, clean_view)
         )
@@ -356,9 +356,9 @@ class Comparison:
     ) -> Difference:
         """Quantiles of a quantity."""
         own = getattr(self.sides.data, by)
-        simulated = np.concatenate([getattr(one, by) for one in noisy])
-        found = np.quantile(simulated, QUANTILES)
-        apart, slopes = found - np.quantile(own, QUANTILES), NONE
+        simulated = np.concatenate([getattr(draw, by) for draw in noisy])
+        quantiles = np.quantile(simulated, QUANTILES)
+        differences, slopes = quantiles - np.quantile(own, QUANTILES), NONE
         errors = np.hypot(
             quantile_errors(own, len(own)), quantile_errors(simulated, len(self.sides))
         )
@@ -366,10 +366,10 @@ class Comparison:
             len(errors)
         )
         if moves is not None:
-            near, _ = hats(getattr(noisy[0], by), found)
+            near, _ = hats(getattr(noisy[0], by), quantiles)
             counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
             slopes = near.T @ getattr(moves, by) / counts
-        return Difference(f"{by} quantiles", apart, covariance, slopes)
+        return Difference(f"{by} quantiles", differences, covariance, slopes)
 
     def _slices(
         self,
@@ -380,7 +380,7 @@ class Comparison:
         moves: Derivatives | None,
     ) -> list[Difference]:
         """Means of bounded functions of every sample, in slices of a quantity."""
-        values = [getattr(one, by) for one in noisy]
+        values = [getattr(draw, by) for draw in noisy]
         of_data, _ = hats(own := getattr(self.sides.data, by), np.quantile(own, RANKS[by]))
         centres = np.quantile(np.concatenate(values), RANKS[by])
         weights, turned = zip(*(hats(value, centres) for value in values), strict=True)
@@ -389,7 +389,7 @@ class Comparison:
             near, _ = hats(values[0], np.quantile(np.concatenate(values), QUANTILES))
             counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
             moved = getattr(moves, by) - near @ (near.T @ getattr(moves, by) / counts)
-        found: list[Any] = []
+        slices: list[Any] = []
         rms = _rms(views, clean)
         for k in range(len(centres)):
             own_data, own = of_data[:, k], np.array([of[:, k] for of in weights])
@@ -407,13 +407,13 @@ class Comparison:
                 relative = noisy_own[0] - each @ noisy_own[0]
                 sliding = relative * (turned[0][rows, k] / w[0].sum())[:, np.newaxis]
                 derivatives += sliding.T.astype(np.float32) @ moved[rows]
-            found.append((*parts, _effective(used), difference, derivatives))
-        shapes, noise = (sum(one[i] for one in found) / len(found) for i in (0, 1))
+            slices.append((*parts, _effective(used), difference, derivatives))
+        shapes, noise = (sum(draw[i] for draw in slices) / len(slices) for i in (0, 1))
         # the inverse of a covariance from n samples is too large (Hartlap, A&A 464 (2007) 399)
         samples = max(1.0, 0.5 * len(views)) * len(clean)
         noise *= samples / max(samples - len(noise), 0.2 * samples)
         differences = []
-        for k, (shape, _, n_sim, left, n_data, difference, derivatives) in enumerate(found):
+        for k, (shape, _, n_sim, left, n_data, difference, derivatives) in enumerate(slices):
             covariance = (1 - POOLED) * shape + POOLED * shapes
             covariance = covariance * (1 / n_sim + 1 / n_data) + noise * (1 / n_data + left)
             differences.append(Difference(f"{by} {k}", difference, covariance, derivatives))
@@ -497,9 +497,9 @@ def hats(values: Values, centres: Values) -> tuple[Values, Values]:
     ([[0.75, 0.25, 0.0], [0.0, 0.0, 1.0]], [-1.0, 1.0, 0.0])
     """
     low = (np.searchsorted(centres, values) - 1).clip(0, len(centres) - 2)
-    apart, rows = centres[low + 1] - centres[low], np.arange(len(values))
-    place = (values - centres[low]) / apart
-    slope = ((place > 0) & (place < 1)) / apart
+    distances, rows = centres[low + 1] - centres[low], np.arange(len(values))
+    place = (values - centres[low]) / distances
+    slope = ((place > 0) & (place < 1)) / distances
     place = place.clip(0, 1)
     bins, derivatives = np.zeros((2, len(values), len(centres)))
     bins[rows, low], bins[rows, low + 1] = 1 - place, place

@@ -36,7 +36,7 @@ class Basis:
     first
         First lag after the step in samples; negative.
     changes
-        Change of the step response from there on per coordinate, shape (lags, coordinates).
+        Change of the step response from this lag on per coordinate, shape (lags, coordinates).
     """
 
     first: int
@@ -51,7 +51,7 @@ class Basis:
 class Derivatives:
     r"""Derivatives in the coordinates of a basis, for pulses with a draw of noise.
 
-    A record changes by the current at lag l times the change of the response there.  What is
+    A record changes by the current at lag l times the change of the response at l.  What is
     read of a pulse changes with its baseline, its height and the time of its half height, too:
 
     .. math:: dA(t) = \frac{dR(t) - dB}{h} - A \frac{dh}{h} + \dot A(t)\, d\tau.
@@ -109,13 +109,13 @@ class Derivatives:
         self.time = -at_half / column(aligned.slopes[rows, frame.before])
         early, part = aligned.early, column(aligned.early_part)
         ahead = aligned.pulses[rows, early + 1] - aligned.pulses[rows, early]
-        apart = column(np.maximum(ahead, 1e-5))
+        step = column(np.maximum(ahead, 1e-5))
         begin = aligned.sample + early - frame.before
         risen = charge(begin) * (1 - part) + charge(begin + 1) * part
         steep = column(aligned.slopes[rows, early]) * (1 - part)
         steep = steep + column(aligned.slopes[rows, early + 1]) * part
         risen = risen - self.base - SINGLE(EARLY) * self.span + self.time * steep
-        self.rise = np.where((early > 1)[:, np.newaxis], risen / apart, 0)
+        self.rise = np.where((early > 1)[:, np.newaxis], risen / step, 0)
         self.log_amplitude = self._amplitude(aligned) / height
         self.log_amplitude /= column(np.exp(aligned.log_amplitude))
         self.log_amplitude -= self.span
@@ -131,15 +131,15 @@ class Derivatives:
     def _amplitude(self, aligned: Aligned) -> Floats:
         """Change of the highest smoothed current of a record."""
         taps, reach, lags = self.sides.frame.taps, self.sides.frame.reach, len(self.changes)
-        found = np.zeros((len(aligned), self.changes.shape[1]), SINGLE)
+        change = np.zeros((len(aligned), self.changes.shape[1]), SINGLE)
         for step, weights in enumerate(taps):
             rows = np.flatnonzero(aligned.step == step)
             first = aligned.steepest[rows] - self.basis.last - reach
             records = stretch(self.sides.current[rows], first, lags + 2 * reach + 1)
             current = np.diff(records, axis=1)
             smooth = sum(w * current[:, j : j + lags] for j, w in enumerate(weights))
-            found[rows] = smooth @ self.reversed
-        return found
+            change[rows] = smooth @ self.reversed
+        return change
 
     def mean(self, rows: npt.NDArray[np.intp], weights: Floats) -> Values:
         """Change of weighted sums of the stretches, shape (stretches, coordinates).
@@ -159,11 +159,11 @@ class Derivatives:
         lags = np.arange(basis.first, basis.last + 1)
         low = self.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
         high = np.take_along_axis(sums, low + widths, axis=1)
-        found = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ basis.changes
-        found -= weights.T @ self.base[rows]
-        found += (weights * self.slopes[rows]).T @ self.time[rows]
-        found -= (weights * self.values[rows]).T @ self.span[rows]
-        return np.asarray(found)
+        change = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ basis.changes
+        change -= weights.T @ self.base[rows]
+        change += (weights * self.slopes[rows]).T @ self.time[rows]
+        change -= (weights * self.values[rows]).T @ self.span[rows]
+        return np.asarray(change)
 
     def each(self, matrix: Values) -> Floats:
         """Change of linear functions of each pulse, shape (pulses, functions, coordinates).
@@ -179,15 +179,15 @@ class Derivatives:
             weights[:, :, np.newaxis], self.basis.changes[::-1, np.newaxis], axes=0
         )
         changes = self.currents @ kernel.reshape(-1, n * m).astype(SINGLE)
-        found = changes.reshape(-1, n, m)
+        change = changes.reshape(-1, n, m)
         matrix = matrix.astype(SINGLE)
         # samples of the level follow the half height, by whole ones
         falling = np.gradient(self.level).mean()
         span = self.span + self.time * SINGLE(falling)
-        found -= self.base[:, np.newaxis] * matrix.sum(axis=0)[:, np.newaxis]
-        found += (self.slopes @ matrix)[:, :, np.newaxis] * self.time[:, np.newaxis]
-        found -= (self.values @ matrix)[:, :, np.newaxis] * span[:, np.newaxis]
-        return np.asarray(found)
+        change -= self.base[:, np.newaxis] * matrix.sum(axis=0)[:, np.newaxis]
+        change += (self.slopes @ matrix)[:, :, np.newaxis] * self.time[:, np.newaxis]
+        change -= (self.values @ matrix)[:, :, np.newaxis] * span[:, np.newaxis]
+        return np.asarray(change)
 
 
 class Changes:

@@ -38,7 +38,7 @@ from cpunet.training.comparison import MOST, NONE, Comparison, Moved, Sides, Spe
 from cpunet.training.derivatives import Basis
 from cpunet.training.joint import Joint
 
-# Knots in ns: the last one of the dense ones and of all, and how far apart.
+# Knots in ns: the last of the dense ones and of all, and their spacing.
 DENSE_NS, LAST_NS, APART_NS, SPARSE_NS, GROWTH = 3000.0, 6800.0, 8.0, 96.0, 1.12
 ONSET_NS, LINEAR_NS, EDGE_NS = 8.0, 96.0, 192.0
 FREE = 0.3  # of the priors of the chain's parameters, within which they are free
@@ -46,7 +46,7 @@ FREE = 0.3  # of the priors of the chain's parameters, within which they are fre
 # must lower chi-square for another.
 STAGES = ((6.0, 1024, 0.03), (1.5, MOST, 0.003))
 # Most steps of a stage; lengths of a step in standard deviations below which the stage ends,
-# and derivatives are kept.
+# and derivatives are used again.
 STEPS, SETTLED, CLOSE = 10, 0.7, 3.0
 # Errors are larger than those of independent slices, since both kinds see the same pulses: rise
 # times (10 to 90, 1 to 99, 0.1 to 99.9 %) on seven stands scatter by this factor more.
@@ -83,12 +83,12 @@ class Prior:
         """Covariance of the deviations at these times."""
         begun = expit(time_ns / ONSET_NS)
         width = self.width * (1 + (self.edge - 1) * np.exp(-((time_ns / EDGE_NS) ** 2))) * begun
-        found = _process(width, np.arcsinh(time_ns / LINEAR_NS), self.length)
+        covariance = _process(width, np.arcsinh(time_ns / LINEAR_NS), self.length)
         if self.fine:
             width = self.fine * np.exp(-np.abs(time_ns) / self.fine_decay) * begun
-            found += _process(width, time_ns, self.fine_length)
+            covariance += _process(width, time_ns, self.fine_length)
         rough = self.rough * np.exp(-np.abs(time_ns) / self.rough_decay)
-        return np.asarray(found + np.diag(rough**2 + 1e-12))
+        return np.asarray(covariance + np.diag(rough**2 + 1e-12))
 
 
 def _process(width: Values, place: Values, length: float) -> Values:
@@ -130,8 +130,8 @@ def posterior(information: Values, right: Values, covariance: Values) -> Posteri
     --------
     A measurement of 3 ± 1 with a prior of width 1 gives half of it:
 
-    >>> one = np.ones((1, 1))
-    >>> posterior(one, np.array([3.0]), one).mean.round(6).tolist()
+    >>> unit = np.ones((1, 1))
+    >>> posterior(unit, np.array([3.0]), unit).mean.round(6).tolist()
     [1.5]
     """
     root = np.linalg.cholesky(covariance)
@@ -142,9 +142,9 @@ def posterior(information: Values, right: Values, covariance: Values) -> Posteri
 
 
 def best_prior(of: Callable[[Prior], float], starts: Sequence[Prior]) -> Prior:
-    """The prior of the highest evidence, one of its values changed after another."""
+    """The prior of the highest evidence, its values changed in turn."""
     followed = sorted(((of(prior), i) for i, prior in enumerate(starts)), reverse=True)
-    found = []
+    candidates = []
     for best, i in followed[:FURTHER]:
         prior, before = starts[i], -np.inf
         while best > before + 1:
@@ -156,8 +156,8 @@ def best_prior(of: Callable[[Prior], float], starts: Sequence[Prior]) -> Prior:
                     other = replace(prior, **{name: value})
                     if other != prior and (tried := of(other)) > best + BETTER:
                         best, prior = tried, other
-        found.append((best, prior))
-    return max(found, key=lambda one: one[0])[1]
+        candidates.append((best, prior))
+    return max(candidates, key=lambda candidate: candidate[0])[1]
 
 
 class Knots:
@@ -183,8 +183,8 @@ class Knots:
     def __init__(self, response: ElectronicsResponse, padded: int) -> None:
         dt_ns, lags = float(response.dt_ns), deviation_lags(float(response.dt_ns))
         self.lags = lags
-        apart, last = max(1, round(APART_NS / dt_ns)), round(LAST_NS / dt_ns)
-        knots, step = [*range(lags[0], round(DENSE_NS / dt_ns) + 1, apart)], float(apart)
+        spacing, last = max(1, round(APART_NS / dt_ns)), round(LAST_NS / dt_ns)
+        knots, step = [*range(lags[0], round(DENSE_NS / dt_ns) + 1, spacing)], float(spacing)
         while knots[-1] < last:
             step = min(GROWTH * step, SPARSE_NS / dt_ns)
             knots.append(min(knots[-1] + max(1, round(step)), last))
@@ -360,12 +360,12 @@ class Linearised:
     def evaluate(self, transfer: Spectrum, place: Values, *, anew: bool) -> float:
         """Chi-square; information and right side with derivatives at this place if `anew`."""
         basis = self.basis if anew else None
-        found = [d for c in self.comparisons for d in c.differences(transfer, basis)]
+        differences = [d for c in self.comparisons for d in c.differences(transfer, basis)]
         n, cost = len(place), 0.0
         self.right = np.zeros(n)
         if anew:
             self.white, self.information = [], np.zeros((n, n))
-        for i, difference in enumerate(found):
+        for i, difference in enumerate(differences):
             share = 0.5 if difference.sliced else 1.0  # both kinds of slices see the same
             if anew:
                 root = np.asarray(np.linalg.cholesky(difference.covariance))

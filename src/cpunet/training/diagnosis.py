@@ -59,9 +59,8 @@ with other impurities: cpunet calibrate tells which
         size += f" in the last microsecond, {_longer(stretch)} near its end"
     if (gain := gains.get(DRIFT[1], "").partition("; ")[2]) != "":
         size += f" ({gain})"
-    cause = (
-        "warmer detector, at a lower bias" if stretch > 0 else "colder one, at a higher bias"
-    )
+    how = ("warmer", "a lower") if stretch > 0 else ("colder", "a higher")
+    cause = "{} detector, at {} bias".format(*how)
     return [f"{size}, as in a {cause} or with other impurities: cpunet calibrate tells which"]
 
 

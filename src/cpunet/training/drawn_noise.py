@@ -18,7 +18,7 @@ from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Samples, Values
 
-# Maximum number of noise traces, each twice as long as a record.  If there are more pulses,
+# Maximum number of noise traces, each twice as long as a record.  For more pulses,
 # they share the traces, with other start samples and signs.
 NOISE_TRACES = 4096
 
@@ -58,14 +58,16 @@ class Noise:
     ) -> Noise:
         """Draw noise for records of `length` samples.
 
-        Every second draw is the one before it with opposite sign, so that the contribution of
+        Every second draw is the previous with opposite sign, so that the contribution of
         noise to a mean cancels.
         """
         n, pairs = len(energy_kev), -(-draws // 2)
-        kept = min(NOISE_TRACES, n * pairs)
-        traces = noise.draw(np.ones(kept), 2 * length, rng)
+        n_traces = min(NOISE_TRACES, n * pairs)
+        traces = noise.draw(np.ones(n_traces), 2 * length, rng)
         # each trace is used before any is used again
-        trace = np.concatenate([rng.permutation(kept) for _ in range(-(-n * pairs // kept))])
+        trace = np.concatenate(
+            [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
+        )
         sign = rng.choice((-1.0, 1.0), (pairs, n))
         drawn = cls(
             traces,

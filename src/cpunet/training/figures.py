@@ -93,7 +93,7 @@ def response_figure(
     chains
         Fitted chains.
     truth
-        True chain, if known.
+        True chain, if given.
     tail_ns
         Time after the step up to which the tail is drawn, in ns.
     """
@@ -136,10 +136,12 @@ def response_figure(
     if truth is not None:
         axes, reference = panels["residual"], steps.pop(0)
         for i, step in enumerate(steps):
-            apart, band = 1e3 * (step - reference), 1e3 * errors[i + 1]
+            difference, band = 1e3 * (step - reference), 1e3 * errors[i + 1]
             colour = shades[i % len(shades)]
-            axes.plot(long_ns, apart, color=colour)
-            axes.fill_between(long_ns, apart - band, apart + band, color=colour, alpha=0.3)
+            axes.plot(long_ns, difference, color=colour)
+            axes.fill_between(
+                long_ns, difference - band, difference + band, color=colour, alpha=0.3
+            )
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set(ylabel="Run − truth\n[10⁻³ of full charge]")
     _annotate(panels)

@@ -53,13 +53,13 @@ class Moves:
         self, sides: Sides, aligned: Aligned, moved: Sequence[Aligned], steps: Values
     ) -> None:
         self.log_amplitude, self.rise = (
-            np.stack([getattr(one, by) - getattr(aligned, by) for one in moved], 1) / steps
+            np.stack([getattr(after, by) - getattr(aligned, by) for after in moved], 1) / steps
             for by in ("log_amplitude", "rise")
         )
         view = sides.view(aligned.pulses)
         self.views = [
-            (sides.view(one.pulses) - view) / np.float32(step)
-            for one, step in zip(moved, steps, strict=True)
+            (sides.view(after.pulses) - view) / np.float32(step)
+            for after, step in zip(moved, steps, strict=True)
         ]
 
     def mean(self, rows: npt.NDArray[np.intp], weights: Floats) -> Values:
@@ -94,10 +94,10 @@ def with_heights(
     by_height.step_kev[...] = max(steps)
     by_height.top_kev[...] = 1.02 * max(float(sides.energy_kev.max()) for sides in bands)
     behind = [sides.entering(own) for sides in bands]
-    halves = [min(len(one), len(one.data), 2 * MOST) // 2 for one in bands]
-    fitted = [one.of(n) for one, n in zip(behind, halves, strict=True)]
+    halves = [min(len(sides), len(sides.data), 2 * MOST) // 2 for sides in bands]
+    fitted = [sides.of(n) for sides, n in zip(behind, halves, strict=True)]
     for most, width, least in STAGES:
-        covariance = _solve(own, [one.of(most) for one in fitted], width, least, count)
+        covariance = _solve(own, [sides.of(most) for sides in fitted], width, least, count)
     held = [sides.some(slice(n, 2 * n)) for sides, n in zip(bands, halves, strict=True)]
     (before, _), (after, functions) = chi_square(response, held), chi_square(own, held)
     line = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
@@ -168,7 +168,7 @@ def _solve(
     damping, last = FIRST, width == STAGES[-1][1]
     for _ in range(STEPS):
         cost = problem.evaluate(own.transfer(padded), place, anew=True)
-        if last:  # near enough that the evidence says how much of each there is
+        if last:  # near enough that the evidence says how much of each is needed
             start = problem.right - problem.information @ centre
             evidence = {
                 choice: posterior(problem.information, start, covariance(*choice)).evidence
@@ -176,8 +176,8 @@ def _solve(
             }
             best = max(evidence, key=lambda choice: evidence[choice])
             precision = np.linalg.inv(covariance(*best))
-        apart = place - centre
-        cost += float(apart @ precision @ apart)
+        offset = place - centre
+        cost += float(offset @ precision @ offset)
         count(cost)
         information, right = problem.information + precision, problem.right
         right = right + precision @ centre - information @ place
@@ -195,9 +195,9 @@ def _solve(
             scale = damping * np.diag(information.diagonal())
             move = np.linalg.solve(information + scale, right)
             put(place + move)
-            apart = place + move - centre
+            offset = place + move - centre
             new = problem.evaluate(own.transfer(padded), place + move, anew=False)
-            if (new := new + float(apart @ precision @ apart)) < cost:
+            if (new := new + float(offset @ precision @ offset)) < cost:
                 break
             damping *= 10
         else:

@@ -1,8 +1,8 @@
 """The inverse of a fitted readout chain, in closed form.
 
-A response translates any number of simulated pulses, so that both sides of each are known,
-and its noise has a known spectrum.  The linear map with the minimum mean square error (LMMSE)
-then follows from covariances.  The covariance of the noise is calculated: noise drawn at
+A response translates any number of simulated pulses, so that charge and record of each are
+given, and so is the spectrum of its noise.  The linear map with the minimum mean square error
+(LMMSE) then follows from covariances.  The covariance of the noise is calculated: noise drawn at
 random would be mistaken for signal unless it was drawn many times for each pulse.
 """
 
@@ -55,7 +55,7 @@ def fit_inverse(
     recipe
         Recipe that matches a response.
     seed
-        Seed of the choice of pulses, if there are more than `MAX_PULSES`.
+        Seed of the choice of pulses, beyond `MAX_PULSES`.
 
     Returns
     -------
@@ -65,7 +65,7 @@ def fit_inverse(
     Raises
     ------
     CpunetError
-        If there are too few pulses.
+        If the pulses are too few.
     """
     _, training = recipe.matching
     if len(sim) < MIN_PULSES:

@@ -232,14 +232,14 @@ def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
             f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
             f"give a run of {like.name}"
         )
-    known: ElectronicsResponse = run.fill(
+    response: ElectronicsResponse = run.fill(
         "ren", ResponseGenerator(generator, run.dt_ns)
     ).response
-    return known
+    return response
 
 
 def fitted(
-    job: TrainingJob, known: ElectronicsResponse | None, listen: Listener
+    job: TrainingJob, start: ElectronicsResponse | None, listen: Listener
 ) -> tuple[ResponseGenerator, FitInfo]:
     """Measure the noise, fit the response, and say how well it describes the data.
 
@@ -247,7 +247,7 @@ def fitted(
     ----------
     job
         Pulses of both sides, and a recipe with a response to fit.
-    known
+    start
         Response to start from, if any.
     listen
         Function called with step and chi-square.
@@ -255,18 +255,18 @@ def fitted(
     Raises
     ------
     CpunetError
-        If there are too few pulses or baselines, or the fit diverges.
+        If pulses or baselines are too few, or the fit diverges.
     """
     recipe, (sim, data) = job.recipe, (job.sim.prepared, job.data.prepared)
     noise, tails = trace_noise(job.data, recipe.preparation)
-    if known is not None:  # its deviations are those of another readout
-        terms = min(known.config.drift_terms, recipe.matching.training.drift_terms)
-        known = with_settings(known, drift_terms=terms, deviations=False, by_height=False)
-        recipe = recipe.model_copy(update={"generator": known.config})
+    if start is not None:  # its deviations are those of another readout
+        terms = min(start.config.drift_terms, recipe.matching.training.drift_terms)
+        start = with_settings(start, drift_terms=terms, deviations=False, by_height=False)
+        recipe = recipe.model_copy(update={"generator": start.config})
     rng, drawn = np.random.default_rng(job.seed), noise.tails
     sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)
     decay = None if drawn is None else drawn.known_decay
-    response, info = fit_response(sets, Fitter(recipe.matching.training, decay, listen), known)
+    response, info = fit_response(sets, Fitter(recipe.matching.training, decay, listen), start)
     chain = ResponseGenerator(response.config, job.sim.dt_ns)
     chain.response, chain.tails = response, drawn
     chain.set_noise(noise.noise)
@@ -284,7 +284,7 @@ def _say(info: FitInfo) -> None:
     log.info(f"compared (simulated/measured pulses): {compared}")
     if any(info.in_no_band.values()):
         log.info(
-            "in no band, since one side has too few of their energies: "
+            "in no band, since a side has too few of their energies: "
             f"{info.in_no_band['sim']} simulated and {info.in_no_band['data']} measured pulses"
         )
     good = info.checks is not None and info.checks.good
@@ -298,12 +298,12 @@ def _say(info: FitInfo) -> None:
         log.warning(doubt)
 
 
-def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> Run:
-    """Fit a readout chain, starting from that of ``init`` or from `known`, if given."""
+def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> Run:
+    """Fit a readout chain, starting from that of ``init`` or from `start`, if given."""
     started, clock = datetime.now(UTC), time.perf_counter()
     if job.init is not None:
-        known = known_response(job.init, job.recipe)
-    with stage("Fitting") as bar:  # how many steps a fit needs is not known
+        start = known_response(job.init, job.recipe)
+    with stage("Fitting") as bar:  # the number of steps is not foreseen
 
         def listen(step: int, chi_square: float) -> None:
             losses = {"chi_square": chi_square}
@@ -313,7 +313,7 @@ def train_chain(job: TrainingJob, known: ElectronicsResponse | None = None) -> R
             bar.update(1)
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
-        chain, info = fitted(job, known, listen)
+        chain, info = fitted(job, start, listen)
     _say(info)
     # a stretch or deviations may have been added
     recipe = job.recipe.model_copy(update={"generator": chain.response.config})

@@ -52,7 +52,7 @@ class Joint:
         Pulses; the measured ones define the functions.
     wider
         Factor of the widths of the bins, and of where components are clipped, which otherwise
-        are all the same if the sides are far apart.
+        are all the same if the sides differ much.
     products
         Whether products of components and bins are compared, too.
     """
@@ -129,17 +129,17 @@ class Joint:
         clean, heights = self.sides.translated(transfer)
         noisy = self.sides.noisy(clean, heights)
         # without those on the tail of another, as the data; far from the data all
-        kept = np.all([self.sides.single(one) for one in noisy], axis=0)
-        kept = kept if kept.mean() > MOSTLY else np.ones_like(kept)
-        values = [self._functions(one[kept]) for one in noisy]
-        mean = np.mean([one.mean(axis=0) for one in values], axis=0)
+        single = np.all([self.sides.single(draw) for draw in noisy], axis=0)
+        single = single if single.mean() > MOSTLY else np.ones_like(single)
+        values = [self._functions(draw[single]) for draw in noisy]
+        mean = np.mean([draw.mean(axis=0) for draw in values], axis=0)
         covariance = self.covariance(0.5 * (np.cov(values[0].T) + np.cov(self.data.T)))
         slopes = NONE
         if basis is not None:
             moves = Derivatives(self.sides, self.sides.first, noisy[0], heights, basis)
             slopes = self._slopes(noisy[0], moves)
         if changes:
-            records = [self.sides.changed(one, transfer, heights) for one in changes]
+            records = [self.sides.changed(draw, transfer, heights) for draw in changes]
             own = self._slopes(noisy[0], Changes(self.sides, noisy[0], records))
             slopes = np.concatenate([slopes, own], axis=1)
         return Difference("joint", mean - self.data.mean(axis=0), covariance, slopes)

@@ -1,7 +1,7 @@
 """How often critics are right on pulses that they have not seen, and when their game is over.
 
 A critic that is right by chance on unseen pulses knows its own by heart, and has nothing to
-teach; one that is nearly always right teaches nothing either, for its slope is flat.
+teach; a critic that is nearly always right teaches nothing either, for its slope is flat.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-JUDGED, RECENT = 5, 20  # iterations from one value to the next, and values that are averaged
+JUDGED, RECENT = 5, 20  # iterations between values, and values that are averaged
 WON = 0.97
 EARLY, HALF = 0.25, 0.5  # part of a training before which none is at chance, and none has won
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-ENOUGH, MANY = 600, 4000  # pulses of a side that a critic needs, and that a large one needs
+ENOUGH, MANY = 600, 4000  # pulses of a side that a critic needs, and that a large critic needs
 SMALL = {"convolutional": {"channels": 8, "hidden": 32, "components": 32}}
 SCALES = 0.0, 0.5, 1.0  # of what a U-Net adds
 SURE, MOST = 2.0, 2000  # standard errors of a gain, and held-out pulses that decide
@@ -186,9 +186,9 @@ def _played(
 
 
 def settle(network: nn.Module, side: Side, config: TrainingConfig) -> None:
-    """Replace the running statistics of batch norms by averages over one side's pulses.
+    """Replace the running statistics of batch norms by averages over the pulses of a side.
 
-    In training a generator sees pulses of both sides (identity and cycle losses).  For one side
+    In training a generator sees pulses of both sides (identity and cycle losses).  For a side
     alone, the running averages of both shift the tail slope of a translation by more than its
     spread (Wu and Johnson 2021, arXiv:2105.07576, section 3).  Dropout is off meanwhile, as in
     a translation: it raises the variance at the batch norms behind it, here by up to a sixth
@@ -297,7 +297,7 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> Scale:
         return classifier_auc(real, windows, seed=0, features=(values[0], values[1]))
 
     results = [judged(scale) for scale in SCALES]
-    best = int(np.argmin([one.auc for one in results]))
+    best = int(np.argmin([result.auc for result in results]))
     text = f"AUC of held-out pulses {results[0].auc:.3f} → {results[-1].auc:.3f}"
     error = results[0].auc_std
     return Scale.of(best, results[0].auc - results[best].auc, error, f"{text} ± {error:.3f}")
@@ -314,11 +314,11 @@ def _iren_scale(game: Game) -> Scale:
         torch.manual_seed(0)
         noisy = sides.noisy(ren.linear(sides.sim.pulses[rows]), rows)
     back = iren.linear(sides.prepared(noisy))
-    apart, change = back - sides.sim.pulses[rows], iren.change(back)
-    squares = [(apart + scale * change).square().mean(dim=1) for scale in SCALES]
-    best = int(np.argmin([float(one.mean()) for one in squares]))
+    error_of_cycle, change = back - sides.sim.pulses[rows], iren.change(back)
+    squares = [(error_of_cycle + scale * change).square().mean(dim=1) for scale in SCALES]
+    best = int(np.argmin([float(square.mean()) for square in squares]))
     gains = squares[0] - squares[best]
-    rms = [float(one.mean().sqrt()) for one in squares]
+    rms = [float(square.mean().sqrt()) for square in squares]
     text = f"RMS of held-out cycles {rms[0]:.2e} → {rms[-1]:.2e}"
     error = max(float(gains.std()) / len(rows) ** 0.5, LEAST * float(squares[0].mean()) / SURE)
     return Scale.of(best, float(gains.mean()), error, text)

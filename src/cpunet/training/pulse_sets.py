@@ -25,7 +25,7 @@ from cpunet.training.aligned import Frame, Samples, Values
 from cpunet.training.comparison import MOST, Sides
 from cpunet.training.drawn_noise import Noise
 
-# Ratio of the limits of a band; the next is used only if no band of the one before is possible.
+# Ratio of the limits of a band; the next is used only if no band of the previous is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
 # Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
 SLICES, IN_SLICE = 32, 50
@@ -71,12 +71,12 @@ def energy_bands(
     sim_kev, data_kev
         Energies of the pulses to be compared, on the two sides.
     peaks
-        Known lines.
+        Gamma lines.
 
     Returns
     -------
     list of EnergyBand
-        Lines first.  Energies with too few pulses of one side are in no band.
+        Lines first.  Energies with too few pulses of a side are in no band.
 
     Raises
     ------
@@ -194,7 +194,7 @@ class PulseSets:
     Raises
     ------
     CpunetError
-        If there are too few pulses, or an energy is not known.
+        If the pulses are too few, or an energy is missing.
     """
 
     sim: Pulses
@@ -231,12 +231,12 @@ class PulseSets:
 
     def sides(self) -> list[Sides]:
         """Pulses of both sides in each band, for the comparison at every sample."""
-        found = []
+        pairs = []
         for band, (of_sim, of_data) in self.parted:
             data = self.data.waveforms[band.data[of_data[:MOST]]]
             some = of_sim[:MOST]
-            found.append(self._sides(self.sim, band.sim[some], data, band.weights[some]))
-        return found
+            pairs.append(self._sides(self.sim, band.sim[some], data, band.weights[some]))
+        return pairs
 
     def single_sites(self) -> list[Sides]:
         """Pulses of the continuum, whose single sites are compared; none if they are few."""

@@ -1,4 +1,4 @@
-"""`cpunet.response`: what readout was learned, beside the truth if it is known."""
+"""`cpunet.response`: what readout was learned, with the true response if given."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Response:
     runs
         The chains of the runs.
     truth
-        True readout, if known.
+        True readout, if given.
     """
 
     runs: list[DescribedChain]
@@ -82,7 +82,7 @@ class Response:
 
     @cached_property
     def true_values(self) -> Numbers:
-        """The same quantities of the true readout; empty if it is not known."""
+        """The same quantities of the true readout; empty if it is not given."""
         if self.truth is None:
             return {}
         first, chain = self.runs[0].run, true_chain_of(self.truth)
@@ -97,11 +97,11 @@ class Response:
 
     @cached_property
     def sigma(self) -> Numbers:
-        """The same in units of the error; of what has no error there is none."""
+        """The same in units of the error; without those that have no error."""
         errors = self.runs[0].errors
         return {
-            name: apart / errors[name]
-            for name, apart in self.difference.items()
+            name: difference / errors[name]
+            for name, difference in self.difference.items()
             if errors.get(name)
         }
 
@@ -110,7 +110,7 @@ class Response:
         """A row per quantity, a column per run, and ``truth``."""
         from pandas import DataFrame
 
-        columns = {one.run.name: one.values for one in self.runs}
+        columns = {chain.run.name: chain.values for chain in self.runs}
         if self.truth is not None:
             columns["truth"] = self.true_values
         return DataFrame(columns).reindex(self._names)
@@ -121,7 +121,7 @@ class Response:
 
         tail_ns = self.runs[0].run.recipe.preparation.after_ns
         truth = None if self.truth is None else true_chain_of(self.truth)
-        return response_figure([one.chain for one in self.runs], truth, tail_ns=tail_ns)
+        return response_figure([chain.chain for chain in self.runs], truth, tail_ns=tail_ns)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Make a folder of ``response.json``, ``.yaml``, ``.csv`` and ``.png``.
@@ -135,10 +135,10 @@ class Response:
             If the folder exists and `force` is off, or is of something else.
         """
         content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": []}
-        for one in self.runs:
-            facts = {"path": one.run.name, "recipe": one.run.recipe.name}
-            facts |= {name: getattr(one.run, name) for name in _OF_RUN}
-            content["runs"].append(facts | {name: getattr(one, name) for name in _OF_CHAIN})
+        for chain in self.runs:
+            facts = {"path": chain.run.name, "recipe": chain.run.recipe.name}
+            facts |= {name: getattr(chain.run, name) for name in _OF_RUN}
+            content["runs"].append(facts | {name: getattr(chain, name) for name in _OF_CHAIN})
         if self.truth is not None:
             content["truth"] = {
                 "name": self.truth.name,
@@ -146,11 +146,11 @@ class Response:
                 "difference": self.difference,
                 "sigma": self.sigma,
             }
-        folders = [one.run.folder for one in self.runs]
+        folders = [chain.run.folder for chain in self.runs]
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
             (folder / MARKER).write_text(text + "\n", encoding="utf-8")
-            chains = {one.run.name: one for one in self.runs}
+            chains = {chain.run.name: chain for chain in self.runs}
             (folder / "response.yaml").write_text(as_yaml(chains), encoding="utf-8")
             (folder / "response.csv").write_text(as_csv(chains), encoding="utf-8")
             if len(chains) > 1:
@@ -158,20 +158,20 @@ class Response:
             self.plot().savefig(folder / "response.png", dpi=_DPI)
 
     def __str__(self) -> str:
-        head = ["", *(Path(one.run.name).name for one in self.runs)]
+        head = ["", *(Path(chain.run.name).name for chain in self.runs)]
         if self.truth is not None:
             head += [self.truth.name, *(["difference", "σ"] if len(self.runs) == 1 else [])]
         return text_table(head, list(map(self._cells, self._names)), title="Readout response")
 
     def __repr__(self) -> str:
         truth = "" if self.truth is None else f", truth {self.truth.name}"
-        names = ", ".join(Path(one.run.name).name for one in self.runs)
+        names = ", ".join(Path(chain.run.name).name for chain in self.runs)
         return f"<{type(self).__name__} of {names}{truth}>"
 
     @property
     def _names(self) -> list[str]:
         """Quantities that any run or the truth has, in the order of `ROWS`."""
-        sources = [*(one.values for one in self.runs), self.true_values]
+        sources = [*(chain.values for chain in self.runs), self.true_values]
         names = {name: None for source in sources for name in source}
         return sorted(names, key=lambda name: _row(name)[0])
 
@@ -179,10 +179,12 @@ class Response:
         """A row of the table."""
         _, label, unit = _row(name)
         scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
-        alone = len(self.runs) == 1  # beside several runs there is no room for errors
+        alone = len(self.runs) == 1  # with several runs errors have no room
         errors = self.runs[0].errors if alone else {}
         cells = [f"{label} [{unit}]" if unit else label]
-        cells += (_number(one.values.get(name), scale, errors.get(name)) for one in self.runs)
+        cells += (
+            _number(chain.values.get(name), scale, errors.get(name)) for chain in self.runs
+        )
         if self.truth is None:
             return cells
         true, sigma = self.true_values.get(name), self.sigma.get(name)
@@ -199,7 +201,7 @@ def response(
     out: str | Path | None = None,
     force: bool = False,
 ) -> Response:
-    """Say in terms of physics what readout was learned, with the truth if it is known.
+    """Say in terms of physics what readout was learned, with the true response if given.
 
     Parameters
     ----------
@@ -227,23 +229,23 @@ def response(
     --------
     ``cpunet response run1 run2 --truth stand --out response``
     """
-    known = [as_run(run) for run in runs]
-    if not known:
-        raise CpunetError("no run was given", "give the folder of one")
+    opened = [as_run(run) for run in runs]
+    if not opened:
+        raise CpunetError("no run was given", "give its folder")
     if out is not None:
         place = str(truth) if isinstance(truth, str | Path) else None
-        refuse_existing(Path(out), place, *(run.folder for run in known), force=force)
+        refuse_existing(Path(out), place, *(run.folder for run in opened), force=force)
     electronics = _electronics(truth)
-    result = Response([describe_chain(run) for run in known], electronics)
-    if electronics is not None and not np.isclose(electronics.dt_ns, known[0].dt_ns):
+    result = Response([describe_chain(run) for run in opened], electronics)
+    if electronics is not None and not np.isclose(electronics.dt_ns, opened[0].dt_ns):
         raise CpunetError(
-            f"{known[0].name}: trained on pulses sampled every {known[0].dt_ns:g} ns, "
+            f"{opened[0].name}: trained on pulses sampled every {opened[0].dt_ns:g} ns, "
             f"electronics {electronics.name} samples every {electronics.dt_ns:g} ns; give the "
             "truth of its data"
         )
-    for one in result.runs:
-        for doubt in one.doubts:
-            log.warning(f"{Path(one.run.name).name}: {doubt}")
+    for chain in result.runs:
+        for doubt in chain.doubts:
+            log.warning(f"{Path(chain.run.name).name}: {doubt}")
     if out is not None:
         result.save(out, force)
     return result
@@ -278,10 +280,10 @@ def _number(value: float | None, scale: float, error: float | None = None) -> st
     return f"{text} ± {scale * error:{'.2g' if scale * error < 99 else '.0f'}}"
 
 
-def _difference(apart: float | None, true: float | None, unit: str) -> str:
+def _difference(difference: float | None, true: float | None, unit: str) -> str:
     """Relative, but of shares in percentage points."""
-    if apart is None:
+    if difference is None:
         return ""
     if unit == "%":
-        return f"{100 * apart:+.2f} pp"
-    return f"{100 * apart / true:+.1f} %" if true else ""
+        return f"{100 * difference:+.2f} pp"
+    return f"{100 * difference / true:+.1f} %" if true else ""

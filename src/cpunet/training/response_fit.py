@@ -7,7 +7,7 @@ deviations of its step response (`cpunet.training.deviations`), if the pulses as
 Every sample decides whether that is good (`cpunet.training.verdict`).  If it is not, and pulses
 begin differently than simulated, the drift of the charges is stretched.
 
-The current amplitude is what users cut on.  How well it is known is also given as the shift of
+The current amplitude is what users cut on.  Its error is also given as the shift of
 the current amplitude (A of A/E) that would best match the translated distribution to the data.
 """
 
@@ -37,7 +37,7 @@ BY_HEIGHT = "slew rate and curve"
 
 
 def fit_response(
-    sets: PulseSets, fitter: Fitter, known: ElectronicsResponse | None = None
+    sets: PulseSets, fitter: Fitter, start_from: ElectronicsResponse | None = None
 ) -> tuple[ElectronicsResponse, FitInfo]:
     """Fit a response to unpaired prepared pulses.
 
@@ -47,20 +47,20 @@ def fit_response(
         Pulses of both sides.
     fitter
         Settings of the fits; counts their steps.
-    known
+    start_from
         Response of a similar readout, with the recipe's configuration, to start from.  The
         recipe's own starts are tried only if that fails.
 
     Raises
     ------
     CpunetError
-        If there are too few pulses, or the fit does not find a finite chi-square.
+        If the pulses are too few, or the fit does not find a finite chi-square.
     """
     bands, chains = sets.sides(), list[Fitted]()
-    for start in _starts(sets, fitter, known):
+    for start in _starts(sets, fitter, start_from):
         chains.append(fit_chain(start, bands, fitter))
         if not chains[-1].poor:
-            break  # there is no other valley to search for
+            break  # no other valley to search for
     nearest = min(chains, key=lambda chain: chain.chi_square)
     best = _learned(nearest, bands, fitter)
     # of few pulses, the onset is not off for sure, but nothing else is either
@@ -69,16 +69,16 @@ def fit_response(
         if stretched is not None:
             other = _learned(stretched, bands, fitter)
             other = _with_single_sites(other, sets, bands, fitter)
-            best = min(best, other, key=lambda one: one.checks.chi_square)
+            best = min(best, other, key=lambda learned: learned.checks.chi_square)
     return best.response, described(best, sets, bands, fitter)
 
 
 def _starts(
-    sets: PulseSets, fitter: Fitter, known: ElectronicsResponse | None
+    sets: PulseSets, fitter: Fitter, start_from: ElectronicsResponse | None
 ) -> Iterator[ElectronicsResponse]:
-    """Where fits start: a known response, then chains of the recipe with the data's decay."""
-    if known is not None:
-        yield with_decay(copy.deepcopy(known), sets.tail_slope, fitter.decay)
+    """Where fits start: the response given, then chains of the recipe with the data's decay."""
+    if start_from is not None:
+        yield with_decay(copy.deepcopy(start_from), sets.tail_slope, fitter.decay)
     config, training = sets.recipe.matching
     for factor in training.start_factors:
         start = ElectronicsResponse(config, sets.noise.dt_ns)
@@ -95,7 +95,7 @@ class _Learned(NamedTuple):
 
 
 def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
-    """Learn what a chain does not do, by the height of a pulse if there are several."""
+    """Learn what a chain does not do, by the height of a pulse if heights differ."""
     response = chain.response
     around = [sides.entering(response) for sides in bands]
     alone = _Learned(chain, response, verdict(response, around))
@@ -112,44 +112,44 @@ def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
     deviated = with_deviations(response, around, fitter.count).response
     around = [sides.entering(deviated) for sides in bands]
     tried.append(_Learned(chain, deviated, verdict(deviated, around)))
-    return min(tried, key=lambda one: one.checks.chi_square)
+    return min(tried, key=lambda learned: learned.checks.chi_square)
 
 
 def _stretched(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> Fitted | None:
     """Stretch the drift, by a factor that may change with time, as far as that gains."""
-    found = None
+    best = None
     for terms in range(1, fitter.training.drift_terms + 1):
-        before = (found or chain).response
+        before = (best or chain).response
         start = with_settings(before, drift_terms=terms)
         tried = fit_chain(start, bands, fitter, search=terms == 1)
         assert tried.response.drift is not None
         gain = held_out(before, tried.response, bands, fitter)
         sane = np.abs(tried.response.drift.stretch).max() < MAX_STRETCH
-        kept = bool(gain[0] - gain[1] > NEEDED and sane)
-        told = f"chi-square of held-out pulses {gain[0]:.0f} → {gain[1]:.0f}"
-        fitter.gains[DRIFT[terms]] = f"{'kept' if kept else 'left out'}; {told}"
-        if not kept:
+        gains = bool(gain[0] - gain[1] > NEEDED and sane)
+        text = f"chi-square of held-out pulses {gain[0]:.0f} → {gain[1]:.0f}"
+        fitter.gains[DRIFT[terms]] = f"{'gains' if gains else 'left out'}; {text}"
+        if not gains:
             break
-        found = tried
-    return found
+        best = tried
+    return best
 
 
 def _with_single_sites(
-    found: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: Fitter
+    learned: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: Fitter
 ) -> _Learned:
     """Fit the single sites of the continuum, too, unless the line then is bad.
 
     If the simulated drift is wrong, so are the charge clouds.  Nearly all pulses of a line have
-    many sites, whose clouds are not as large as that of one; the sharp peak of these tells.
+    many sites, whose clouds are smaller than those of single sites; their sharp peak decides.
     """
     if not (single := sets.single_sites()):
-        return found
-    start = copy.deepcopy(found.chain.response)
+        return learned
+    start = copy.deepcopy(learned.chain.response)
     chain = fit_chain(start, bands, fitter, search=False, single=single)
     tried = _learned(chain, bands, fitter)
-    used = tried.checks.good >= found.checks.good
+    used = tried.checks.good >= learned.checks.good
     fitter.gains[SINGLE] = f"{'used' if used else 'left out'}; {tried.checks}"
-    return tried if used else found
+    return tried if used else learned
 
 
 def held_out(
@@ -160,14 +160,14 @@ def held_out(
 ) -> list[float]:
     """Chi-square of two responses on either half of the pulses when fitted to the other."""
     halves = [[sides.some(slice(k, None, 2)) for sides in bands] for k in range(2)]
-    found = []
+    totals = []
     for response in (first, second):
         total = 0.0
         for fitted, held in (halves, halves[::-1]):
             again = fit_chain(copy.deepcopy(response), fitted, fitter, search=False)
             total += chi_square(again.response, held)[0]
-        found.append(total)
-    return found
+        totals.append(total)
+    return totals
 
 
 def described(
@@ -222,7 +222,7 @@ def described(
 def amplitude_shift(quantiles: Sequence[Difference]) -> tuple[float, float]:
     """Relative shift that the translated current amplitudes need, and its error.
 
-    It is the one that brings the quantiles of their logarithm closest to the data's.
+    It brings the quantiles of their logarithm closest to the data's.
     """
     weight = weighted = 0.0
     for difference in quantiles:

@@ -30,9 +30,9 @@ SHOWN = {
 FAR, FEW = 4.0, 5
 
 
-def correlations(one: DescribedChain) -> tuple[list[str], Values]:
+def correlations(chain: DescribedChain) -> tuple[list[str], Values]:
     """Names of the numbers of a chain that its fit determines, and their correlations."""
-    run, fit = one.run, one.run.fit
+    run, fit = chain.run, chain.run.fit
     if fit is None or not isinstance(run.recipe.generator, ResponseConfig):
         return [], np.zeros((0, 0))
     generator = run.fill("ren", ResponseGenerator(run.recipe.generator, run.dt_ns))
@@ -43,25 +43,27 @@ def correlations(one: DescribedChain) -> tuple[list[str], Values]:
         ]
         for pair in error_ends(generator.response, fit.covariance)
     ]
-    known = [n for n in one.errors if one.errors[n] and all(n in e for p in ends for e in p)]
-    moved = np.array([[0.5 * (a[n] - b[n]) for n in known] for a, b in ends])
-    moved = moved.reshape(len(ends), len(known))
+    names = [
+        n for n in chain.errors if chain.errors[n] and all(n in e for p in ends for e in p)
+    ]
+    moved = np.array([[0.5 * (a[n] - b[n]) for n in names] for a, b in ends])
+    moved = moved.reshape(len(ends), len(names))
     sizes = np.sqrt((moved**2).sum(axis=0))
-    known = [name for name, size in zip(known, sizes, strict=True) if size > 0]
+    names = [name for name, size in zip(names, sizes, strict=True) if size > 0]
     moved, sizes = moved[:, sizes > 0], sizes[sizes > 0]
-    return known, (moved.T @ moved) / np.outer(sizes, sizes)
+    return names, (moved.T @ moved) / np.outer(sizes, sizes)
 
 
 def as_yaml(chains: Mapping[str, DescribedChain]) -> str:
     """Value and error of each number, and correlations, by channel."""
     content = {}
-    for name, one in chains.items():
-        names, matrix = correlations(one)
+    for name, chain in chains.items():
+        names, matrix = correlations(chain)
         content[name] = {
-            "run": one.run.name,
-            "good": one.run.ok,
+            "run": chain.run.name,
+            "good": chain.run.ok,
             "numbers": {
-                n: {"value": v, "error": one.errors.get(n)} for n, v in one.values.items()
+                n: {"value": v, "error": chain.errors.get(n)} for n, v in chain.values.items()
             },
             "correlations": {"names": names, "matrix": matrix.round(4).tolist()},
         }
@@ -70,14 +72,14 @@ def as_yaml(chains: Mapping[str, DescribedChain]) -> str:
 
 def as_csv(chains: Mapping[str, DescribedChain]) -> str:
     """A line for each channel: each number with its error."""
-    names = list(dict.fromkeys(n for one in chains.values() for n in one.values))
+    names = list(dict.fromkeys(n for chain in chains.values() for n in chain.values))
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = [f"{name}{end}" for name in names for end in ("", "_error")]
     writer.writerow(["channel", "good", *columns])
-    for channel, one in chains.items():
-        cells = [of.get(n, "") for n in names for of in (one.values, one.errors)]
-        writer.writerow([channel, int(one.run.ok), *cells])
+    for channel, chain in chains.items():
+        cells = [of.get(n, "") for n in names for of in (chain.values, chain.errors)]
+        writer.writerow([channel, int(chain.run.ok), *cells])
     return stream.getvalue()
 
 
@@ -89,14 +91,14 @@ def outliers(values: Sequence[float | None], errors: Sequence[float | None]) -> 
     >>> outliers([1.0, 1.1, 0.9, 1.0, 1.05, 3.0], [0.01] * 6)
     [False, False, False, False, False, True]
     """
-    found = np.array([np.nan if value is None else value for value in values], float)
+    numbers = np.array([np.nan if value is None else value for value in values], float)
     own = np.array([error or 0.0 for error in errors])
-    known = found[np.isfinite(found)]
-    if known.size < FEW:
-        return [False] * len(found)
-    spread = np.hypot(median_abs_deviation(known, scale="normal"), own)
-    apart = np.abs(found - np.median(known))
-    return [bool(a > FAR * s) for a, s in zip(apart, spread, strict=True)]
+    finite = numbers[np.isfinite(numbers)]
+    if finite.size < FEW:
+        return [False] * len(numbers)
+    spread = np.hypot(median_abs_deviation(finite, scale="normal"), own)
+    distances = np.abs(numbers - np.median(finite))
+    return [bool(a > FAR * s) for a, s in zip(distances, spread, strict=True)]
 
 
 def array_page(chains: Mapping[str, DescribedChain]) -> str:
@@ -106,16 +108,16 @@ def array_page(chains: Mapping[str, DescribedChain]) -> str:
 
     columns: dict[str, list[tuple[str, bool]]] = {}
     for name, title in SHOWN.items():
-        values = [one.values.get(name) for one in chains.values()]
-        errors = [one.errors.get(name) for one in chains.values()]
+        values = [chain.values.get(name) for chain in chains.values()]
+        errors = [chain.errors.get(name) for chain in chains.values()]
         if any(value is not None for value in values):
             texts = [with_std(v, e) for v, e in zip(values, errors, strict=True)]
             columns[title] = list(zip(texts, outliers(values, errors), strict=True))
     rows: list[dict[str, Any]] = []
-    for i, (channel, one) in enumerate(chains.items()):
+    for i, (channel, chain) in enumerate(chains.items()):
         cells = [column[i] for column in columns.values()]
-        marked = sum(far for _, far in cells) + (not one.run.ok)
-        rows.append({"name": channel, "good": one.run.ok, "cells": cells, "marked": marked})
+        marked = sum(far for _, far in cells) + (not chain.run.ok)
+        rows.append({"name": channel, "good": chain.run.ok, "cells": cells, "marked": marked})
     rows.sort(key=lambda row: -row["marked"])
     marked = sum(bool(row["marked"]) for row in rows)
     title = f"Readouts of {len(rows)} channels: {marked} to look at"

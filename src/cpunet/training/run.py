@@ -5,7 +5,7 @@
 ``recipe.yaml``
     Every setting, resolved.
 ``losses.jsonl``
-    One line per iteration.
+    A line per iteration.
 ``weights.safetensors``
     The networks, names prefixed ``ren.``, ``iren.``, ``discriminator_*.``.
 """
@@ -153,13 +153,13 @@ class Run(InfoPart):
         path = folder / INFO
         if not path.is_file():
             raise CpunetError(
-                f"{folder}: no finished run (no {INFO}); make one with `cpunet train`"
+                f"{folder}: no finished run (no {INFO}); make it with `cpunet train`"
             )
         facts = read_json(path, "train again")
-        if (found := facts.pop("format", 0)) != FORMAT:
+        if (stored_format := facts.pop("format", 0)) != FORMAT:
             raise CpunetError(
-                f"{path}: of another version of cpunet (format {found}, not {FORMAT}); read it "
-                "with that one, or train again"
+                f"{path}: of another version of cpunet (format {stored_format}, not {FORMAT}); "
+                "read it with that, or train again"
             )
         recipe = checked(Recipe, read_values(folder / RECIPE), str(folder / RECIPE))
         try:
@@ -247,17 +247,17 @@ class Run(InfoPart):
     @property
     def tails(self) -> DrawnTails | None:
         """Pile-up tails under the data, with rate 0 if they have none for sure."""
-        told = None if self.fit is None else self.fit.tails
-        if told is None or told.drawn is None:
+        tails = None if self.fit is None else self.fit.tails
+        if tails is None or tails.drawn is None:
             return None
-        drawn = DrawnTails.of(told.drawn)
-        if told.rate_khz > 0:
+        drawn = DrawnTails.of(tails.drawn)
+        if tails.rate_khz > 0:
             return drawn
         return replace(drawn, law=replace(drawn.law, rate_khz=0.0))
 
     @cached_property
     def records(self) -> list[Record]:
-        """Records of the training's log; empty if there is none."""
+        """Records of the training's log; empty without a log."""
         return [] if self.folder is None else read_losses(self.folder)
 
     @cached_property
@@ -363,14 +363,14 @@ class Run(InfoPart):
     def _repr_html_(self) -> str:
         from cpunet.html_pages import notebook_picture, part
 
-        there = self.recipe.generator.name == "response" or self.records
-        picture = notebook_picture(self.plot()) if there else ""
+        drawable = self.recipe.generator.name == "response" or self.records
+        picture = notebook_picture(self.plot()) if drawable else ""
         return part("object", "cpunet run", rows=self.summary(), picture=picture)
 
 
 if TYPE_CHECKING:
     RunLike: TypeAlias = str | Path | Run
-else:  # which commands read: there, a run is its folder
+else:  # which commands read: for them, a run is its folder
     RunLike = str | Path
 
 
@@ -396,7 +396,7 @@ def arrays_of(part: Stored | nn.Module) -> dict[str, Array]:
 
 
 def differing(own: Mapping[str, Shaped], expected: Mapping[str, Shaped]) -> list[str]:
-    """Names of arrays that only one side has, or in another shape."""
+    """Names of arrays that only a single side has, or in another shape."""
     shapes = [{name: value.shape for name, value in side.items()} for side in (own, expected)]
     return sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()})
 
@@ -409,9 +409,9 @@ def resolve_device(device: str, recipe: Recipe) -> str:
     CpunetError
         If a device, or torch, is missing.
     """
-    known = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
-    if known is None:
-        raise CpunetError(f"device {device!r} is not known; use cpu, cuda or auto")
+    match = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
+    if match is None:
+        raise CpunetError(f"device {device!r} does not exist; use cpu, cuda or auto")
     if device == "cpu" or not recipe.networks:
         return "cpu"
     require_torch()
@@ -420,8 +420,8 @@ def resolve_device(device: str, recipe: Recipe) -> str:
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     if not torch.cuda.is_available():
-        raise CpunetError("no GPU was found; use `device` cpu or install a CUDA build of torch")
-    if known[1] and int(known[1]) >= torch.cuda.device_count():
+        raise CpunetError("no GPU; use `device` cpu or install a CUDA build of torch")
+    if match[1] and int(match[1]) >= torch.cuda.device_count():
         count = torch.cuda.device_count()
         raise CpunetError(f"device {device!r}: the last of {count} GPUs is cuda:{count - 1}")
     return device
@@ -429,11 +429,11 @@ def resolve_device(device: str, recipe: Recipe) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of the software that affects the result."""
-    found = {"python": platform.python_version(), "cpunet": cpunet.__version__}
+    numbers = {"python": platform.python_version(), "cpunet": cpunet.__version__}
     for name in ("numpy", "scipy", "numba", "torch"):
         with suppress(PackageNotFoundError):  # torch is needed by networks only
-            found[name] = version(name)
-    return found
+            numbers[name] = version(name)
+    return numbers
 
 
 def append_losses(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:

@@ -63,7 +63,7 @@ def train(
     seed
         Seed of all random numbers.
     device
-        cpu, cuda, or auto: the GPU if there is one.
+        cpu, cuda, or auto: the GPU if present.
     resume
         Resume OUT.unfinished; give all other options as before. Chains are fitted anew.
     read
@@ -75,13 +75,13 @@ def train(
     Returns
     -------
     Run or Outcome
-        The trained run; of all channels, each run or the reason why there is none. Its ``ok``
+        The trained run; of all channels, each run or the reason why it failed. Its ``ok``
         says whether its fit is good.
 
     Raises
     ------
     CpunetError
-        If the input cannot be used, the folder exists, there is an unfinished training of
+        If the input cannot be used, the folder exists, an unfinished training is of
         another kind, or the training diverges.
 
     Examples
@@ -114,7 +114,7 @@ def train(
     if sides[1].table != ALL:
         trained = trained_in(target, sides, **how)
     elif target is None:
-        raise CpunetError("`out`: runs of all channels are not kept in memory", "give a folder")
+        raise CpunetError("`out`: runs of all channels do not stay in memory", "give a folder")
     else:
         folders = each_channel(paired(*sides), target, partial(of_channel, **how))
         runs = {name: Run.load(folder) for name, folder in folders.done.items()}

@@ -70,7 +70,7 @@ def unfinished_folder(
 ) -> Iterator[Path]:
     """Provide ``OUT.unfinished`` as a working folder; its content at the end becomes `out`.
 
-    On an exception the folder is kept if it contains a checkpoint.
+    On an exception the folder stays if it contains a checkpoint.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def unfinished_folder(
     inputs
         Files and folders that are read.
     resume
-        Whether an unfinished training may exist; it is kept for `UnfinishedRun` to continue.
+        Whether an unfinished training may exist; it stays for `UnfinishedRun` to continue.
     force
         Replace an existing run folder, and allow an unfinished training to be replaced.
 
@@ -109,12 +109,12 @@ def unfinished_folder(
             with folder_written_aside(out, RUN, force=force) as whole:
                 copy_own(folder, whole, RUN)
         except CpunetError as error:
-            kept = "the training is kept, finish it with `resume`"
-            raise CpunetError(f"{error}; {kept}") from error
+            remedy = "the training is stored, finish it with `resume`"
+            raise CpunetError(f"{error}; {remedy}") from error
         checkpoint.unlink(missing_ok=True)
     except OSError as error:
         raise CpunetError(
-            f"{not_written(error, folder, folder)}; what is stored is kept, continue with "
+            f"{not_written(error, folder, folder)}; what is stored remains, continue with "
             "`resume`"
         ) from error
     finally:
@@ -156,7 +156,7 @@ class UnfinishedRun:
         return self._seconds_before + time.perf_counter() - self._clock
 
     def begin(self, *, resume: bool) -> State | None:
-        """Clear the folder, or find the state to continue from (None if there is none).
+        """Clear the folder, or find the state to continue from, or None.
 
         Raises
         ------
@@ -193,8 +193,8 @@ class UnfinishedRun:
             path.unlink(missing_ok=True)
         with (self.folder / LOSSES).open("ab") as stream:
             stream.truncate(self._logged)
-        told = {"started": self.started} | self._fingerprint | self._environment
-        (self.folder / MARKER).write_text(json.dumps(told, indent=2) + "\n")
+        facts = {"started": self.started} | self._fingerprint | self._environment
+        (self.folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n")
         return state
 
     def log(self, records: Iterable[Record]) -> None:
@@ -204,7 +204,7 @@ class UnfinishedRun:
             self.finish()
 
     def save(self, state: State) -> None:
-        """Store a checkpoint; if that fails, report it and keep the previous one."""
+        """Store a checkpoint; if that fails, report it and keep the previous checkpoint."""
         aside = self.folder / ASIDE
         try:
             self.finish()
@@ -228,7 +228,7 @@ class UnfinishedRun:
             aside.unlink(missing_ok=True)  # free the space on a full disk
             log.warning(
                 f"{self.folder}: no checkpoint after {state['iteration']} iterations "
-                f"({error.strerror or error}); the one before is kept"
+                f"({error.strerror or error}); the previous remains"
             )
 
     def finish(self) -> None:
@@ -265,7 +265,7 @@ def _short(value: Any) -> str:
 
 
 class Interruption:
-    """Ctrl-C and SIGTERM wait for the end of an iteration; a second one acts at once."""
+    """Ctrl-C and SIGTERM wait for the end of an iteration; a second signal acts at once."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -286,10 +286,10 @@ class Interruption:
         self.signal = number
         log.info("stopping after this iteration; once more to stop at once")
 
-    def act(self, told: str) -> None:
-        """Act now, if there was a signal and all is stored."""
+    def act(self, text: str) -> None:
+        """Act now, after a signal, if all is stored."""
         if self.signal:
-            log.info(told)
+            log.info(text)
             signal.raise_signal(self.signal)
 
 
@@ -304,7 +304,7 @@ def state_of(game: Any) -> State:
 
 
 def restore(game: Any, state: State | None) -> None:
-    """Continue a training of the same pulses and settings from a state, if there is one."""
+    """Continue a training of the same pulses and settings from a state, if any."""
     if state is None:
         return
     game.iteration, game.right = state["iteration"], dict(state["right"])

@@ -29,12 +29,12 @@ PARTS = {
     "onset": (
         -240.0,
         "electronics cannot cause this: the physics simulated are not those of the detector, "
-        "or it is another one; try: cpunet check; cpunet calibrate finds temperature and "
+        "or it is another detector; try: cpunet check; cpunet calibrate finds temperature and "
         "impurities",
     ),
     "edge": (
         240.0,
-        "a readout that is not linear, as one of limited slew rate, or other physics; try: "
+        "a readout that is not linear, as of limited slew rate, or other physics; try: "
         "cpunet train --peak FEP,1000-1580; cpunet calibrate",
     ),
     "top": (
@@ -65,7 +65,7 @@ class Verdict(InfoPart):
         Largest deviation of the mean pulse in its standard errors, and its time from the half
         height in ns.
     beyond_ns
-        First and last time beyond `MAX_Z`; empty if there is none.
+        First and last time beyond `MAX_Z`; empty if none is.
     auc, auc_null, auc_error
         Of the classifier, the same of shuffled labels, and the standard deviation of that.
     off
@@ -89,7 +89,7 @@ class Verdict(InfoPart):
 
     @property
     def distinguished(self) -> bool:
-        """Whether the classifier tells the two sides apart."""
+        """Whether the classifier distinguishes the two sides."""
         return self.auc > max(MAX_AUC, self.auc_null + SURE * self.auc_error)
 
     @property
@@ -100,7 +100,7 @@ class Verdict(InfoPart):
 
     @property
     def clear(self) -> bool:
-        """Whether nothing asks for more than is there."""
+        """Whether nothing asks for more parameters."""
         near = self.chi_square - 1 < CLEAR * (MAX_CHI_SQUARE - 1)
         near &= self.amplitude - 1 < CLEAR * (MAX_AMPLITUDE - 1)
         return self.good and near and abs(self.z) < (1 - CLEAR) * MAX_Z
@@ -108,15 +108,15 @@ class Verdict(InfoPart):
     @property
     def causes(self) -> list[str]:
         """What is off, why that may be, and what to try, worst first; a wrong onset leads."""
-        told = []
+        causes = []
         for part in sorted(self.off, key=lambda part: (part != "onset", -self.off[part])):
             size = _size(self.off[part])
-            told.append(f"the {part} is off by {size}: {PARTS[part][1]}")
+            causes.append(f"the {part} is off by {size}: {PARTS[part][1]}")
         if self.amplitude > MAX_AMPLITUDE:
-            told.append(OTHER_MIXTURE)
-        if not told and not self.good:
-            told.append("pulses differ from each other otherwise than simulated")
-        return told
+            causes.append(OTHER_MIXTURE)
+        if not causes and not self.good:
+            causes.append("pulses differ from each other otherwise than simulated")
+        return causes
 
     def __str__(self) -> str:
         size = _size(abs(self.z))
@@ -142,7 +142,7 @@ class FitInfo(InfoPart):
     checks
         What every sample says.
     verdict
-        The same in a sentence, with how well the current amplitude is known.
+        The same in a sentence, with the error of the current amplitude.
     chi_square, moments, steps
         Chi-square of all that is compared, how much that is, and the steps of all fits.
     parameters
@@ -157,7 +157,7 @@ class FitInfo(InfoPart):
     gains
         What held-out pulses say of each part that was tried.
     bands, in_no_band
-        Energies compared, with the pulses of each side; pulses of energies that one side lacks.
+        Energies compared, with the pulses of each side; pulses of energies that a side lacks.
     data_left_out
         Number of measured pulses excluded: those with a piled-up pulse, or without a baseline.
     amplitude_shift, amplitude_shift_error
@@ -209,22 +209,22 @@ def _size(z: float) -> str:
 
 def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
     """Compare translated and measured pulses of all bands; the worst of each counts."""
-    found = [_of_band(response, sides) for sides in bands]
-    worst = max(found, key=lambda one: abs(one.z))
-    apart = max(found, key=lambda one: one.auc - one.auc_null)
+    verdicts = [_of_band(response, sides) for sides in bands]
+    worst = max(verdicts, key=lambda each: abs(each.z))
+    distinct = max(verdicts, key=lambda each: each.auc - each.auc_null)
     off: dict[str, float] = {}
-    for one in found:
-        off |= {part: max(size, off.get(part, 0.0)) for part, size in one.off.items()}
+    for each in verdicts:
+        off |= {part: max(size, off.get(part, 0.0)) for part, size in each.off.items()}
     return worst.model_copy(
         update={
-            "chi_square": max(one.chi_square for one in found),
-            "amplitude": max(one.amplitude for one in found),
-            "auc": apart.auc,
-            "auc_null": apart.auc_null,
-            "auc_error": apart.auc_error,
+            "chi_square": max(each.chi_square for each in verdicts),
+            "amplitude": max(each.amplitude for each in verdicts),
+            "auc": distinct.auc,
+            "auc_null": distinct.auc_null,
+            "auc_error": distinct.auc_error,
             "off": off,
-            "pulses": np.sum([one.pulses for one in found], axis=0).tolist(),
-            "left_out": sum(one.left_out for one in found),
+            "pulses": np.sum([each.pulses for each in verdicts], axis=0).tolist(),
+            "left_out": sum(each.left_out for each in verdicts),
         }
     )
 
@@ -248,8 +248,12 @@ def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
         both = sides.data, translated
         more = [{"log": of.log_amplitude, "rise": of.rise} for of in both]
         pulses = (of.pulses for of in both)
-        told = classifier_auc(*pulses, seed=0, features=(more[0], more[1]))
-        auc = {"auc": told.auc, "auc_null": told.null_mean, "auc_error": told.null_std}
+        classified = classifier_auc(*pulses, seed=0, features=(more[0], more[1]))
+        auc = {
+            "auc": classified.auc,
+            "auc_null": classified.null_mean,
+            "auc_error": classified.null_std,
+        }
     return Verdict(
         chi_square=float(np.median([d.chi_square for d in differences if d.sliced])),
         amplitude=next(d.chi_square for d in differences if d.name == f"{AMPLITUDE} quantiles"),
