@@ -74,7 +74,7 @@ def test_priors_are_the_defaults_or_those_given():
 def test_what_is_not_known_or_possible_is_refused():
     with pytest.raises(CpunetError, match="no such parameter of the physics; there are temp"):
         named("colour")
-    with pytest.raises(CpunetError, match="with li_thickness_mm = 5 there can be none"):
+    with pytest.raises(CpunetError, match="li_thickness_mm = 5 is impossible"):
         Physics(
             PHYSICS.detector.model_copy(update={"bore_length": 90.0, "li_thickness": 3.0}),
             PHYSICS.settings,

@@ -199,7 +199,7 @@ MISTAKES = {
     # machine
     "no GPU": Mistake(
         f"{TRAIN} --recipe paper --device cuda",
-        r"no GPU was found; use --device cpu or install .*",
+        r"no GPU; use --device cpu or install .*",
         lambda patch: patch.setattr("torch.cuda.is_available", lambda: False),
     ),
     "no memory": Mistake(

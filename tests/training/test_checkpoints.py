@@ -196,7 +196,7 @@ def test_a_full_disk_does_not_stop_the_training(recipe, tmp_path, whole, caplog)
     work(recipe, out, disk=3000)
     (note,) = caplog.messages
     assert note.startswith(f"{beside(out)}: no checkpoint after 4 iterations (")
-    assert note.endswith("; the one before is kept")
+    assert note.endswith("; the previous remains")
     assert content(out) == whole
 
 

@@ -82,7 +82,7 @@ def test_devices(monkeypatch):
     assert resolve_device("cpu", RECIPE) == "cpu"
     assert resolve_device("auto", RECIPE) in ("cpu", "cuda")
     for name in ("gpu", "", "CPU", "mps", "cudas", "cuda:-1", "cuda:"):
-        with pytest.raises(CpunetError, match="is not known; use cpu, cuda or auto"):
+        with pytest.raises(CpunetError, match="does not exist; use cpu, cuda or auto"):
             resolve_device(name, RECIPE)
     assert resolve_device("cuda", load_recipe("fast")) == "cpu"  # chains are NumPy
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

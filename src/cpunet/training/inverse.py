@@ -1,8 +1,8 @@
 """The inverse of a fitted readout chain, in closed form.
 
 A response translates any number of simulated pulses, so that charge and record of each are
-given, and so is the spectrum of its noise.  The linear map with the minimum mean square error
-(LMMSE) then follows from covariances.  The covariance of the noise is calculated: noise drawn at
+given, and so is the spectrum of its noise.  The linear map of least mean square error (LMMSE)
+then follows from covariances.  The covariance of the noise is calculated: noise drawn at
 random would be mistaken for signal unless it was drawn many times for each pulse.
 """
 
