@@ -33,7 +33,7 @@ from scipy.special import expit
 
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
 from cpunet.training.aligned import Values
-from cpunet.training.chain_parameters import SmoothParameters
+from cpunet.training.chain_parameters import SmoothParameters, with_settings
 from cpunet.training.comparison import MOST, NONE, Comparison, Moved, Sides, Spectrum
 from cpunet.training.derivatives import Basis
 from cpunet.training.joint import Joint
@@ -260,11 +260,7 @@ def with_deviations(
     """
     padded, frame = bands[0].padded, bands[0].frame
     knots = Knots(response, padded)
-    own = ElectronicsResponse(
-        response.config.model_copy(update={"deviations": True}), float(response.dt_ns)
-    )
-    own.fill(own.arrays() | response.arrays())
-    own.decay_known = response.decay_known
+    own = with_settings(response, deviations=True)
     basis = Basis(int(knots.lags[0]), knots.between)
     inside = (knots.lags >= frame.level[0]) & (knots.lags < frame.level[1])
     gauge = knots.between[inside].mean(axis=0)
@@ -312,12 +308,10 @@ def with_deviations(
         return Deviated(response, first)
     own.set_deviation(knots.between @ place)
     modes = _modes(information, covariance)
-    moves = Basis(basis.first, knots.between @ modes)
-    place = place + modes @ _with_amplitude(own, [side.of(MOST) for side in bands], moves)
+    whole, along = [side.of(MOST) for side in bands], Basis(basis.first, knots.between @ modes)
+    place = place + modes @ _with_amplitude(own, whole, along)
     own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))
-    root = np.linalg.cholesky(covariance)
-    sizes, axes = np.linalg.eigh(root.T @ problem.information @ root)
-    return Deviated(own, first, knots.between @ root @ axes[:, sizes > 1])
+    return Deviated(own, first, knots.between @ _determined(problem.information, covariance))
 
 
 def _modes(information: Values, covariance: Values) -> Values:
@@ -326,6 +320,13 @@ def _modes(information: Values, covariance: Values) -> Values:
     inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ information @ root)
     left, widths, _ = np.linalg.svd(root @ scipy.linalg.inv(inner).T)
     return np.asarray(left[:, :MODES] * widths[:MODES])
+
+
+def _determined(information: Values, covariance: Values) -> Values:
+    """Directions of unit prior variance that the pulses determine, (knots, modes)."""
+    root = np.linalg.cholesky(covariance)
+    sizes, axes = np.linalg.eigh(root.T @ information @ root)
+    return np.asarray(root @ axes[:, sizes > 1])
 
 
 def _with_amplitude(own: ElectronicsResponse, bands: Sequence[Sides], modes: Basis) -> Values:

@@ -112,6 +112,61 @@ def _largest_step(sides: Sides, translated: tuple[Floats, Floats]) -> float:
     return float(np.quantile(steps, 0.99))
 
 
+class Unknowns:
+    """Coordinates of a chain, then of the follower and of the curve behind it."""
+
+    def __init__(self, own: ElectronicsResponse) -> None:
+        assert own.by_height is not None
+        self.own, self.by_height, self.chain = own, own.by_height, SmoothParameters(own)
+        self.n, self.lag = len(self.chain.centre), np.arange(1, LAG_KNOTS) / PER_STEP
+        curve = np.arange(1, CURVE_KNOTS - 1)
+        self.near = np.exp(-0.5 * ((curve[:, np.newaxis] - curve) / NEAR) ** 2)
+        others = np.full(len(self.lag), LAG_STEP), np.full(len(curve), CURVE_STEP)
+        self.steps = np.concatenate([PART * self.chain.widths, *others])
+        self.centre = np.r_[self.chain.centre, np.zeros(len(self.steps) - self.n)]
+        self.place = np.r_[self.chain.vector(), self.by_height.vector]
+
+    def covariance(self, of_lag: float, of_curve: float) -> Values:
+        """Of the priors."""
+        return np.asarray(
+            scipy.linalg.block_diag(
+                np.diag(self.chain.widths**2),
+                of_lag * np.minimum.outer(self.lag, self.lag),
+                of_curve**2 * (self.near + 1e-4 * np.eye(len(self.near))),
+            )
+        )
+
+    def put(self, vector: Values) -> None:
+        """Set chain, follower and curve."""
+        self.chain.set(vector[: self.n])
+        self.by_height.set(vector[self.n :])
+
+    def moves(self, sides: Sides, aligned: Aligned) -> Moves:
+        """Derivatives at the place."""
+        moved, (clean, heights) = [], sides.translated(self.own.transfer(sides.padded))
+        for i, step in enumerate(self.steps):
+            self.put(self.place + step * (np.arange(len(self.place)) == i))
+            if i < self.n:
+                new, of = sides.translated(self.own.transfer(sides.padded))
+                moved.append(sides.read(sides.noise.add(new, 0), of))
+            else:
+                moved.append(sides.read(sides.noise.add(clean, 0), heights))
+        self.put(self.place)
+        return Moves(sides, aligned, moved, self.steps)
+
+    def limited(self, cost: Callable[[], float]) -> bool:
+        """Go to the slew rate of the least cost; far from it, pulses are not linear in it."""
+        rates = [np.log(self.lag / limit / np.tanh(self.lag / limit)) for limit in LIMITS]
+        costs = [cost()]
+        for rate in rates:
+            self.by_height.lag[1:] = rate
+            costs.append(cost())
+        if best := int(np.argmin(costs)):
+            self.place[self.n : self.n + len(self.lag)] = rates[best - 1]
+        self.put(self.place)
+        return best > 0
+
+
 def _solve(
     own: ElectronicsResponse,
     bands: Sequence[Sides],
@@ -123,93 +178,60 @@ def _solve(
 
     Returns the covariance of the chain's parameters.
     """
-    by_height, parameters, padded = own.by_height, SmoothParameters(own), bands[0].padded
-    assert by_height is not None
-    n = len(parameters.centre)
-    lag, curve = np.arange(1, LAG_KNOTS) / PER_STEP, np.arange(1, CURVE_KNOTS - 1)
-    near = np.exp(-0.5 * ((curve[:, np.newaxis] - curve) / NEAR) ** 2)
+    unknowns, padded = Unknowns(own), bands[0].padded
+    best, damping, last = (LAGS[-1], CURVES[-1]), FIRST, width == STAGES[-1][1]
+    precision = np.linalg.inv(unknowns.covariance(*best))
+    compared = [Comparison(sides, width, least) for sides in bands]
+    problem = Linearised(compared, unknowns.moves)
 
-    def covariance(of_lag: float, of_curve: float) -> Values:
-        return np.asarray(
-            scipy.linalg.block_diag(
-                np.diag(parameters.widths**2),
-                of_lag * np.minimum.outer(lag, lag),
-                of_curve**2 * (near + 1e-4 * np.eye(len(curve))),
-            )
-        )
+    def cost_at(place: Values, anew: bool = False) -> float:
+        unknowns.put(place)
+        return problem.evaluate(own.transfer(padded), place, anew=anew)
 
-    best = LAGS[-1], CURVES[-1]
-    precision = np.linalg.inv(covariance(*best))
-    centre = np.r_[parameters.centre, np.zeros(len(lag) + len(curve))]
-    steps = np.r_[
-        PART * parameters.widths,
-        np.full(len(lag), LAG_STEP),
-        np.full(len(curve), CURVE_STEP),
-    ]
-    place = np.r_[parameters.vector(), by_height.vector]
+    def of_prior(place: Values) -> float:
+        offset = place - unknowns.centre
+        return float(offset @ precision @ offset)
 
-    def put(vector: Values) -> None:
-        parameters.set(vector[:n])
-        by_height.set(vector[n:])
-
-    def moves(sides: Sides, aligned: Aligned) -> Moves:
-        moved, (clean, heights) = [], sides.translated(own.transfer(padded))
-        for i, step in enumerate(steps):
-            put(place + step * (np.arange(len(place)) == i))
-            if i < n:
-                new, of = sides.translated(own.transfer(padded))
-                moved.append(sides.read(sides.noise.add(new, 0), of))
-            else:
-                moved.append(sides.read(sides.noise.add(clean, 0), heights))
-        put(place)
-        return Moves(sides, aligned, moved, steps)
-
-    problem = Linearised([Comparison(sides, width, least) for sides in bands], moves)
-    damping, last = FIRST, width == STAGES[-1][1]
     for _ in range(STEPS):
-        cost = problem.evaluate(own.transfer(padded), place, anew=True)
+        place = unknowns.place
+        cost = cost_at(place, anew=True)
+        right = problem.right
         if last:  # near enough that the evidence says how much of each is needed
-            start = problem.right - problem.information @ centre
+            start = right - problem.information @ unknowns.centre
             evidence = {
-                choice: posterior(problem.information, start, covariance(*choice)).evidence
+                choice: posterior(
+                    problem.information, start, unknowns.covariance(*choice)
+                ).evidence
                 for choice in product(LAGS, CURVES)
             }
             best = max(evidence, key=lambda choice: evidence[choice])
-            precision = np.linalg.inv(covariance(*best))
-        offset = place - centre
-        cost += float(offset @ precision @ offset)
+            precision = np.linalg.inv(unknowns.covariance(*best))
+        cost += of_prior(place)
         count(cost)
-        information, right = problem.information + precision, problem.right
-        right = right + precision @ centre - information @ place
-        if not by_height.lag.any():  # far from here, pulses are not linear in a slew rate
-            costs = [cost]
-            for limit in LIMITS:
-                by_height.lag[1:] = np.log(lag / limit / np.tanh(lag / limit))
-                costs.append(problem.evaluate(own.transfer(padded), place, anew=False))
-            if nearest := int(np.argmin(costs)):
-                limit = LIMITS[nearest - 1]
-                place[n : n + len(lag)] = np.log(lag / limit / np.tanh(lag / limit))
-                put(place)
-                continue
+        information = problem.information + precision
+        right = right + precision @ unknowns.centre - information @ place
+        if not unknowns.by_height.lag.any() and unknowns.limited(
+            lambda: problem.evaluate(own.transfer(padded), unknowns.place, anew=False)
+        ):
+            continue
         for _ in range(TRIES):
             scale = damping * np.diag(information.diagonal())
-            move = np.linalg.solve(information + scale, right)
-            put(place + move)
-            offset = place + move - centre
-            new = problem.evaluate(own.transfer(padded), place + move, anew=False)
-            if (new := new + float(offset @ precision @ offset)) < cost:
+            tried = place + np.linalg.solve(information + scale, right)
+            new = cost_at(tried) + of_prior(tried)
+            if new < cost:
                 break
             damping *= 10
         else:
-            put(place)
+            unknowns.put(place)
             break
-        place, damping = place + move, 0.1 * damping
+        unknowns.place, damping = tried, 0.1 * damping
         if cost - new < SETTLED:
             break
     if best[0] == LAGS[0]:
-        by_height.lag[:] = 0
+        unknowns.by_height.lag[:] = 0
     if best[1] == CURVES[0]:
-        by_height.curve[:] = 0
+        unknowns.by_height.curve[:] = 0
+    n, chain = unknowns.n, unknowns.chain
     of_chain = SHARED**2 * np.linalg.inv(problem.information + precision)[:n, :n]
-    prior = np.diag(parameters.widths**-2.0)
-    return parameters.covariance(np.linalg.inv(of_chain) - prior)
+    prior = np.diag(chain.widths**-2.0)
+    return chain.covariance(np.asarray(np.linalg.inv(of_chain) - prior))
