@@ -76,7 +76,7 @@ def test_only_physics_that_explain_the_pulses_as_well_are_fitted():
     found = Search.__new__(Search)
     found.chosen = False
     found.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
-    found._moved = lambda nearby, move, _: SimpleNamespace(centre=nearby.centre + move)
+    found._moved = lambda nearby, move, *_: SimpleNamespace(centre=nearby.centre + move)
     found._problem = problem
     here = problem("chain", SimpleNamespace(centre=np.array([1.0, 0, 0])), [0])
     (only,) = found._alternatives(here, selection)

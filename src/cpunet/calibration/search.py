@@ -216,8 +216,13 @@ class Search:
         information, selection = self._looked(problem)
         return [self._first[i] for i in selection.begin(information)]
 
-    def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
-        """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
+    def _moved(
+        self, nearby: Nearby, moved: Values, free: Sequence[int], reaches: float = 1.0
+    ) -> Nearby:
+        """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach.
+
+        Derivatives are simulated again beyond so many reaches.
+        """
         nuisances = self.simulator.physics.nuisances
         farthest = FARTHEST * np.array([nuisance.reach for nuisance in nuisances])
         move = np.clip(moved, -farthest, farthest)
@@ -233,7 +238,7 @@ class Search:
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
                 "that cannot be simulated; narrow a `prior`, or leave a parameter out of `free`"
             )
-        outdated = place.outdated(free, farthest / FARTHEST)
+        outdated = place.outdated(free, reaches * farthest / FARTHEST)
         return place.again(outdated) if outdated else place
 
     def _needed(self, problem: JointProblem) -> int | None:
@@ -301,7 +306,7 @@ class Search:
             try:
                 for _ in range(OTHER_ROUNDS):
                     move = np.where(is_free, place, 0) - nearby.centre
-                    nearby = self._moved(nearby, move, other)
+                    nearby = self._moved(nearby, move, other, np.inf)
                     chain = fit.parameters.chain.response
                     fit = self._problem(chain, nearby, other, weights=problem.weights)
                     minimum = fit.fitted()
