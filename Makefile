@@ -54,6 +54,7 @@ resolve: install
 
 # site/index.html, which needs no network; a warning is an error
 docs: install-dev
+	$(BIN)/python docs/hooks/diagrams.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 # versions and digests of all that is installed, for this Python and system

@@ -23,14 +23,14 @@ def main() -> None:
         u = rng.random((3, 6 * HITS))
         r, z = detector.crystal_radius * np.sqrt(u[0]), detector.crystal_length * u[1]
         x, y = r * np.cos(2 * np.pi * u[2]), r * np.sin(2 * np.pi * u[2])
-        places = np.stack([x, y, z])[:, detector.active(r, z)][:, :HITS]
+        x, y, z = np.stack([x, y, z])[:, detector.active(r, z)][:, :HITS]
         for dt in (1, 16):
             largest, duration = {}, {}
             for constant in CONSTANTS:
                 settings = SimulationSettings(
                     dt_ns=dt, length_ns=4000, diffusion_constant=constant
                 )
-                pulses = hit_signals(fields, *places, np.full(HITS, 1592.0), settings)
+                pulses = hit_signals(fields, x, y, z, np.full(HITS, 1592.0), settings)
                 rises = np.diff(pulses.waveforms[pulses.valid], prepend=0)
                 largest[constant] = rises.max(axis=1)
                 duration[constant] = np.median(pulses.cloud_fwhm_ns[pulses.valid])

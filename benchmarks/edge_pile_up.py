@@ -34,7 +34,8 @@ NEAR = 3  # samples of a moving average of the current
 def edges_of(windows: npt.NDArray[np.float32]) -> Values:
     """Edges around half maximum, of pulses scaled to unit height."""
     height = np.sort(windows, axis=1)[:, -20:].mean(axis=1, keepdims=True)
-    return np.nan_to_num(np.asarray(align_half_maximum(windows / height, BEFORE, AFTER), float))
+    aligned: Values = align_half_maximum(windows / height, BEFORE, AFTER).astype(float)
+    return np.asarray(np.nan_to_num(aligned))
 
 
 def distances(edges: Values, others: Values) -> Values:
@@ -43,9 +44,9 @@ def distances(edges: Values, others: Values) -> Values:
     _, _, axes = np.linalg.svd(others - mean, full_matrices=False)
     axes = axes[:COMPONENTS]
     mine, theirs = (edges - mean) @ axes.T, (others - mean) @ axes.T
-    beside = ((edges - mean) ** 2).sum(axis=1) - (mine**2).sum(axis=1)
+    remainder = ((edges - mean) ** 2).sum(axis=1) - (mine**2).sum(axis=1)
     square = (mine**2).sum(axis=1)[:, None] - 2 * mine @ theirs.T + (theirs**2).sum(axis=1)
-    return np.sqrt(np.maximum(square.min(axis=1) + beside, 0) / edges.shape[1])
+    return np.asarray(np.sqrt(np.maximum(square.min(axis=1) + remainder, 0) / edges.shape[1]))
 
 
 def second_maxima(edges: Values) -> Values:
@@ -99,7 +100,7 @@ def main() -> None:
             "nearest": distances(edges, others) * energy,
             "second maximum": second_maxima(edges),
         }
-        piled = known["flag"] & PILE_UP > 0
+        piled = known["flag"].astype(int) & PILE_UP > 0
         inside = piled
         if "piled_ns" in known:
             with np.errstate(invalid="ignore"):

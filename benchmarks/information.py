@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.electronics.measured import noise_of
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -63,7 +64,7 @@ def off(translated: np.ndarray, wanted: np.ndarray) -> float:
 
 
 def experiment(
-    run: Path, sim: Pulses, windows: np.ndarray, noise
+    run: Path, sim: Pulses, windows: np.ndarray, noise: BaselineNoise
 ) -> tuple[Pulses, Pulses, np.ndarray]:
     """Half of the pulses, the others with a known response as data, and true amplitudes."""
     half, config = len(sim) // 2, RECIPE.preparation

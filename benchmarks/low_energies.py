@@ -13,6 +13,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.parameters import Values, current_amplitude
@@ -33,10 +34,8 @@ def main() -> None:
     given = arguments.parse_args()
     run = Run.load(given.run)
     ren, recipe, selection = REN.of(run), run.recipe, parse_selection("100-1000", {})
-    sim, data = (
-        load_pulses(PulseFile(given.stand / f"{name}.lh5"), side, recipe, selection)
-        for name, side in (("sim", "simulated"), ("data", "measured"))
-    )
+    sim = load_pulses(PulseFile(given.stand / "sim.lh5"), "simulated", recipe, selection)
+    data = load_pulses(PulseFile(given.stand / "data.lh5"), "measured", recipe, selection)
     noise = fit_baseline_methods(sim, data, selection, recipe, tails=ren.tails, fitted=False)
     known = true_responses(given.stand / "truth.npz", sim)
     noisy = translate_all(ren, noise, sim, data, known, SEED)
@@ -47,7 +46,7 @@ def main() -> None:
     level = recipe.preparation.tail_level
     print(f"{'keV':<12}{'translated':>12}{'bad windows':>13}{'A ratio':>10}{'of truth':>10}")
 
-    def high(name: str, without: Values, rows: Values) -> float:
+    def high(name: str, without: Values, rows: npt.NDArray[np.bool_]) -> float:
         return float(np.nanquantile((noisy.amplitudes[name] / without)[rows], 0.95))
 
     for low, top in RANGES:

@@ -33,9 +33,11 @@ def p_values(folder: Path, stands: int) -> dict[str, dict[str, list[float]]]:
             place = folder / f"stand{seed}"
             stand = cpunet.make_stand(place, events=EVENTS, seed=seed, force=True)
             run = cpunet.train(stand.sim, stand.data)
+            assert isinstance(run, cpunet.Run)
             report = cpunet.validate(
                 run, stand.sim, stand.data, truth=stand.truth, baselines=False, seed=seed
             )
+            assert isinstance(report, cpunet.Report)
             file.write_text(json.dumps(report.metrics))
         metrics = json.loads(file.read_text())
         for method in ("truth", "ren"):

@@ -14,14 +14,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numba
 import numpy as np
+import numpy.typing as npt
 
+from cpunet.kernels import kernel
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.drift import FWHM_PER_SIGMA, cloud_after_step, repulsion_constant
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.velocity import HOLE, carrier_velocity, velocity_table
 
+Values = npt.NDArray[np.float64]
 ENERGIES_KEV = (100, 200, 400, 700, 1000, 1400, 2000)
 FIELD, DRIFT_NS, STEP_NS, BODIES, CLOUD_MM = 800.0, 600.0, 2.0, 300, 0.1
 # Strengths relative to siggen's, between which its effect is interpolated.
@@ -40,8 +42,8 @@ MOBILITY, SLOPE = SPEED / FIELD, (speed(FIELD + 20) - speed(FIELD - 20)) / 40
 DIFFUSION = 0.12 * MOBILITY  # mm2/ns
 
 
-@numba.njit
-def drifted(places, each, rng):
+@kernel
+def drifted(places: Values, each: float, rng: np.random.Generator) -> Values:
     """Places of equal charges of `each` V mm2/cm after the drift."""
     n, spread = len(places), np.sqrt(2 * DIFFUSION * STEP_NS)
     for _ in range(int(DRIFT_NS / STEP_NS)):
@@ -64,16 +66,16 @@ def drifted(places, each, rng):
     return places
 
 
-def log_amplitude(z, weights, sigma):
+def log_amplitude(z: Values, weights: Values, size: Values | float) -> float:
     """Logarithm of the maximum current of clouds that arrive one after the other."""
-    width = np.sqrt(sigma**2 + (30 * SPEED) ** 2) * np.ones(len(z))
+    width = np.sqrt(size**2 + (30 * SPEED) ** 2) * np.ones(len(z))
     at = np.average(z, weights=weights) + np.linspace(-1.5, 1.5, 121)
     current = (weights / width * np.exp(-0.5 * ((at[:, None] - z) / width) ** 2)).sum(axis=1)
-    return np.log(current.max() / weights.sum())
+    return float(np.log(current.max() / weights.sum()))
 
 
-@numba.njit
-def sigma(repulsion):
+@kernel
+def sigma(repulsion: Values) -> Values:
     """Widths (mm) of clouds that grow by siggen's law, for their repulsion constants."""
     found, diffusion = np.empty(len(repulsion)), DIFFUSION / MOBILITY * FWHM_PER_SIGMA**2
     for i in range(len(repulsion)):
@@ -86,16 +88,16 @@ def sigma(repulsion):
     return found
 
 
-def of_hits(places, energy, merging, near=0.0):
+def of_hits(places: Values, energy: Values, merging: float, near: float = 0.0) -> list[float]:
     """ln A by strength, of hits that repel with the energy within `near` mm, or their own."""
     hits = cluster_hits(Hits.of(places, energy, [0, len(energy)]), merging)
-    apart = np.linalg.norm(hits.position_mm[:, None] - hits.position_mm, axis=2)
-    charge = (hits.edep_kev * (apart <= near)).sum(axis=1)
+    distance = np.linalg.norm(hits.position_mm[:, None] - hits.position_mm, axis=2)
+    charge = (hits.edep_kev * (distance <= near)).sum(axis=1)
     widths = [sigma(strength * repulsion_constant(1.0) * charge) for strength in STRENGTHS]
     return [log_amplitude(hits.z_mm, hits.edep_kev, width) for width in widths]
 
 
-MODELS = {
+MODELS: dict[str, tuple[float, ...]] = {
     "own charge, merged within 0.05 mm": (0.05,),
     "own charge, merged within 0.2 mm": (0.2,),
     "own charge, merged within 1 mm": (1.0,),
@@ -142,8 +144,8 @@ def main() -> None:
             energies.append(total[t] / 1000)
     mev, points, models = np.array(energies), 100 * np.array(bodies), 100 * np.array(clouds)
 
-    def per_mev(values):
-        return np.polyfit(mev, values, 1)[0]
+    def per_mev(values: Values) -> float:
+        return float(np.polyfit(mev, values, 1)[0])
 
     effect = points[:, 1] - points[:, 0]
     print(f"{len(mev)} tracks; point charges: ln A {per_mev(points[:, 1]):+.3f} % per MeV, ")

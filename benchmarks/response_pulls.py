@@ -20,6 +20,7 @@ def main() -> None:
     found: dict[str, list[float]] = {}
     for stand in parser.parse_args().stands:
         run = cpunet.train(f"{stand}/sim.lh5", f"{stand}/data.lh5")
+        assert isinstance(run, cpunet.Run)
         for name, sigma in cpunet.response(run, truth=stand).sigma.items():
             found.setdefault(name, []).append(sigma)
     for name, values in found.items():

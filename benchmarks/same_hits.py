@@ -47,7 +47,7 @@ def moments(waveforms: npt.NDArray[np.float32], dt_ns: float) -> npt.NDArray[np.
 def _crossing(smooth: npt.NDArray[np.float64], level: float) -> npt.NDArray[np.float64]:
     before, n = (smooth < level).sum(axis=1) - 1, np.arange(len(smooth))
     low, high = smooth[n, before], smooth[n, before + 1]
-    return before + (level - low) / (high - low)
+    return np.asarray(before + (level - low) / (high - low))
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ import numpy as np
 from cpunet.outputs import written_aside
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
+from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.validation.evaluation import evaluate
 
@@ -41,8 +42,9 @@ def one_seed(
     truth = stand / "truth.npz"
     with tempfile.TemporaryDirectory() as folder:
         before = time.process_time()
-        how = {"recipe": load_recipe(recipe, overrides), "seed": seed}
-        run = train(*files, Path(folder) / "run", **how)
+        settings = load_recipe(recipe, overrides)
+        run = train(*files, Path(folder) / "run", recipe=settings, seed=seed)
+        assert isinstance(run, Run)
         cpu = time.process_time() - before
         known = truth if truth.exists() and sim == stand else None
         drawn = [

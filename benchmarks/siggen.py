@@ -6,11 +6,9 @@ Run with ``python benchmarks/siggen.py FOLDER``, the folder that holds ``siggen/
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.fields import FieldMaps, compute_fields
@@ -18,7 +16,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
 
-Array = npt.NDArray[np.float64]
 PLAIN = SimulationSettings(
     dt_ns=1, library_step_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0
 )
@@ -27,28 +24,30 @@ CLOUD = PLAIN.model_copy(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class StoredMaps:
-    grid_mm: float
-    potential_V: Array
-    e_r_V_per_cm: Array
-    e_z_V_per_cm: Array
-    weighting_potential: Array
-    region: npt.NDArray[np.int8]
-    temperature_K: float = 90.0
-
-
-def stored_maps(folder: Path) -> StoredMaps:
+def stored_maps(folder: Path) -> FieldMaps:
     """Every fifth node of the reference's 0.1 mm solution."""
     with np.load(folder / "maps_A_outertaper.npz") as maps:
-        names = ("V_01", "Er_01", "Ez_01", "WP_01", "point_type")
-        return StoredMaps(0.5, *(maps[name] for name in names))
+        n_r, n_z = maps["V_01"].shape
+        return FieldMaps(
+            r_mm=np.linspace(0, 0.5 * (n_r - 1), n_r),
+            z_mm=np.linspace(0, 0.5 * (n_z - 1), n_z),
+            grid_mm=0.5,
+            potential_V=maps["V_01"],
+            e_r_V_per_cm=maps["Er_01"],
+            e_z_V_per_cm=maps["Ez_01"],
+            weighting_potential=maps["WP_01"],
+            region=maps["point_type"],
+            temperature_K=90.0,
+            capacitance_pF=np.nan,
+            depletion_V=np.nan,
+        )
 
 
 def compare(folder: Path, fields: FieldMaps) -> None:
     with np.load(folder / "waveforms_plain_A_outertaper_grid0.1.npz") as plain:
         expected = plain["wf1"]
-        found = hit_signals(fields, *plain["positions"].T, 100.0, PLAIN).waveforms
+        x, y, z = plain["positions"].T
+        found = hit_signals(fields, x, y, z, 100.0, PLAIN).waveforms
     worst = np.abs(found - expected).max(axis=1)
     rms = np.sqrt(np.mean((found - expected) ** 2, axis=1))
     late = np.subtract(*(np.argmax(w > 0.995, axis=1) for w in (found, expected)))
@@ -56,13 +55,15 @@ def compare(folder: Path, fields: FieldMaps) -> None:
     print(f", within 1e-3: {(worst < 1e-3).sum()}; RMS {rms.max():.1e} at most", end="")
     print(f"; collected {np.median(late):+.0f} ns later (median), {np.abs(late).max()} at most")
     with np.load(folder / "waveforms_diffusion_A_outertaper_grid0.1.npz") as cloud:
-        signals = hit_signals(fields, *cloud["positions"].T, 100.0, CLOUD)
+        x, y, z = cloud["positions"].T
+        signals = hit_signals(fields, x, y, z, 100.0, CLOUD)
         width = np.abs(signals.cloud_fwhm_ns / cloud["fwhm_steps"] - 1)
         rms = np.sqrt(np.mean((signals.waveforms - cloud["wf1"]) ** 2, axis=1))
     print(f"  cloud: width within 5 %: {(width < 0.05).sum()} of {len(width)}", end="")
     print(f", worst {width.max():.1%} (one step); RMS {rms.max():.1e} at most")
     with np.load(folder / "drift_paths_A_grid0.1.npz") as reference:
-        _, paths = drift_paths(fields, *reference["positions"].T, PLAIN)
+        x, y, z = reference["positions"].T
+        _, paths = drift_paths(fields, x, y, z, PLAIN)
         theirs = reference["paths"][:, : PLAIN.n_steps]
         holes = np.nanmax(np.linalg.norm(paths - theirs[..., 3:], axis=2))
     print(f"  paths of holes within {holes:.3f} mm")

@@ -104,7 +104,8 @@ def compare(folder: Path, detector: str, hits: Hits, path: Path) -> None:
     with h5py.File(path) as file:
         ((name, library),) = file.items()
         mode = json.loads(library.attrs["cpunet"])["mode_per_ns"]
-    turned = replace(hits, x_mm=np.hypot(hits.x_mm, hits.y_mm), y_mm=np.zeros(len(hits.x_mm)))
+    radius = np.hypot(hits.x_mm, hits.y_mm)
+    turned = replace(hits, position_mm=np.stack([radius, 0 * radius, hits.z_mm], axis=1))
     for title, these in (("azimuth 0", turned), ("own azimuth", hits)):
         full = drifted(folder, detector, these, mode)
         begun = time.monotonic()

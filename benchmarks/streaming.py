@@ -27,6 +27,7 @@ from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
+from cpunet.translation.translation import Translation
 
 DT_NS, LENGTH, BLOCK = 16.0, 225, 4096
 PAGE_MB = resource.getpagesize() / 2**20
@@ -113,18 +114,19 @@ def main() -> None:
         scale = Adc(6.0, 15_000, 1400, 700) if given.adc else Adc()
         begin = time.perf_counter()
         with watching() as seen:
-            told = translate(
+            result = translate(
                 folder / "run",
                 folder / "sim.lh5",
                 folder / "out.lh5",
                 adc=given.adc,
                 scale=scale,
-            ).counts
-        seconds = time.perf_counter() - begin
+            )
+        assert isinstance(result, Translation)
+        counts, seconds = result.counts, time.perf_counter() - begin
         size = (folder / "out.lh5").stat().st_size
     memory = np.array([mb for _, mb in seen])
     quarter = max(1, len(memory) // 4)
-    print(f"{told.translated:,} pulses in {seconds:.0f} s: {told.read / seconds:,.0f}/s")
+    print(f"{counts.translated:,} pulses in {seconds:.0f} s: {counts.read / seconds:,.0f}/s")
     print(f"{size / given.pulses:,.0f} bytes a pulse")
     print(f"peak of memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
     print(

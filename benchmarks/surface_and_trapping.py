@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 
-from cpunet.electronics.exponentials import Exponentials
 from cpunet.legend.currents import PEAK, currents_about_peak
 from cpunet.legend.lithium import LithiumLayer, arrived
 from cpunet.simulation.fields import FieldMaps, compute_fields
@@ -25,7 +24,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.signals import hit_signals
-from cpunet.training.closed_forms import learned_chain
+from cpunet.training.closed_forms import StepResponse, learned_chain
 from cpunet.translation.translator import REN
 
 DEPTHS_MM = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6)
@@ -39,7 +38,7 @@ def settings(**more: float) -> SimulationSettings:
     return SimulationSettings(dt_ns=1.0, length_ns=LENGTH, **more)
 
 
-def told(undecayed: Exponentials, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def told(undecayed: StepResponse, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A/E, and late charge in ns: area missing after 80 % of the charge at 10 us."""
     step = undecayed.step(np.arange(LENGTH, dtype=float))
     size = scipy.fft.next_fast_len(2 * LENGTH, real=True)
@@ -73,7 +72,7 @@ def delayed(charge: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.asarray(scipy.fft.irfft(spectra, length)[:, :n_samples], np.float32)
 
 
-def of_the_layer(chain: Exponentials, detector: Detector, fields: FieldMaps) -> None:
+def of_the_layer(chain: StepResponse, detector: Detector, fields: FieldMaps) -> None:
     """Print a table by depth."""
     layer = LithiumLayer(1.0)
     r = detector.crystal_radius - detector.li_thickness - 0.1
@@ -88,7 +87,7 @@ def of_the_layer(chain: Exponentials, detector: Detector, fields: FieldMaps) -> 
         print(f"{depth:8.2f} {100 * end:13.1f} {relative:18.4f} {more:16.1f}")
 
 
-def of_trapping(chain: Exponentials, detector: Detector, fields: FieldMaps) -> None:
+def of_trapping(chain: StepResponse, detector: Detector, fields: FieldMaps) -> None:
     """Print what each kind of trapping changes."""
     rng = np.random.default_rng(0)
     r = detector.crystal_radius * np.sqrt(rng.random(4 * HITS))
@@ -97,12 +96,12 @@ def of_trapping(chain: Exponentials, detector: Detector, fields: FieldMaps) -> N
     places = (r * np.cos(phi), r * np.sin(phi), z)
     without = hit_signals(fields, *places, 1000.0, settings())
     chosen = np.flatnonzero(without.valid & without.collected)[:HITS]
-    places = tuple(axis[chosen] for axis in places)
+    x, y, z = (axis[chosen] for axis in places)
     amplitude, charge = told(chain, without.waveforms[chosen])
     print("trapping         collected   A/E             late charge ns")
     for name in TRAPPING:
         for rate in (0.005, 0.02):
-            with_it = hit_signals(fields, *places, 1000.0, settings(**{name: rate}))
+            with_it = hit_signals(fields, x, y, z, 1000.0, settings(**{name: rate}))
             waveforms = with_it.waveforms
             a, lq = told(chain, waveforms / waveforms[:, -1:])
             lines = [
@@ -125,8 +124,9 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--detector", default="icpc")
     given = parser.parse_args()
-    backend = REN.load(given.run).backend
-    chain = learned_chain(backend.chain.response, "run").undecayed
+    generator = REN.load(given.run).backend.chain
+    assert generator is not None, "a run of a readout chain"
+    chain = learned_chain(generator.response, "run").undecayed
     detector = read_detector(given.detector)
     fields = compute_fields(detector)
     of_the_layer(chain, detector, fields)

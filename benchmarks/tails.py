@@ -146,7 +146,8 @@ def _subtracted(raw: Pulses, tails: PileUpTails) -> Pulses:
     """Traces with their tails subtracted; unchanged where these are undetermined."""
     decay = tail_shape(raw.length, tails.dt_ns, tails.decay_us)
     heights = np.nan_to_num(tails.measure(raw)) * tails.adc_per_kev
-    return raw.with_waveforms(np.float32(raw.waveforms - heights[:, np.newaxis] * decay))
+    flat = raw.waveforms - heights[:, np.newaxis] * decay
+    return raw.with_waveforms(flat.astype(np.float32))
 
 
 def _in_kev(traces: FloatArray, tails: PileUpTails) -> Values:

@@ -35,7 +35,8 @@ def ramps(rng: np.random.Generator, n: int, samples: int) -> FloatArray:
     """Charge pulses that rise linearly, for 160 to 960 ns, up to the middle of the record."""
     rise = rng.uniform(10, 60, (n, 1)).astype(np.float32)
     time_samples = np.arange(samples, dtype=np.float32) - samples // 2
-    return np.clip(time_samples / rise + 1, 0, 1)
+    clipped: FloatArray = np.clip(time_samples / rise + 1, 0, 1)
+    return clipped
 
 
 def write_simulation(path: Path, n: int) -> None:

@@ -45,7 +45,7 @@ def taught(
     wanted = finish(true_responses(truth, sim), recipe.preparation, dt_ns=sim.dt_ns).clean
     side = Side.of(sim.prepared.pulses, 0.0, seed=0)
     targets = Side.of(sim.prepared.pulses.with_waveforms(wanted), 0.0, seed=0).pulses
-    config, steps, made = recipe.training, given.steps, generators(recipe)
+    config, steps, made = recipe.cyclegan.training, given.steps, generators(recipe)
     ren, weights = made["ren"].train(), window_weights(config.losses, recipe.preparation.length)
     optimiser = AdamW(ren.parameters(), given.rate)
     schedule = CosineAnnealingLR(optimiser, steps)
@@ -90,10 +90,8 @@ def main() -> None:
     recipe = load_recipe("published", settings | {"training.noise": "baselines"}).at(16)
     files = PulseFile(given.stand / "sim.lh5"), PulseFile(given.stand / "data.lh5")
     chosen, truth = parse_selection(PEAK, recipe.peaks), given.stand / "truth.npz"
-    sim, data = (
-        load_pulses(file, side, recipe, chosen)
-        for file, side in zip(files, ("simulated", "measured"), strict=True)
-    )
+    sim = load_pulses(files[0], "simulated", recipe, chosen)
+    data = load_pulses(files[1], "measured", recipe, chosen)
     run = taught(sim, data, truth, recipe, given)
     metrics = evaluate(run, *files, truth=truth, baselines=False).metrics
     print(f"width {given.width}, dropout {given.dropout}, {given.steps} steps")

@@ -44,7 +44,9 @@ def make_run(folder: Path) -> None:
 def repeated(source: Path, target: Path, n: int, *, noise: float) -> int:
     """Write `n` pulses, repeating those of the source, and return the number of the latter."""
     if target.exists():
-        return open_pulses(source).n_pulses
+        n_pulses = open_pulses(source).n_pulses
+        assert n_pulses is not None
+        return n_pulses
     blocks = list(open_pulses(source).blocks(BLOCK))
     every = Pulses.concatenate(blocks)
     rng = np.random.default_rng(0)

@@ -265,11 +265,13 @@ def test_formulas_of_docstrings_become_mathml():
     made = hook("formulas", "latex2mathml")
     text = made.as_markdown(
         "A :math:`x^2` and\n\n.. math:: y\n    = z\n\n"
-        ".. math::\n\n    a = b\n    + c\n\nThen `f` of :func:`cpunet.f`."
+        ".. math::\n\n    a = b\n    + c\n\nAs in::\n\n    f(x)\n\n"
+        "Then `f` of :func:`cpunet.f`."
     )
     assert "A $x^2$ and" in text
     assert "$$\ny = z\n$$" in text
     assert "$$\na = b + c\n$$" in text
+    assert "As in:\n\n    f(x)" in text
     assert text.rstrip().endswith("Then `f` of `cpunet.f`.")
     html = made.on_page_content('<span class="arithmatex">\\(a &lt; b\\)</span>')
     assert html.startswith("<math")

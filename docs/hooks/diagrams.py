@@ -1,4 +1,4 @@
-"""Draw the diagrams of the concept pages; run by hand, it writes their SVG files."""
+"""Draw the diagrams of the concept pages: `make docs` writes their SVG files from the code."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ ROOM_WORDS = {
     "training": "fit of a chain, CycleGAN, run",
     "calibration": "detector and chain together",
     "translation": "REN, IREN on files; ONNX, dspeed",
-    "validation": "scores, ceilings, report",
+    "validation": "scores, data vs data, report",
     "legend": "pulse-shape libraries, parameters",
 }
 FLOWS = (
@@ -156,6 +156,79 @@ def rooms() -> None:
     d.write("rooms.svg")
 
 
+# steps of each way: a room, and a function, class or method in it
+WAYS = {
+    "trace": (
+        "pulses.open_pulses",
+        "pulses.prepare",
+        "pulses.apply_cuts",
+        "electronics.noise_of",
+        "training.fit_response",
+        "training.verdict",
+        "validation.score_peak",
+    ),
+    "hit": (
+        "simulation.read_hits",
+        "simulation.merge_hits",
+        "simulation.simulate_events",
+        "pulses.prepare",
+        "translation.Translator.translate_pulses",
+        "validation.score_peak",
+    ),
+    "run": (
+        "recipes.load_recipe",
+        "training.train_chain",
+        "training.Run",
+        "translation.REN",
+        "translation.translate",
+        "validation.evaluate",
+        "legend.export_legend",
+    ),
+}
+Step = ast.FunctionDef | ast.ClassDef
+
+
+def definitions(room: str) -> dict[str, tuple[Path, Step]]:
+    """Functions, classes and methods of a room; of one name, that of the module so named."""
+    steps: dict[str, tuple[Path, Step]] = {}
+    for path in sorted((SOURCE / room).rglob("*.py")):
+        for node in ast.parse(path.read_text("utf-8")).body:
+            if not isinstance(node, Step) or (node.name in steps and path.stem != node.name):
+                continue
+            steps[node.name] = path, node
+            methods = node.body if isinstance(node, ast.ClassDef) else []
+            for method in methods:
+                if isinstance(method, ast.FunctionDef):
+                    steps[f"{node.name}.{method.name}"] = path, method
+    return steps
+
+
+def way(name: str) -> None:
+    """Boxes of the steps with the first lines of their docstrings; arrows: what they return."""
+    steps, height, pitch = WAYS[name], 44, 76
+    d = Drawing(860, 10 + pitch * len(steps), f"The way of a {name} through the rooms")
+    for i, step in enumerate(steps):
+        room, _, function = step.partition(".")
+        defined = definitions(room)
+        if function not in defined:
+            raise SystemExit(
+                f"{__file__}: no {step} any more; name another step of WAYS[{name!r}]"
+            )
+        path, node = defined[function]
+        y = 10 + pitch * i
+        if i == 0 or room != steps[i - 1].partition(".")[0]:
+            d.text(90, y + height / 2 + 5, room)
+        about = (ast.get_docstring(node) or "").splitlines()[0].replace("`", "")
+        module = path.relative_to(SOURCE).as_posix()
+        d.box(180, y, 670, height, SIM, f"{function} ({module})", about)
+        if i + 1 < len(steps):
+            d.arrow((515, y + height), (515, y + pitch))
+            returned = node.returns if isinstance(node, ast.FunctionDef) else None
+            label = node.name if returned is None else ast.unparse(returned)
+            d.text(528, y + height + 20, label, 11, "start")
+    d.write(f"way-of-a-{name}.svg")
+
+
 def chain() -> None:
     """The stages of a readout, with the pulse after each: computed, not sketched."""
     dt_ns, n = 4.0, 1100
@@ -172,11 +245,11 @@ def chain() -> None:
     slow = 0.93 * smooth + 0.07 * after(smooth, pole(400))
     decayed = after(np.diff(slow, prepend=0), np.exp(-t / 12_000))
     noise = after(np.random.default_rng(1).normal(0, 0.06, n), pole(30))
-    d = Drawing(860, 210, "A readout chain: charge, bandwidth, slow part, decay, noise")
+    d = Drawing(860, 210, "A readout chain: charge, bandwidth, late charge, decay, noise")
     stages = [
         ("charge", "of the simulation", charge),
         ("bandwidth", "two poles", smooth),
-        ("slow part", "five fixed times", slow),
+        ("late charge", "five fixed times", slow),
         ("decay", "of the preamplifier", decayed),
         ("noise", "of real baselines", decayed + noise),
     ]
@@ -187,11 +260,11 @@ def chain() -> None:
         d.text(x + 74, 41, what, 11)
         if i:
             d.arrow((x - 22, 105), (x - 3, 105))
-    d.text(430, 185, "4.4 µs; slow part, decay and noise drawn larger than they are", 11)
+    d.text(430, 185, "4.4 µs; late charge, decay and noise drawn larger than they are", 11)
     d.text(
         430,
         203,
-        "recipe fast fits bandwidth, slow part and decay; the noise is that of the data",
+        "recipe fast fits bandwidth, late charge and decay; the noise is that of the data",
         11,
     )
     d.write("chain.svg")
@@ -217,7 +290,7 @@ def networks() -> None:
     d.text(650, 324, "adversarial loss", 11)
     d.arrow((535, 110), (535, 165), (345, 165), (345, 250), dashed=True)
     d.arrow((535, 250), (535, 195), (285, 195), (285, 110), dashed=True)
-    d.text(640, 172, "cycle loss: there and back", 11)
+    d.text(640, 172, "cycle loss: both in turn", 11)
     d.text(640, 188, "must give the pulse again", 11)
     d.arrow((95, 250), (95, 180), (255, 180), (255, 110), dashed=True)
     d.text(110, 150, "identity loss: REN leaves", 11)
@@ -230,3 +303,5 @@ def networks() -> None:
 if __name__ == "__main__":
     for draw in (rooms, chain, networks):
         draw()
+    for name in WAYS:
+        way(name)

@@ -15,6 +15,7 @@ ROLE = re.compile(r":math:`([^`]+)`")
 DIRECTIVE = re.compile(
     r"^\.\. math::[ \t]*(.*(?:\n(?:[ \t]+\S.*|[ \t]*(?=\n[ \t]+\S)))*)", re.M
 )
+LITERAL = re.compile(r"(^|\S)::[ \t]*$", re.MULTILINE)  # an indented block of code follows
 OTHER_ROLE = re.compile(r":(?:func|class|meth|mod|attr):`~?([^`]+)`")
 
 
@@ -28,9 +29,10 @@ def mathml(latex: str, display: str) -> str:
 
 
 def as_markdown(text: str) -> str:
-    """Formulas and references of a docstring in reStructuredText, as Markdown writes them."""
+    """Formulas, code and references of reStructuredText, as Markdown writes them."""
     text = DIRECTIVE.sub(lambda found: f"$$\n{' '.join(found[1].split())}\n$$\n", text)
     text = ROLE.sub(lambda found: f"${' '.join(found[1].split())}$", text)
+    text = LITERAL.sub(lambda found: found[1] and f"{found[1]}:", text)
     return OTHER_ROLE.sub(r"`\1`", text)
 
 

@@ -47,7 +47,7 @@ def merge(
         If a file cannot be read, or the files' pulses differ in length or sampling.
     """
     refuse_inputs(out, *files, *energies)
-    of_files = list(energies) or [None]
+    of_files: list[str | None] = list(energies) or [None]
     if len(of_files) == 1:
         of_files *= len(files)
     if len(of_files) != len(files):
