@@ -53,7 +53,7 @@ def one(stand: Path, n: int) -> dict[str, float]:
         "cpu_s": time.process_time() - cpu,
         "before_mb": loaded,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "chi_square_per_moment": fit.chi_square / fit.moments,
+        "chi_square_per_moment": fit.chi_square_per_moment or 0.0,
     }
 
 

@@ -118,7 +118,7 @@ def test_far_from_the_data_only_their_covariance_counts(problem, functions):
 
 
 def test_priors_and_further_knowledge_follow_the_deviations(problem):
-    known = problem(known=lambda coordinates: 7 * coordinates[:1])
+    known = problem(knowledge=lambda coordinates: 7 * coordinates[:1])
     parameters = known.parameters
     vector = parameters.vector()
     vector[parameters.n_chain :] = 1.5, 0.02
@@ -135,7 +135,7 @@ def test_what_else_is_known_makes_errors_smaller(problem):
         Information.of(one, one.both(one.parameters.vector())[1])
         for one in (
             problem(few=True),
-            problem(few=True, known=lambda coordinates: 500 * coordinates[1:]),
+            problem(few=True, knowledge=lambda coordinates: 500 * coordinates[1:]),
         )
     )
     own = before.errors([1])[0]

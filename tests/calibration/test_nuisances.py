@@ -72,7 +72,7 @@ def test_priors_are_the_defaults_or_those_given():
 
 
 def test_what_is_not_known_or_possible_is_refused():
-    with pytest.raises(CpunetError, match="no such parameter of the physics; there are temp"):
+    with pytest.raises(CpunetError, match="no such parameter of the physics; these are temp"):
         named("colour")
     with pytest.raises(CpunetError, match="li_thickness_mm = 5 is impossible"):
         Physics(
