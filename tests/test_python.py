@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 import shutil
 import subprocess
@@ -15,7 +16,9 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pandas
 import pytest
+import yaml
 from matplotlib import pyplot
 
 import cpunet
@@ -24,6 +27,7 @@ from cpunet.pulses import baselines, loading
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
+from cpunet.tables import with_std
 from cpunet.translation.translator import NOISE_ROWS
 from synthetic import FACTS, KEV, write_run, write_sides
 
@@ -67,7 +71,19 @@ def opens() -> Iterator[Counter[str]]:
 
 
 @pytest.fixture(scope="module")
-def run(home, opens) -> cpunet.Run:
+def logged() -> Iterator[list[str]]:
+    """What is logged."""
+    lines, handler = list[str](), logging.Handler()
+    handler.emit = lambda record: lines.append(record.getMessage())
+    logger = logging.getLogger("cpunet")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    yield lines
+    logger.removeHandler(handler)
+
+
+@pytest.fixture(scope="module")
+def run(home, opens, logged) -> cpunet.Run:
     sides = home / "sim.lh5", str(home / "raw.lh5")
     opens.clear()
     run = cpunet.train(*sides, home / "run", settings=SHORT, seed=2, device="cpu")
@@ -112,6 +128,31 @@ def test_a_run(home, run):
     assert run.fit.verdict in html
     assert run.plot().axes
     assert run.ren.translate(np.zeros((0, 1200)), noise=False).shape == (0, 800)
+
+
+def test_printed_numbers_agree(run, logged, tmp_path):
+    """Log, run, response and its tables give the same number with the same digits."""
+    summary, response = dict(run.summary()), cpunet.response(run, out=tmp_path / "response")
+    cells = [line.split("  ") for line in str(response).splitlines()]
+    rows = {row[0]: row[-1].strip() for row in cells}
+    stored = yaml.safe_load((tmp_path / "response" / "response.yaml").read_text())[run.name]
+    table = pandas.read_csv(tmp_path / "response" / "response.csv").iloc[0]
+    assert f"the fit is {summary['fit']}" in logged
+    assert summary["noise"].startswith(f"{rows['noise RMS [keV]']} keV")
+    chain = response.runs[0]
+    assert run.parameters == chain.values
+    for name, value in chain.values.items():
+        assert stored["numbers"][name]["value"] == table[name] == pytest.approx(value)
+        if error := chain.errors.get(name):
+            assert stored["numbers"][name]["error"] == pytest.approx(error)
+    for name, label in {
+        "rise_10_90_ns": "rise 10–90 % [ns]",
+        "decay_us": "main decay [µs]",
+    }.items():
+        assert rows[label] == with_std(chain.values[name], chain.errors.get(name))
+    report = chain.values["chi_square_per_moment"]
+    assert report == run.fit.chi_square_per_moment
+    assert f"chi-square per moment {report:.2f}" in repr(run)
 
 
 def test_a_run_of_a_network(tmp_path):

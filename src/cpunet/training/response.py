@@ -17,7 +17,7 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.settings import checked, read_json
-from cpunet.tables import text_table
+from cpunet.tables import text_table, with_std
 from cpunet.training.chain_description import DescribedChain, describe_chain
 from cpunet.training.closed_forms import Numbers, chain_numbers, true_chain_of, true_parameters
 from cpunet.training.response_tables import array_page, as_csv, as_yaml
@@ -180,15 +180,17 @@ class Response:
         _, label, unit = _row(name)
         scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
         alone = len(self.runs) == 1  # with several runs errors have no room
-        errors = self.runs[0].errors if alone else {}
+
+        def cell(values: Numbers, errors: Numbers) -> str:
+            scaled = [scale * of[name] if name in of else None for of in (values, errors)]
+            return with_std(*scaled)
+
         cells = [f"{label} [{unit}]" if unit else label]
-        cells += (
-            _number(chain.values.get(name), scale, errors.get(name)) for chain in self.runs
-        )
+        cells += (cell(chain.values, chain.errors if alone else {}) for chain in self.runs)
         if self.truth is None:
             return cells
         true, sigma = self.true_values.get(name), self.sigma.get(name)
-        cells.append(_number(true, scale))
+        cells.append(cell(self.true_values, {}))
         if alone:
             cells.append(_difference(self.difference.get(name), true, unit))
             cells.append("" if sigma is None else f"{sigma:+.1f}")
@@ -269,15 +271,6 @@ def _row(name: str) -> tuple[int, str, str]:
         for place, (pattern, (text, unit)) in enumerate(ROWS.items())
         if re.fullmatch(pattern, name)
     )
-
-
-def _number(value: float | None, scale: float, error: float | None = None) -> str:
-    if value is None:
-        return "–"
-    text = f"{scale * value:.4g}" if abs(scale * value) >= 0.005 else f"{scale * value:.2f}"
-    if error is None:
-        return text
-    return f"{text} ± {scale * error:{'.2g' if scale * error < 99 else '.0f'}}"
 
 
 def _difference(difference: float | None, true: float | None, unit: str) -> str:
