@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays
 
 from cpunet.hdf5_files import lh5_rows, members, one_line, text_attribute, units_of
-from cpunet.pulses.reading.energies import Column
+from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.units import factor
 
@@ -40,7 +40,7 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     left_out
         The reason for each column that cannot be copied.
     """
-    if (group := source.table.group) is None:
+    if (group := source.group) is None:
         columns = {
             name: column
             for name, column in source.columns.items()
@@ -50,9 +50,9 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
         return lambda start, n: {
             shown[name]: _from_column(column, start, n) for name, column in columns.items()
         }, {}
-    chosen = source.table.name.rpartition("/")[2]
+    chosen = source.name.rpartition("/")[2]
     names, left_out = list[str](), dict[str, str]()
-    rows, size = source.table.chosen, source.table.n_all or source.n_pulses or 0
+    rows, size = source.chosen, source.n_all or source.n_pulses or 0
     with one_line(source.path):
         for name, item in members(group).items():
             is_plain = isinstance(item, h5py.Dataset)

@@ -18,14 +18,9 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.processes import give_back_large_arrays
-from cpunet.progress import Stage, stage
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.provenance import (
-    TRANSLATED_BY,
-    TRANSLATION,
-    recorded_attributes,
-    require_side,
-)
+from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import other_columns
@@ -111,9 +106,10 @@ class FileTranslation:
     def warn(self) -> None:
         """Say what the user should know of the output."""
         if self.form.fills_in:
+            window = self.translator.recipe.preparation.length
             log.warning(
-                f"a network knows windows of {self.form.config.length} samples alone; beyond "
-                "them stand baseline and decay without noise"
+                f"a network knows windows of {window} samples alone; beyond them stand "
+                "baseline and decay without noise"
             )
 
     def __call__(
@@ -203,7 +199,7 @@ class FileTranslation:
         pulses = source.open()
         self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
         remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
-        if TRANSLATED_BY in recorded_attributes(pulses):
+        if pulses.attrs.get(TRANSLATED_BY):
             remedy = f"translate the {self.kind.takes} ones that they were made of"
         require_side(pulses, self.kind.takes, remedy, insist=source.insist)
         return pulses
@@ -213,7 +209,7 @@ class FileTranslation:
         return PulseWriter(
             out,
             table=self.options.table or f"geds/{self.kind.part}",
-            waveform_units=self.form.units,
+            waveform_units="ADC" if self.options.adc else "",
             attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
             samples=self.form.samples,
             force=force,
@@ -229,18 +225,13 @@ class FileTranslation:
 
     def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[TranslatedPulses]:
         """Translate block by block; the noise depends only on the order of the pulses."""
+        size = max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))  # fits in memory
         with stage("Translating", pulses.n_pulses) as bar:
-            for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
+            for number, block in enumerate(regrouped(pulses.blocks(size), NOISE_ROWS)):
                 seed = noise_seed(self.options.seed, noise_key, number)
                 generator = np.random.default_rng(seed)
                 yield self.form(block, noise=self.options.noise, generator=generator)
-
-
-def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
-    """Blocks of a file that fit in memory, whatever the length of its traces."""
-    for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
-        yield block
-        bar.update(len(block))
+                bar.update(len(block))
 
 
 def source_print(source: PulseFile) -> str:
