@@ -93,6 +93,15 @@ def line(values):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def quietest_rms(baseline):  # type: ignore[no-untyped-def]
+    """RMS about a straight line in the quietest part of the baseline."""
+    size, quietest = len(baseline) // _PARTS, math.inf
+    for part in range(_PARTS):
+        quietest = min(quietest, line(baseline[part * size : (part + 1) * size])[2])
+    return quietest
+
+
+@compiled
 def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
     """Fraction of equal neighbouring samples, and the smallest step between unequal ones."""
     equal, step = 1, math.inf  # start at 1: a probability is never exactly zero
@@ -413,6 +422,17 @@ def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-d
 
 
 @compiled
+def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
+    """Write `(trace - base) / scale`: 0 before the record, its last value after it."""
+    length, factor = len(trace), 1.0 / scale
+    first, stop = max(0, -start), min(len(window), length - start)
+    window[:first] = 0
+    for i in range(first, stop):
+        window[i] = (trace[start + i] - base) * factor
+    window[stop:] = (trace[length - 1] - base) * factor
+
+
+@compiled
 def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-untyped-def]
     """Fill a window and numbers from a trace and return its code.
 
@@ -442,10 +462,7 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
     if s.simulated:
         scale = top - base
     else:
-        size, quietest = (last - first) // _PARTS, math.inf
-        for part in range(_PARTS):
-            begin = first + part * size
-            quietest = min(quietest, line(trace[begin : begin + size])[2])
+        quietest = quietest_rms(trace[first:last])
         if height < (_MIN_HEIGHT_RMS if s.of_maximum == 0 else _MIN_TOP_RMS) * quietest:
             return Rejection.NO_AMPLITUDE
         first, last = _before_pulse(trace, align, mean, top, quietest, s)
@@ -466,18 +483,12 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
     if not scale > 0:
         return Rejection.NO_AMPLITUDE
 
-    # 0 before the record, its last value after it
-    first, last, factor = max(0, -start), min(len(window), length - start), 1.0 / scale
-    window[:first] = 0
-    for i in range(first, last):
-        window[i] = (trace[start + i] - base) * factor
-    window[last:] = (trace[length - 1] - base) * factor
+    _fill(trace, start, base, scale, window)
     tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
     if math.isnan(tail_slope):
         return Rejection.TAIL_NOT_POSITIVE
-    values = base, scale, float(align), rms / scale, slope / scale, tail_slope, chi2
-    for column, value in enumerate(values):
-        numbers[column] = value
+    numbers[0], numbers[1], numbers[2], numbers[3] = base, scale, align, rms / scale
+    numbers[4], numbers[5], numbers[6] = slope / scale, tail_slope, chi2
     return Rejection.ACCEPTED
 
 

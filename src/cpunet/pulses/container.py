@@ -194,7 +194,7 @@ def line_slope(n: int) -> npt.NDArray[np.float64]:
 
     Examples
     --------
-    >>> line_slope(5) @ np.array([3.0, 5.0, 7.0, 9.0, 11.0])
+    >>> float(line_slope(5) @ np.array([3.0, 5.0, 7.0, 9.0, 11.0]))
     2.0
     """
     lever = np.arange(n) - (n - 1) / 2

@@ -271,7 +271,7 @@ def _read(
     uniform sample of the whole file, always the same for the same file.
     """
     sets, drawn, before = list[Prepared](), list[FloatColumn](), set[int]()
-    kev, amplitudes = list[FloatColumn](), list[FloatColumn]()
+    seen = list[tuple[FloatColumn, FloatColumn]]()
     baselines, whole, whole_rows = list[Baselines](), list[Pulses](), list[Rows]()
     first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
     lowest, highest = np.inf, -np.inf
@@ -290,20 +290,18 @@ def _read(
             part = part.rejected(_copies(block[part.index], side, before))
             if side == "measured":
                 good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
-                lowest = min(lowest, good.min(initial=np.inf))
-                highest = max(highest, good.max(initial=-np.inf))
+                lowest, highest = good.min(initial=lowest), good.max(initial=highest)
                 rows = part.index[: max(WHOLE - sum(map(len, whole)), 0)]
                 whole.append(block[rows])
                 whole_rows.append(start + rows)
-            kev.append(block.energy_kev)
-            amplitudes.append(amplitude(block.waveforms))
+            seen.append((block.energy_kev, amplitude(block.waveforms)))
             sets.append(part)
             drawn.append(rng.random(len(part)))
             start, n = start + len(block), n + len(part)
             if max_pulses is not None and n > 1.5 * max_pulses:
                 n = _thin(sets, drawn, max_pulses)
             bar.update(len(block))
-    energies, heights = np.concatenate(kev), np.concatenate(amplitudes)
+    energies, heights = map(np.concatenate, zip(*seen, strict=True))
     if not n:
         error = _nothing_left(source.path, np.concatenate([part.codes for part in sets]))
         raise explained(error, source.path, first, energies, heights, side, selection)
