@@ -20,7 +20,7 @@ from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes import load_recipe
 from cpunet.training.adversarial import Generator
-from cpunet.translation.backends import Drawn, NetworkBackend, ResponseBackend
+from cpunet.translation.backends import Batch, NetworkBackend, response_backend
 
 REPEATS = 3
 DT_NS, FEP_KEV = 16.0, 2614.5
@@ -54,20 +54,20 @@ def main() -> None:
     fast = load_recipe("fast").at(16)
     chain = ResponseGenerator(fast.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.ones(4097), 8192, DT_NS, 100))
-    response = ResponseBackend(chain, fast.preparation)
+    response = response_backend(chain, fast.preparation)
     pulses, energies = windows(8192), np.full(8192, FEP_KEV)
     blocks = [slice(first, first + 512) for first in range(0, len(pulses), 512)]
     generator = np.random.default_rng(0)
 
     def with_noise(noise: bool) -> None:
         for rows in blocks:
-            drawn = Drawn(energies[rows], noise=noise, generator=generator)
-            response(pulses[rows], drawn)
+            response.translate(Batch(pulses[rows], energies[rows], noise, generator))
 
     def unet(width: int, n: int) -> float:
         recipe = load_recipe("published", [f"generator.width={width}"]).at(16)
         network = Generator(PositionalUNet(recipe.cyclegan.generator, 800)).to(given.device)
-        return rate(partial(NetworkBackend(network, fast.preparation), pulses[:n], Drawn()), n)
+        backend = NetworkBackend(network.eval(), fast.preparation, DT_NS)
+        return rate(partial(backend.translate, Batch(pulses[:n])), n)
 
     rates = {
         "readout chain, with noise": rate(lambda: with_noise(True), len(pulses)),

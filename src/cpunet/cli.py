@@ -16,8 +16,7 @@ import re
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import cache
 from types import FrameType
 from typing import Any
@@ -93,33 +92,28 @@ def with_options(text: str) -> str:
     return re.sub(r"`([a-z_]+)`", lambda name: f"--{_option(name[1])}", text)
 
 
-def _made() -> App:
-    """The application, which loads a command's function when it is called."""
-    made = App(
-        name="cpunet",
-        help="Make simulated germanium-detector pulses look measured.\n\n"
-        f"{DEBUG} shows the whole traceback if a command fails.",
-        version=f"cpunet {cpunet.__version__}",
-        # of "a path or an object", the command line takes paths
-        default_parameter=Parameter(
-            accepts_keys=False,
-            consume_multiple=False,
-            name_transform=_option,
-            negative_iterable=(),
-        ),
-        result_action="return_value",
+app = App(
+    name="cpunet",
+    help="Make simulated germanium-detector pulses look measured.\n\n"
+    f"{DEBUG} shows the whole traceback if a command fails.",
+    version=f"cpunet {cpunet.__version__}",
+    # of "a path or an object", the command line takes paths
+    default_parameter=Parameter(
+        accepts_keys=False,
+        consume_multiple=False,
+        name_transform=_option,
+        negative_iterable=(),
+    ),
+    result_action="return_value",
+)
+for _group in GROUPS.values():
+    app.command(_group)
+for _name, _help in COMMANDS.items():  # whose functions are loaded when they are called
+    *_group_of, _word = _name.split()
+    _function = FUNCTIONS.get(_name) or _name.replace(" ", "_")
+    (GROUPS[_group_of[0]] if _group_of else app).command(
+        f"{cpunet.HOMES[_function]}:{_function}", name=_word, help=_help
     )
-    for group in GROUPS.values():
-        made.command(group)
-    for name, told in COMMANDS.items():
-        *group_of, word = name.split()
-        place = GROUPS[group_of[0]] if group_of else made
-        function = FUNCTIONS.get(name) or name.replace(" ", "_")
-        place.command(f"{cpunet.HOMES[function]}:{function}", name=word, help=told)
-    return made
-
-
-app = _made()
 
 
 @cache
@@ -146,12 +140,17 @@ def run(words: Sequence[str]) -> int:
         If the words are no command, or the command fails; parameters, which stand in
         backticks, are named as the options that they are.
     """
-    made = app if not words or words[0].startswith("-") else application()
+    called = app if not words or words[0].startswith("-") else application()
     try:
-        result: Any = made(words, exit_on_error=False, print_error=False)
+        result: Any = called(words, exit_on_error=False, print_error=False)
     except CycloptsError as error:
         command = " ".join(["cpunet", *(error.command_chain or ())])
-        raise CpunetError(_wrong_usage(error), f"see {command} --help") from error
+        text = " ".join(str(error).split())
+        if isinstance(error, UnknownCommandError):  # more words list the first of all commands
+            text = text.partition(" Available commands")[0]
+        if isinstance(error, MissingArgumentError) and error.argument is not None:
+            text = f"{error.argument.names[0]} is missing"
+        raise CpunetError(text.rstrip("."), f"see {command} --help") from error
     except CpunetError as error:
         raise CpunetError(with_options(str(error))) from error
     if HELP.intersection(words):
@@ -163,16 +162,6 @@ def run(words: Sequence[str]) -> int:
     if result is not None:
         print(with_options(str(result)))  # noqa: T201 - the only place that prints
     return 0 if getattr(result, "ok", True) else BUG
-
-
-def _wrong_usage(error: CycloptsError) -> str:
-    """What is wrong with the words of a command."""
-    if isinstance(error, MissingArgumentError) and error.argument is not None:
-        return f"{error.argument.names[0]} is missing"
-    told = " ".join(str(error).split())
-    if isinstance(error, UnknownCommandError):  # more words list the first of all commands
-        told = told.partition(" Available commands")[0]
-    return told.rstrip(".")
 
 
 def examples(words: Sequence[str]) -> list[str]:
@@ -189,17 +178,32 @@ def main() -> None:
     end = words.index("--") if "--" in words else len(words)  # then names only
     debug = DEBUG in words[:end]  # known wherever it stands
     words = [word for word in words[:end] if word != DEBUG] + words[end:]
-    with _messages_to_stderr(), _stopped_as_on_an_error():
-        try:
-            sound_environment()
-            for stream in (sys.stdout, sys.stderr):
-                if isinstance(stream, io.TextIOWrapper):  # of any encoding
-                    stream.reconfigure(errors="replace")
-            if clash := other_package():
-                log.warning(clash)
-            status = run(words)
-        except BaseException as error:
-            status = _ended_with(error, words, debug=debug)
+    logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Lines())
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        sys.exit(128 + number)  # which leaves nothing half-written, as an error does
+
+    caught = [n for n in STOPPING if signal.getsignal(n) != signal.SIG_IGN]  # as by nohup
+    handlers = {n: signal.signal(n, stop) for n in caught}
+    try:
+        sound_environment()
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # of any encoding
+                stream.reconfigure(errors="replace")
+        if clash := other_package():
+            log.warning(clash)
+        status = run(words)
+    except BaseException as error:
+        status = _ended_with(error, words, debug=debug)
+    finally:
+        for number, earlier in handlers.items():
+            signal.signal(number, earlier)
+        logger.setLevel(level)
+        logger.removeHandler(handler)
     sys.exit(status)
 
 
@@ -231,72 +235,40 @@ class _Lines(logging.Formatter):
         return f"{_bold(f'{record.levelname.lower()}:')} {line}"
 
 
-@contextmanager
-def _messages_to_stderr() -> Iterator[None]:
-    """Print records of this package within the context, from level INFO up."""
-    logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Lines())
-    before = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-        logger.removeHandler(handler)
-
-
 def _bold(text: str) -> str:
     return f"\033[1m{text}\033[0m" if sys.stderr.isatty() else text
 
 
-def _fail(message: str) -> None:
-    sys.stderr.write(f"{_bold('error:')} {' '.join(message.split())}\n")
-
-
 def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> int:
     """Say in one line what a command of these words ended with; return the exit status."""
-    text = " ".join(str(error).split())
-    if isinstance(error, KeyboardInterrupt | SystemExit):
-        status = error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT
-        if status in (128 + number for number in STOPPING):
-            _fail("interrupted; nothing half-written was left")
-        return status if isinstance(status, int) else BUG
+    text, status = " ".join(str(error).split()), USAGE
     if isinstance(error, BrokenPipeError):  # nobody reads on, as in "cpunet … | head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BUG
-    if debug:
+    stopped = isinstance(error, KeyboardInterrupt | SystemExit)
+    if debug and not stopped:
         traceback.print_exception(error)
     files = ", ".join(word for word in words if os.path.exists(word))  # noqa: PTH110
     about = f"{files}: " if files else ""
-    if isinstance(error, CpunetError):
-        _fail(text)
+    if stopped:
+        code = error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT
+        status = code if isinstance(code, int) else BUG
+        if status not in (128 + number for number in STOPPING):
+            return status
+        text = "interrupted; nothing half-written was left"
+    elif isinstance(error, CpunetError):
+        pass
     elif isinstance(error, MemoryError) or any(part in text.lower() for part in NO_MEMORY):
-        _fail(f"{about}out of memory ({text[:200]}); take fewer pulses, or smaller batches")
+        text = f"{about}out of memory ({text[:200]}); take fewer pulses, or smaller batches"
     elif isinstance(error, OSError) and error.errno:
         remedy = "make room" if error.errno in FULL else "check its name and permissions"
         about = f"{error.filename}: "[-200:] if error.filename else about
-        _fail(f"{about}{os.strerror(error.errno)}; {remedy}, or choose another place")
+        text = f"{about}{os.strerror(error.errno)}; {remedy}, or choose another place"
     else:
-        _fail(
+        text, status = (
             f"{about}unexpected {type(error).__name__} ({text[:200]}); please report it to the "
-            f"makers of {DISTRIBUTION}, with what {DEBUG} prints"
+            f"makers of {DISTRIBUTION}, with what {DEBUG} prints",
+            BUG,
         )
-        return BUG
-    return USAGE
-
-
-@contextmanager
-def _stopped_as_on_an_error() -> Iterator[None]:
-    """Let Ctrl-C and batch systems leave nothing half-written."""
-
-    def stop(number: int, _frame: FrameType | None) -> None:
-        sys.exit(128 + number)
-
-    caught = (n for n in STOPPING if signal.getsignal(n) != signal.SIG_IGN)  # as by nohup
-    before = {n: signal.signal(n, stop) for n in caught}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    sys.stderr.write(f"{_bold('error:')} {' '.join(text.split())}\n")
+    return status

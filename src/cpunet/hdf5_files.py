@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -144,9 +143,9 @@ def is_text(item: object) -> bool:
 
 def reading(path: Path, item: h5py.Group | h5py.Dataset, read: Read) -> Read:
     """A function that reads rows of an item, whose file stays open; see `one_line`."""
-    return partial(_read, item.file, path, read)
 
+    def rows(start: int, stop: int, _open: h5py.File = item.file) -> npt.NDArray[Any]:
+        with one_line(path):
+            return read(start, stop)
 
-def _read(_open: h5py.File, path: Path, read: Read, start: int, stop: int) -> npt.NDArray[Any]:
-    with one_line(path):
-        return read(start, stop)
+    return rows

@@ -12,7 +12,6 @@ import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
-from cpunet.pulses.reading.source import PulseSource
 from cpunet.settings import Set, key_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import holds_detector, read_detector
@@ -21,7 +20,6 @@ from cpunet.tables import Lines, aligned, text_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from cpunet.pulses.container import Pulses
     from cpunet.recipes.schema import Recipe
 
     Loaded: TypeAlias = cpunet.Run | cpunet.Report | cpunet.Stand | PulseFile
@@ -133,10 +131,10 @@ def info(
     """
     if out is not None:
         refuse_picture(Path(out), path, read.energy, force=force)
-    found = _look(path, read, units, key_values(settings), quality)
+    content = _look(path, read, units, key_values(settings), quality)
     if out is not None:
-        found.save(out, force)
-    return found
+        content.save(out, force)
+    return content
 
 
 def load(path: str | Path) -> Loaded:
@@ -161,12 +159,11 @@ def load(path: str | Path) -> Loaded:
         file = PulseFile(path)
         file.open()
         return file
-    if (path / "run.json").is_file():
-        return cpunet.Run.load(path)
-    if (path / "metrics.json").is_file():
-        return cpunet.Report.load(path)
-    if (path / "stand.json").is_file():
-        return cpunet.Stand.load(path)
+    for name, kind in (
+        ("run.json", cpunet.Run), ("metrics.json", cpunet.Report), ("stand.json", cpunet.Stand),
+    ):  # fmt: skip
+        if (path / name).is_file():
+            return kind.load(path)
     raise CpunetError(
         f"{path}: no folder of this program",
         "give the folder of a run, which holds run.json, of a report or stand, or a file",
@@ -194,22 +191,18 @@ def _look(
     if settings:
         raise CpunetError(f"{path}: is no detector", "leave out `settings`")
     if place.is_dir():
-        return _folder(path)
+        content = load(path)
+        if isinstance(content, cpunet.Run):
+            return InfoResult(str(path), content.summary())
+        verdicts = getattr(content, "verdicts", None)
+        lines = [("report", str(path)), *(("", verdict) for verdict in verdicts or ())]
+        return InfoResult(str(path), lines if verdicts else [("", str(content))])
     if holds_hits(path):
         lines = [("file", str(path))]
-        for name, one in describe_hits(place, recipe.peaks, units).items():
-            lines += [("detector", name), *one]
+        for name, topics in describe_hits(place, recipe.peaks, units).items():
+            lines += [("detector", name), *topics]
         return InfoResult(str(path), lines)
     raise no_pulses or CpunetError(f"{path}: no such file; check the name")
-
-
-def _folder(path: str | Path) -> InfoResult:
-    found = load(path)
-    if isinstance(found, cpunet.Run):
-        return InfoResult(str(path), found.summary())
-    if verdicts := getattr(found, "verdicts", None):
-        return InfoResult(str(path), [("report", str(path)), *(("", v) for v in verdicts)])
-    return InfoResult(str(path), [("", str(found))])
 
 
 def _detector(detector: Detector, path: str) -> InfoResult:
@@ -233,9 +226,9 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
         from cpunet.pulses.channels import channels_of  # processes, bars
 
         texts, ok = [], True
-        for name, one in channels_of(file).items():
+        for name, channel in channels_of(file).items():
             try:
-                text = aligned(_pulses(one, recipe, quality))
+                text = aligned(_pulses(channel, recipe, quality))
             except CpunetError as error:
                 text, ok = str(error).removeprefix(f"{path}: "), False
             texts.append(("", f"{name}:\n{text}"))
@@ -251,7 +244,7 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
         try:
             with replace(file, table=name).open() as source:
                 numbers = [number or source.n_pulses, source.length, f"{source.dt_ns:g}"]
-                rows.append([name, *numbers, source.energies.description])
+                rows.append([name, *numbers, source.energies])
         except CpunetError as error:
             rows.append([name, "", "", "", str(error).removeprefix(f"{path}: ")])
     text = text_table(["table", "traces", "samples", "ns", "energies"], rows)
@@ -261,39 +254,33 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
 
 
 def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
-    """Describe the pulses of one table."""
+    """Describe the pulses of one table; of measured traces also their quality, on request."""
     from cpunet.pulses import provenance
-    from cpunet.pulses.description import describe_pulses
+    from cpunet.pulses.description import describe_pulses, left_out, trace_properties
+    from cpunet.pulses.doubts import rolled_over
 
     with file.open() as source:
         blocks = source.blocks()
         first = next(blocks)  # a few thousand
         lines = describe_pulses(source, chain([first], blocks), recipe.peaks)
-        found = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
+        side = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
         # translated windows look measured, but are not raw traces
-        translated = provenance.TRANSLATED_BY in provenance.recorded_attributes(source)
-        if found is None or found.side != "measured" or translated:
+        translated = source.attrs.get(provenance.TRANSLATED_BY)
+        if side is None or side.side != "measured" or translated:
             return lines
-        return [*lines, *_traces(source, first, recipe, quality)]
+        try:
+            lines += trace_properties(first, recipe.preparation)
+        except CpunetError as error:
+            lines.append(("", f"cannot be described: {error}"))
+        lines.append(("odd", str(rolled_over(first.waveforms) or "")))
+        if not quality:
+            return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
+        from cpunet.electronics.pile_up_tails import PileUpTails
+        from cpunet.pulses.baselines import Baselines
 
-
-def _traces(source: PulseSource, first: Pulses, recipe: Recipe, quality: bool) -> Lines:
-    """Properties of measured traces; on request their quality and the pile-up tails."""
-    from cpunet.pulses.description import left_out, rolled_over, trace_properties
-
-    try:
-        lines = trace_properties(first, recipe.preparation)
-    except CpunetError as error:
-        lines = [("", f"cannot be described: {error}")]
-    lines.append(("odd", str(rolled_over(first.waveforms) or "")))
-    if not quality:
-        return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
-    from cpunet.electronics.pile_up_tails import PileUpTails
-    from cpunet.pulses.baselines import Baselines
-
-    lines.append(("left out", left_out(first, recipe)))
-    try:
-        baselines = Baselines.of(source.blocks(), recipe.preparation)
-        return lines + PileUpTails.of(baselines).describe().in_words()
-    except CpunetError as error:
-        return [*lines, ("pile-up tails", f"not known: {error}")]
+        lines.append(("left out", left_out(first, recipe)))
+        try:
+            baselines = Baselines.of(source.blocks(), recipe.preparation)
+            return lines + PileUpTails.of(baselines).describe().in_words()
+        except CpunetError as error:
+            return [*lines, ("pile-up tails", f"not known: {error}")]

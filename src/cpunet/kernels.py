@@ -1,9 +1,9 @@
-"""Compiled loops: their code is kept, and compiled again when a module of loops changes.
+"""Compiled loops: their code is stored, and compiled again when a module of loops changes.
 
-numba itself looks only at the file of a function, and so keeps old code of functions that it
-calls in other files.  Therefore code is kept in a folder named by a digest of all modules with
-loops and of all that they import: in ``NUMBA_CACHE_DIR``, else in the user's cache.  If neither
-can be written to, each process compiles anew.
+numba itself looks only at the file of a function, and so uses old code of functions that it
+calls in other files.  Therefore code is stored in a folder named by a digest of all modules
+with loops and of all that they import: in ``NUMBA_CACHE_DIR``, else in the cache of the user.
+If neither can be written to, each process compiles anew.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import re
 import shutil
 import sys
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -25,7 +25,7 @@ import numba
 import platformdirs
 import threadpoolctl
 from numba.core import config, entrypoints
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.caching import FunctionCache
 
 from cpunet.errors import CpunetError
 
@@ -52,25 +52,22 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         # cache; their last bits differ.  Inlined into the caller there is only one version.
         options.setdefault("forceinline", True)
     compiled = numba.njit(nogil=True, **options)(function)
-    cache = _Cache(function, parallel=bool(options.get("parallel")))
-    compiled._cache = cache  # noqa: SLF001  numba has no public way
-    compiled._compilation_chain_init_hook = lambda: None  # noqa: SLF001  see `_unextended`
-    return _in_own_threads(compiled) if options.get("parallel") else compiled
+    if _folder() is not None:
+        compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
+    compiled._compilation_chain_init_hook = lambda: None  # noqa: SLF001  see `_Cache`
+    if not options.get("parallel"):
+        return compiled
 
-
-def _in_own_threads(loop: Loop) -> Loop:
-    """A parallel loop that is refused in a forked process, which has no threads but this."""
-
-    @functools.wraps(loop)
-    def call(*given: Any) -> Any:
-        if start_threads() != os.getpid():
+    @functools.wraps(function)
+    def in_own_threads(*given: Any) -> Any:
+        if start_threads() != os.getpid():  # a forked process has no threads but this
             raise CpunetError(
                 "loops of several threads do not work in a forked process; begin processes "
                 'with multiprocessing.get_context("spawn")'
             )
-        return loop(*given)
+        return compiled(*given)
 
-    return call  # type: ignore[return-value]
+    return in_own_threads
 
 
 def _after_fork() -> None:
@@ -121,90 +118,57 @@ def use_threads(count: int) -> None:
     numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))
 
 
-def _digest() -> str:
-    """Digest of all modules with loops and of those that they import, wherever they lie."""
-    home = Path(__file__).parent
-    texts = {}
+@functools.cache
+def _folder() -> Path | None:
+    """Folder of the code of these sources; of earlier ones the last few remain.
+
+    Its name is a digest of all modules with loops and of those that they import.
+    """
+    home, texts, used = Path(__file__).parent, dict[str, str](), set[str]()
     for file in home.rglob("*.py"):
         parts = (home.name, *file.relative_to(home).with_suffix("").parts)
         texts[".".join(parts).removesuffix(".__init__")] = file.read_text(encoding="utf-8")
-    found = set[str]()
     ahead = [name for name, text in texts.items() if f"{__name__} import" in text]
     while ahead:
-        found.add(name := ahead.pop())
+        used.add(name := ahead.pop())
         imported = re.findall(r"^from ([\w.]+) import", texts[name], re.MULTILINE)
-        ahead += [other for other in imported if other in texts.keys() - found]
-    return hashlib.sha256("\0".join(texts[name] for name in sorted(found)).encode()).hexdigest()
-
-
-@functools.cache
-def _folder() -> Path | None:
-    """Folder of the code of these sources; of earlier ones the last few are kept."""
+        ahead += [other for other in imported if other in texts.keys() - used]
+    digest = hashlib.sha256("\0".join(texts[name] for name in sorted(used)).encode())
     base = Path(config.CACHE_DIR or platformdirs.user_cache_path("cpunet") / "loops")
-    folder = base / f"cpunet-{_digest()[:16]}"
+    folder = base / f"cpunet-{digest.hexdigest()[:16]}"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         os.utime(folder)
     except OSError:
         return None
     with suppress(OSError):  # another process removes them as well
-        used = sorted(base.glob("cpunet-*"), key=lambda place: place.stat().st_mtime)
-        for old in used[:-_MAX_FOLDERS]:
+        folders = sorted(base.glob("cpunet-*"), key=lambda place: place.stat().st_mtime)
+        for old in folders[:-_MAX_FOLDERS]:
             shutil.rmtree(old)
     return folder
 
 
-class _Locator(_CacheLocator):  # type: ignore[misc]
-    """Tells numba where the code of a function is."""
-
-    def __init__(self, function: Callable[..., Any], file: str) -> None:
-        self._py_file = file  # for numba's warnings
-        self._name = f"{function.__module__}-{function.__code__.co_firstlineno}"
-
-    def get_cache_path(self) -> str:
-        return str(_folder())
-
-    def get_source_stamp(self) -> str:
-        return ""  # the folder is that of the sources
-
-    def get_disambiguator(self) -> str:
-        return self._name
-
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _Locator:
-        return cls(py_func, py_file)
-
-
-class _Result(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = (_Locator,)
-
-
 class _Cache(FunctionCache):  # type: ignore[misc]
-    _impl_class = _Result
+    """The code of a loop in `_folder`, which is loaded without extensions of numba.
 
-    def __init__(self, function: Callable[..., Any], *, parallel: bool) -> None:
-        super().__init__(function)
-        self._parallel = parallel
+    Those of awkward take 0.4 s, and no loop here needs them.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(_folder())
+        try:
+            super().__init__(function)
+        finally:
+            config.CACHE_DIR = before
         # numba numbers files from 1: of two processes that compile a loop for different types
         # at once, one would load the other's code
         name = f"{self._impl.filename_base}.{uuid.uuid4().hex}.{{number:d}}.nbc"
         self._cache_file._data_name_pattern = name  # noqa: SLF001
-        if _folder() is None:
-            self.disable()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        if self._parallel:
-            start_threads()  # before numba does so itself when it loads or compiles the loop
-        with _unextended():
+        before = entrypoints._already_initialized  # noqa: SLF001
+        entrypoints._already_initialized = True  # noqa: SLF001
+        try:
             return super().load_overload(sig, target_context)
-
-
-@contextmanager
-def _unextended() -> Iterator[None]:
-    """Load no extensions of numba: those of awkward take 0.4 s, and no loop here needs them."""
-    before = entrypoints._already_initialized  # noqa: SLF001
-    entrypoints._already_initialized = True  # noqa: SLF001
-    try:
-        yield
-    finally:
-        entrypoints._already_initialized = before  # noqa: SLF001
+        finally:
+            entrypoints._already_initialized = before  # noqa: SLF001

@@ -57,8 +57,16 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
         Files and folders as given by the user, including ``FILE:table`` and patterns; values
         that are not file names (a preset, None) are ignored.
     """
-    place = Path(out).resolve()
-    for source in (found for given in inputs for found in _named(given)):
+    place, sources = Path(out).resolve(), list[Path]()
+    for text in map(str, filter(None, inputs)):
+        file = text.rpartition(":")[0]
+        if os.path.lexists(text):
+            sources.append(Path(text))
+        elif file and os.path.lexists(file):
+            sources.append(Path(file))
+        elif glob.has_magic(text):  # of absolute names, too
+            sources += map(Path, glob.glob(text, recursive=True))  # noqa: PTH207
+    for source in sources:
         real = source.resolve()
         if _same(place, real):
             raise CpunetError(f"{out}: is the input; choose another `out`")
@@ -66,6 +74,13 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
             raise CpunetError(f"{out}: holds the input {source}; choose another `out`")
         if any(_same(above, real) for above in place.parents):
             raise CpunetError(f"{out}: lies in the input {source}; choose another `out`")
+
+
+def _same(path: Path, other: Path) -> bool:
+    """Whether two resolved paths are the same file, also under different names."""
+    with suppress(OSError):
+        return path == other or path.samefile(other)
+    return False
 
 
 def refuse_existing(target: Path, *inputs: Given, force: bool = False) -> None:
@@ -143,13 +158,14 @@ def written_aside(target: Path) -> Iterator[Path]:
         If `target` cannot be written.
     """
     target = Path(target)
-    aside = target.parent / f"{_hidden(target.stem)}.partial{target.suffix}"
+    aside = target.parent / f".{target.stem}-{secrets.token_hex(4)}.partial{target.suffix}"
     try:
-        with _writing(target, aside):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            aside.touch(exist_ok=False)
-            yield aside
-            aside.replace(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        aside.touch(exist_ok=False)
+        yield aside
+        aside.replace(target)
+    except OSError as error:
+        raise not_written(error, target, aside) from error
     finally:
         with suppress(OSError):
             aside.unlink(missing_ok=True)
@@ -181,40 +197,24 @@ def folder_written_aside(
     refuse_existing(target, *inputs, force=force)
     require_replaceable(target, kind)
     place = target.resolve() if target.is_symlink() else target
-    aside = place.parent / _hidden(place.name)
-    try:
-        with _writing(target, aside):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            aside.mkdir()
-            yield aside
-            mark(aside, kind)
-            if force and place.exists():
-                require_replaceable(place, kind)  # the user may have come meanwhile
-                _exchange(aside, place)
-            else:
-                aside.replace(place)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
-
-
-def _exchange(aside: Path, place: Path) -> None:
-    """Move a folder into the place of another one, which is removed only afterwards."""
+    aside = place.parent / f".{place.name}-{secrets.token_hex(4)}"
     old = aside.with_name(f"{aside.name}-old")
-    place.replace(old)
     try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        aside.mkdir()
+        yield aside
+        mark(aside, kind)
+        if force and place.exists():
+            require_replaceable(place, kind)  # the user may have come meanwhile
+            place.replace(old)
         aside.replace(place)
-    except OSError:
-        old.replace(place)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
-def _writing(target: Path, aside: Path) -> Iterator[None]:
-    try:
-        yield
     except OSError as error:
         raise not_written(error, target, aside) from error
+    finally:
+        if old.exists() and not place.exists():
+            old.replace(place)
+        for path in (aside, old):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def not_written(error: OSError, target: Path, aside: Path) -> CpunetError:
@@ -228,30 +228,6 @@ def not_written(error: OSError, target: Path, aside: Path) -> CpunetError:
     )
 
 
-def _hidden(name: str) -> str:
-    return f".{name}-{secrets.token_hex(4)}"
-
-
-def _named(given: Given) -> Iterator[Path]:
-    """Existing files and folders that a command-line argument refers to."""
-    if given is None or str(given) == "":
-        return
-    text = str(given)
-    if os.path.lexists(text):
-        yield Path(text)
-    elif (file := text.rpartition(":")[0]) and os.path.lexists(file):
-        yield Path(file)
-    elif glob.has_magic(text):
-        yield from map(Path, glob.glob(text, recursive=True))  # noqa: PTH207 (absolute ones too)
-
-
-def _same(one: Path, other: Path) -> bool:
-    """Whether two resolved paths are the same file, also under different names."""
-    with suppress(OSError):
-        return one == other or one.samefile(other)
-    return False
-
-
 def _marker(folder: Path) -> tuple[str, list[str]]:
     """Kind of a folder, and the files that were listed as its own; nothing of other folders."""
     try:
@@ -263,5 +239,5 @@ def _marker(folder: Path) -> tuple[str, list[str]]:
 
 def _names(folder: Path) -> list[str]:
     """Names of the files and links below a folder, relative to it, in order."""
-    found = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+    paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in paths)

@@ -5,8 +5,8 @@ one thread as well, since the last bits of a network depend on the number of thr
 
 OpenBLAS threads wait for each other in busy loops.  The matrices here are small: a second
 thread brings no gain on idle cores.  On busy cores the other threads wait for one that has no
-core; this made scores take twelve times as long.  Both numbers that the C library is told for
-memory are set each time, so that no choice of an earlier job remains.
+core; this made scores take twelve times as long.  Both thresholds of the C library's memory are
+set each time, so that no choice of an earlier job remains.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from functools import partial
 from logging.handlers import QueueHandler
 from pathlib import Path
 from queue import SimpleQueue
@@ -82,17 +81,10 @@ def outcomes(
             torch.set_num_threads(1)
         work = make()
         for task in tasks:
-            yield task, _outcome(partial(work, task))
+            yield task, _outcome(work, task)
     finally:
         if torch is not None:
             torch.set_num_threads(before)
-
-
-def _outcome(result: Callable[[], R]) -> R | CpunetError:
-    try:
-        return result()
-    except (CpunetError, OSError) as error:
-        return CpunetError(str(error))
 
 
 def _in_processes(
@@ -101,8 +93,7 @@ def _in_processes(
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise CpunetError(f"a process runs the script that began it; {_GUARD}")
     context = multiprocessing.get_context("spawn")  # threads do not survive a fork
-    others = {*multiprocessing.active_children()}
-    noted: set[str] = set()
+    others, noted = {*multiprocessing.active_children()}, set[str]()
     left: dict[Future[tuple[Any, list[logging.LogRecord]]], T] = {}
     with ProcessPoolExecutor(jobs, context, _begin, (make,)) as pool:
         try:
@@ -112,14 +103,22 @@ def _in_processes(
                     outcome, records = future.result()
                     for record in records:
                         logger = logging.getLogger(record.name)
-                        if not (once and record.msg in noted) and logger.isEnabledFor(
-                            record.levelno
-                        ):
+                        again = once and record.msg in noted
+                        if not again and logger.isEnabledFor(record.levelno):
                             logger.handle(record)
                         noted.add(record.msg)
                     yield left.pop(future), outcome
         except BrokenProcessPool as error:
-            raise CpunetError(_why_broken()) from error
+            # each process runs the main script again, which may have no guard
+            script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+            if script.is_file() and b"__main__" not in script.read_bytes():
+                raise CpunetError(
+                    f"{script}: processes run this script again; {_GUARD}"
+                ) from error
+            raise CpunetError(
+                "a process was ended, perhaps for lack of memory; use fewer processes "
+                "(OMP_NUM_THREADS, or `jobs`), and continue with `resume`"
+            ) from error
         finally:
             if left:
                 for process in {*multiprocessing.active_children()} - others:
@@ -130,15 +129,11 @@ def _in_processes(
 _GUARD = 'put its calls under if __name__ == "__main__":'
 
 
-def _why_broken() -> str:
-    """Why processes were ended: each runs the main script again, which may have no guard."""
-    script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
-    if script.is_file() and b"__main__" not in script.read_bytes():
-        return f"{script}: processes run this script again; {_GUARD}"
-    return (
-        "a process was ended, perhaps for lack of memory; use fewer processes "
-        "(OMP_NUM_THREADS, or `jobs`), and continue with `resume`"
-    )
+def _outcome(work: Callable[[T], R], task: T) -> R | CpunetError:
+    try:
+        return work(task)
+    except (CpunetError, OSError) as error:
+        return CpunetError(str(error))
 
 
 # in a process of the pool: its work, and the messages that it has for its parent
@@ -148,12 +143,24 @@ _messages: SimpleQueue[logging.LogRecord] = SimpleQueue()
 
 def _begin(make: Callable[[], Callable[[Any], Any]]) -> None:
     """Begin the work of a process; its parent alone handles Ctrl-C, and may not outlive it."""
+
+    def leave(number: int, _frame: FrameType | None) -> None:
+        """End in a way that removes what is being written."""
+        signal.signal(number, signal.SIG_IGN)  # the pool repeats it
+        sys.exit(128 + number)
+
+    def end_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
     for number in STOPPING:
         if number == signal.SIGINT:
             signal.signal(number, signal.SIG_IGN)
         elif signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _leave)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+            signal.signal(number, leave)
+    threading.Thread(target=end_with_parent, daemon=True).start()
     from cpunet.kernels import use_threads  # imported late: numba takes a second
 
     use_threads(1)
@@ -165,22 +172,9 @@ def _begin(make: Callable[[], Callable[[Any], Any]]) -> None:
     logging.getLogger("cpunet.progress").setLevel(logging.ERROR)  # the parent counts tasks
 
 
-def _leave(number: int, _frame: FrameType | None) -> None:
-    """End in a way that removes what is being written."""
-    signal.signal(number, signal.SIG_IGN)  # the pool repeats it
-    sys.exit(128 + number)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
 def _work(task: Any) -> tuple[Any, list[logging.LogRecord]]:
     try:
-        outcome = _outcome(partial(_do, task))
+        outcome = _outcome(_do, task)
     except SystemExit:  # which the pool would take for an outcome
         os._exit(1)
     return outcome, [_messages.get() for _ in range(_messages.qsize())]
@@ -195,7 +189,7 @@ def give_back_large_arrays() -> None:
     For jobs that process files block by block.  By default the C library eventually keeps
     such arrays on its heap, which becomes fragmented and grows.
     """
-    _choose(mmap_bytes=1 << 20, trim_bytes=1 << 17)
+    _set_thresholds(mmap_bytes=1 << 20, trim_bytes=1 << 17)
 
 
 def keep_freed_memory() -> None:
@@ -204,10 +198,10 @@ def keep_freed_memory() -> None:
     For trainings.  Every step of a network allocates and frees the same hundreds of megabytes.
     Fetching them from the system again takes a tenth of the step and more.
     """
-    _choose(mmap_bytes=2**31 - 1, trim_bytes=2**31 - 1)
+    _set_thresholds(mmap_bytes=2**31 - 1, trim_bytes=2**31 - 1)
 
 
-def _choose(mmap_bytes: int, trim_bytes: int) -> None:
+def _set_thresholds(mmap_bytes: int, trim_bytes: int) -> None:
     with suppress(OSError, AttributeError, TypeError):  # another C library
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, mmap_bytes)

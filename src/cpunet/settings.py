@@ -9,6 +9,7 @@ import math
 import re
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
 
@@ -190,27 +191,24 @@ def names(folder: Path) -> list[str]:
 
 
 def read_text(name: str | Path, folder: Path | None = None) -> str:
-    """Text of a file, given by its path or by its name in `folder`."""
-    known = names(folder) if folder else []
-    file = folder / f"{name}.yaml" if folder and str(name) in known else Path(name)
+    """Text of a file, given by its path or by its name in `folder`.
+
+    It is in UTF-8 or, with a byte order mark, UTF-16; comments may be in any encoding.
+    """
+    choices = names(folder) if folder else []
+    file = folder / f"{name}.yaml" if folder and str(name) in choices else Path(name)
     try:
-        return _decoded(file.read_bytes(), str(name))
+        content = file.read_bytes()
     except FileNotFoundError as error:
-        wrong = f"neither a file nor one of {', '.join(known)}" if known else "no such file"
+        wrong = f"neither a file nor one of {', '.join(choices)}" if choices else "no such file"
         raise CpunetError(f"{name}: {wrong}") from error
     except OSError as error:
         raise CpunetError(f"{name}: cannot be read ({error.strerror}); check it") from error
-
-
-def _decoded(content: bytes, name: str) -> str:
-    """Text in UTF-8 or, with a byte order mark, UTF-16; comments may be in any encoding."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16", "replace")
-    try:
+    with suppress(UnicodeDecodeError):
         return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        lines = content.splitlines()
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(content.splitlines(), 1):
         if b"\0" in line or not line.split(b"#")[0].isascii():
             raise CpunetError(f"{name}: line {number} is not UTF-8; save it as UTF-8")
     return content.decode("latin-1")
@@ -220,7 +218,7 @@ def read_values(name: str | Path, folder: Path | None = None) -> dict[str, Any]:
     """Read a mapping from a YAML or JSON file, see `read_text`."""
     text = read_text(name, folder)
     is_json = Path(name).suffix.lower() == ".json"  # may be indented with tabs
-    values = _parsed(text, str(name), json.loads if is_json else _loaded)
+    values = _parsed(text, str(name), is_json=is_json)
     if not isinstance(values, dict):
         raise CpunetError(f"{name}: holds no settings; write lines such as dt_ns: 16")
     return values
@@ -261,13 +259,9 @@ def yaml_text(values: Any) -> str:
     return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
-def _loaded(text: str) -> Any:
-    return yaml.load(text, _Loader)
-
-
-def _parsed(text: str, source: str, parse: Any = _loaded) -> Any:
+def _parsed(text: str, source: str, *, is_json: bool = False) -> Any:
     try:
-        return parse(text)
+        return json.loads(text) if is_json else yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError) as error:
         raise CpunetError(f"{source}: not YAML ({' '.join(str(error).split())})") from error
 
@@ -277,9 +271,9 @@ def _fault(
 ) -> str:
     faults = error.errors(include_url=False)
     # what is missing may be misspelt
-    first = next((one for one in faults if one["type"] == "extra_forbidden"), faults[0])
+    first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), faults[0])
     # a location also has the members of unions
-    keys = []
+    keys: list[Any] = []
     for place, part in enumerate(first["loc"]):
         try:
             values = values[part]
@@ -291,24 +285,19 @@ def _fault(
     if first["type"] == "missing":
         return f"{key}: {missing.get(key, 'missing; add it')}"
     if first["type"] == "extra_forbidden":
-        known = _fields(kind, keys[:-1])
-        near = difflib.get_close_matches(str(keys[-1]), known, 1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+        kinds: set[Any] = {kind}
+        for name in filter(lambda name: isinstance(name, str), keys[:-1]):  # no place in a list
+            fields = [of.model_fields[name] for of in kinds if name in of.model_fields]
+            kinds = set().union(*(_kinds(field.annotation) for field in fields))
+            kinds = {of for of in kinds if isinstance(of, type) and issubclass(of, Config)}
+        names = list(dict.fromkeys(name for of in kinds for name in of.model_fields))
+        near = difflib.get_close_matches(str(keys[-1]), names, 1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
         return f"{key[:60]}: no such setting; {hint}"
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] != "value_error":
         message += f" ({reprlib.repr(first['input'])})"
     return f"{key}: {message}" if key else message
-
-
-def _fields(kind: type[Config], keys: list[Any]) -> list[str]:
-    """Names of the fields of a part of settings."""
-    kinds: set[Any] = {kind}
-    for key in filter(lambda key: isinstance(key, str), keys):  # no places in a list
-        found = [one.model_fields[key] for one in kinds if key in one.model_fields]
-        kinds = set().union(*(_kinds(field.annotation) for field in found))
-        kinds = {one for one in kinds if isinstance(one, type) and issubclass(one, Config)}
-    return list(dict.fromkeys(name for one in kinds for name in one.model_fields))
 
 
 def _kinds(annotation: Any) -> set[Any]:

@@ -33,10 +33,9 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     files = ["--sim", stand.sim, "--data", raw, "--data-table", "all"]
     trained = command("train", *files, "--out", tmp_path / "runs", *tiny)
     assert trained.code == 1
-    told = trained.out.splitlines()
-    assert told[0].startswith("ch1  Run ")
-    assert told[1].startswith("ch2  Run ")
-    assert told[2].startswith("ch3  failed: ")
+    begins = ["ch1  Run ", "ch2  Run ", "ch3  failed: "]
+    for line, begin in zip(trained.out.splitlines()[:3], begins, strict=True):
+        assert line.startswith(begin)
     info = json.loads((tmp_path / "runs" / "ch2" / "run.json").read_text())
     assert info["data"]["read_as"] == {"table": "ch2/raw"}
 
@@ -73,21 +72,18 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert len(lh5.read("geds/iren/energy", out / "ch2.lh5")) == len(stand.data_kev)
 
     # one simulation serves all channels
-    made = tmp_path / "made"
-    one = command("translate", tmp_path / "runs", stand.sim, "--table", "all", "--out", made)
-    assert one.code == 0, one.err
-    assert sorted(file.name for file in made.glob("*.lh5")) == ["ch1.lh5", "ch2.lh5"]
+    both = tmp_path / "both"
+    single = command("translate", tmp_path / "runs", stand.sim, "--table", "all", "--out", both)
+    assert single.code == 0, single.err
+    assert sorted(file.name for file in both.glob("*.lh5")) == ["ch1.lh5", "ch2.lh5"]
 
     # every option reaches the channels
     refused = command(
         "translate",
         tmp_path / "runs",
         raw,
-        *words[:3],
-        "--pile-up-khz",
-        1,
-        "--out",
-        tmp_path / "piled",
+        *(*words[:3], "--pile-up-khz", 1),
+        *("--out", tmp_path / "piled"),
     )
     assert "leave out --pile-up-khz" in refused.out + refused.err
 

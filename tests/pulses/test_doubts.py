@@ -13,13 +13,12 @@ from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.description import rolled_over
+from cpunet.pulses.doubts import go_down, mismatched, rolled_over, second_rate
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.seen import apart, go_down, second_rate
 from cpunet.pulses.writing import PulseWriter
 from synthetic import load_recipe, waveform_table, write_pulses
 
@@ -61,10 +60,10 @@ def test_the_polarity_is_the_reason_and_not_the_energies(tmp_path):
 def test_amplitudes_go_with_their_energies_and_with_no_others(resolution):
     rng, energies = np.random.default_rng(3), kev()
     amplitudes = GAIN * energies * rng.normal(1, resolution, N)
-    assert apart(energies, amplitudes) == 0
+    assert mismatched(energies, amplitudes) == 0
     different = np.mean(energies != np.roll(energies, 1))
-    assert apart(np.roll(energies, 1), amplitudes) == pytest.approx(different, abs=0.1)
-    assert apart(np.roll(energies, 1), np.ones(N)) == 0  # scaled to one height
+    assert mismatched(np.roll(energies, 1), amplitudes) == pytest.approx(different, abs=0.1)
+    assert mismatched(np.roll(energies, 1), np.ones(N)) == 0  # scaled to one height
 
 
 def test_energies_of_other_pulses_are_refused_unless_one_insists(tmp_path):

@@ -55,8 +55,8 @@ def test_a_single_table_is_found_and_read_in_blocks(file, raw):
     np.testing.assert_array_equal(pulses.energy_kev, energy)
     np.testing.assert_array_equal(pulses.event_number, np.arange(N) * 7)
     np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), raw)
-    assert source.table.format == "LH5"
-    assert source.table.name == "geds/raw/waveform"
+    assert source.format == "LH5"
+    assert source.name == "geds/raw/waveform"
     assert sorted(source.columns) == ["energy", "eventnumber"]
 
 
@@ -149,7 +149,7 @@ def test_of_several_columns_the_full_rate_is_taken_and_told(file, raw, caplog):
         "waveform_windowed": waveform_table(raw),
     }
     lh5.write(Table(col_dict=columns), "raw", file)
-    assert open_pulses(file).table.name == "raw/waveform_windowed"
+    assert open_pulses(file).name == "raw/waveform_windowed"
     (told,) = caplog.messages
     assert "waveform_windowed is read, at the full rate, not waveform_presummed" in told
     other = open_pulses(file, table="raw/waveform_presummed")

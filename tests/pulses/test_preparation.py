@@ -16,12 +16,11 @@ from cpunet.errors import CpunetError
 from cpunet.pulses import loading
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.description import describe_pulses
-from cpunet.pulses.loading import load_prepared
 from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.preparation import Prepared, Rejection, prepare
-from cpunet.pulses.reading import PulseSource
+from cpunet.pulses.preparation import Kind, Prepared, Rejection, prepare
 from cpunet.pulses.reading.files import PulseFile
 from synthetic import PREPARATION as CONFIG
+from synthetic import load_recipe
 
 DT_NS = 16.0
 Array = npt.NDArray[np.float64]
@@ -261,7 +260,7 @@ SIZES |= {"decay_fit_ns": 160, "padding_before_ns": 80}
 SHORT = CONFIG.model_copy(update=SIZES)
 
 
-def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> PulseSource:
+def file_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> PulseFile:
     energy_kev = np.asarray(energies, float)
     t = np.maximum(np.arange(60) - 27, 0)
     raw = (
@@ -270,7 +269,7 @@ def source_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> Pulse
     raw *= 1 + 1e-6 * np.arange(len(raw))[:, None]  # else they are copies
     raw[broken or []] = np.nan
     pulses = Pulses.of(raw, dt_ns=16, energy_kev=energy_kev)
-    return PulseFile(Path("run7.lh5"), pulses=pulses).open()
+    return PulseFile(Path("run7.lh5"), pulses=pulses, insist=True)
 
 
 @pytest.fixture(autouse=True)
@@ -279,11 +278,18 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 NEAR_1000 = parse_selection("900-1100", {})
+FAST = load_recipe("fast")
+WIDE = FAST.cuts.model_copy(update=dict.fromkeys(type(FAST.cuts).model_fields, 1e9))
+RECIPE = FAST.model_copy(update={"preparation": SHORT, "cuts": WIDE})
+
+
+def load(file: PulseFile, side: Kind = "measured", max_pulses: int | None = None) -> Prepared:
+    return loading.load_pulses(file, side, RECIPE, NEAR_1000, max_pulses=max_pulses).prepared
 
 
 def test_every_pulse_is_kept_or_counted() -> None:
     energies = [1000, 1001, 50, np.nan, 1002, 1003, 2000, 999, 998, np.nan]
-    prepared = load_prepared(source_of(energies, [4]), SHORT, "measured", selection=NEAR_1000)
+    prepared = load(file_of(energies, [4]))
     assert prepared.pulses.energy_kev.tolist() == [1000, 1001, 1003, 999, 998]
     assert prepared.index.tolist() == [0, 1, 5, 7, 8]
     assert prepared.rejections == {"nan": 1, "energy_unknown": 2, "energy_outside_selection": 2}
@@ -293,13 +299,15 @@ def test_every_pulse_is_kept_or_counted() -> None:
 @pytest.mark.parametrize("kind", ["measured", "simulated"])
 @pytest.mark.parametrize("same_events", [True, False])
 def test_rows_written_twice_count_once(kind, same_events) -> None:
-    once = source_of([1000, 1001, 1002, 1003, 1004, 50]).read()
+    once = file_of([1000, 1001, 1002, 1003, 1004, 50])[:]
     again = once if same_events else replace(once, event_number=once.event_number + 6)
-    source = PulseFile(Path("run7.lh5"), pulses=Pulses.concatenate([once, again])).open()
-    prepared = load_prepared(source, SHORT, kind, selection=NEAR_1000)
+    twice = Pulses.concatenate([once, again])
+    file = PulseFile(Path("run7.lh5"), pulses=twice, insist=True)
+    prepared = load(file, kind)
     copies = 5 if same_events or kind == "measured" else 0
     assert prepared.rejections.get("copies", 0) == copies
     assert prepared.index.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9, 10][: 10 - copies]
+    source = file.open()
     lines = dict(describe_pulses(source, source.blocks(), {}))
     assert "6 traces copies of others" in lines["samples"]
 
@@ -310,22 +318,17 @@ def test_rows_written_twice_count_once(kind, same_events) -> None:
     st.integers(1, 20),
 )
 def test_counts_add_up(energies: list[float], max_pulses: int) -> None:
-    source = source_of([*energies, 1000.0])
-    prepared = load_prepared(
-        source, SHORT, "measured", selection=NEAR_1000, max_pulses=max_pulses
-    )
+    file = file_of([*energies, 1000.0])
+    prepared = load(file, max_pulses=max_pulses)
     assert len(prepared) + sum(prepared.rejections.values()) == prepared.n_read
     assert prepared.n_read == len(energies) + 1
     assert len(prepared) == min(max_pulses, energies.count(1000.0) + 1)
-    assert (source.read().energy_kev[prepared.index] == 1000).all()
+    assert (file.energy_kev[prepared.index] == 1000).all()
 
 
 def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
-    source = source_of([1000.0, 50.0] * 500)
-    first, second = (
-        load_prepared(source, SHORT, "measured", selection=NEAR_1000, max_pulses=60)
-        for _ in range(2)
-    )
+    file = file_of([1000.0, 50.0] * 500)
+    first, second = (load(file, max_pulses=60) for _ in range(2))
     assert (len(first), first.n_read) == (60, 1000)
     assert first.rejections == {"energy_outside_selection": 500, "not_drawn": 440}
     assert (first.index == second.index).all()
@@ -333,7 +336,7 @@ def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     # rows 0, 2 ... 998, each as likely: their mean is 499 with a scatter of 289 / sqrt(60)
     assert abs(first.index.mean() - 499) < 3 * 289 / 60**0.5
     assert (first.codes[first.index] == 0).all()
-    whole = load_prepared(source, SHORT, "measured", selection=NEAR_1000)
+    whole = load(file)
     same = np.isin(whole.index, first.index)
     assert (whole.pulses.waveforms[same] == first.pulses.waveforms).all()
 
@@ -355,7 +358,7 @@ def test_nothing_left_is_one_line_with_counts_and_remedy(
     energies: list[float], broken: list[int], words: list[str]
 ) -> None:
     with pytest.raises(CpunetError) as error:
-        load_prepared(source_of(energies, broken), SHORT, "measured", selection=NEAR_1000)
+        load(file_of(energies, broken))
     message = str(error.value)
     assert "\n" not in message
     assert all(word in message for word in words), message

@@ -200,7 +200,7 @@ def test_foreign_files(tmp_path, suffix, content):
 def test_content_counts_more_than_the_name(tmp_path):
     pulses = Pulses.of(np.zeros((2, 20)), dt_ns=16)
     write_pulses(tmp_path / "pulses.npz", pulses)
-    assert open_pulses(tmp_path / "pulses.npz").table.format == "LH5"
+    assert open_pulses(tmp_path / "pulses.npz").format == "LH5"
 
 
 def write_all(folder: Path) -> list[Path]:

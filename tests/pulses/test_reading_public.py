@@ -57,8 +57,8 @@ def test_one_detector_of_the_majorana_release(tmp_path):
     np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), traces[rows])
     labels = source.columns["psd_label_low_avse"].read(0, len(rows))
     np.testing.assert_array_equal(labels, rows % 2)
-    assert (source.table.format, source.table.name) == ("Majorana release", "9")
-    assert source.energies.description == "column energy [keV]"
+    assert (source.format, source.name) == ("Majorana release", "9")
+    assert source.energies == "column energy [keV]"
 
 
 def test_all_detectors_and_files_without_labels(tmp_path):
@@ -66,7 +66,7 @@ def test_all_detectors_and_files_without_labels(tmp_path):
     write_majorana(file, 6, labels=False, length=40)
     with open_pulses(file, table="raw_waveform", dt_ns=10) as source:
         assert source.n_pulses == 6
-        assert source.energies.description == "not known"
+        assert source.energies == "not known"
     with h5py.File(file, "r+") as content:
         content["detector"][...] = 5
     assert len(open_pulses(file, dt_ns=10).read()) == 6
@@ -107,8 +107,8 @@ def test_pickled_pulses(tmp_path, lists):
     file = write_pickles(tmp_path / "fep_wf_ornl.pickle", traces, lists=lists, dc_label=0.0)
     source = open_pulses(file, dt_ns=16)
     assert (source.n_pulses, source.length) == (23, 40)
-    assert source.table.format == "pickled pulses"
-    assert source.energies.description == "column energy [keV]"
+    assert source.format == "pickled pulses"
+    assert source.energies == "column energy [keV]"
     assert sorted(source.columns) == ["dc_label", "energy", "event_number", "tp0"]
     columns = source.columns
     np.testing.assert_array_equal(columns["tp0"].read(3, 5), [403, 404])

@@ -17,7 +17,6 @@ from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.training.inverse import fit_inverse
-from cpunet.translation.backends import Drawn
 from cpunet.translation.translator import IREN, REN
 from games import untrained
 from synthetic import (
@@ -276,8 +275,8 @@ def test_other_pulses_are_added_with_the_noise(noisy_run, prepared_sim):
     piled = InTracePileUp(
         len(prepared_sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
     )
-    drawn = Drawn(generator=np.random.default_rng(1), piled=piled, **energies)
-    result = ren.apply_with_codes(prepared_sim, drawn).windows
+    drawn = {"generator": np.random.default_rng(1), "piled": piled}
+    result = ren.apply(prepared_sim, **drawn, **energies)
     step = result[4] - plain[4]
     # 0.2 of the height of 1, less by the scale: the tail is higher too
     assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)

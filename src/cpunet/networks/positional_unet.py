@@ -135,7 +135,12 @@ class PositionalUNet(nn.Module):
         self.maps_up = maps((4 * m, 8, 4 * m), (2 * m, 4, 2 * m), (m, 2, 2 * m))
 
     def forward(
-        self, pulses: Tensor, *, generator: torch.Generator | None = None, mean: bool = False
+        self,
+        pulses: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+        mean: bool = False,
+        epsilon: Tensor | None = None,
     ) -> Tensor:
         """Translate pulses.
 
@@ -147,6 +152,8 @@ class PositionalUNet(nn.Module):
             Source of the latent noise, for reproducible draws.
         mean
             Take the latent mean instead of a draw: the same output every time.
+        epsilon
+            The draw itself, shape (batch, channels, samples / 16).
 
         Returns
         -------
@@ -159,22 +166,20 @@ class PositionalUNet(nn.Module):
             x = position(block(nn.functional.max_pool1d(x, 2)))
             skips.append(x)
         x = self.down[3](nn.functional.max_pool1d(x, 2))  # (batch, 8m, samples / 16)
-        x = self.map_latent(self._latent(x, generator, mean))
+        centre = self.latent_mean(x)
+        if mean or self.residual:
+            x = self.map_latent(centre)
+        else:  # from the latent normal distribution (reparameterised: gradients flow)
+            spread = torch.exp(0.5 * self.latent_log_variance(x))
+            if epsilon is None:
+                epsilon = torch.empty_like(centre).normal_(generator=generator)
+            x = self.map_latent(centre + spread * epsilon)
         for level, block in enumerate(self.up):
             x = nn.functional.interpolate(x, scale_factor=2, mode="linear", align_corners=True)
             x = block(torch.cat([skips[3 - level], x], dim=1))
             if level < 3:
                 x = self.maps_up[level](x)
         return self.outlet(x)  # type: ignore[no-any-return]
-
-    def _latent(self, x: Tensor, generator: torch.Generator | None, mean: bool) -> Tensor:
-        """Draw from the latent normal distribution (reparameterised: gradients flow)."""
-        centre: Tensor = self.latent_mean(x)
-        if mean or self.residual:
-            return centre
-        spread = torch.exp(0.5 * self.latent_log_variance(x))
-        noise = torch.empty_like(centre).normal_(generator=generator)
-        return centre + spread * noise
 
 
 # Cycles of the initial sines over the whole table.  Slow ones are nearly monotonic, so

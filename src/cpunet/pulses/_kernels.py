@@ -7,10 +7,10 @@ float64.  Traces are read in place and never copied.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.kernels import kernel
 
@@ -95,11 +95,9 @@ def line(values):  # type: ignore[no-untyped-def]
 @compiled
 def quietest_rms(baseline):  # type: ignore[no-untyped-def]
     """RMS about a straight line in the quietest part of the baseline."""
-    size = len(baseline) // _PARTS
-    quietest = math.inf
+    size, quietest = len(baseline) // _PARTS, math.inf
     for part in range(_PARTS):
-        _, _, rms = line(baseline[part * size : (part + 1) * size])
-        quietest = min(quietest, rms)
+        quietest = min(quietest, line(baseline[part * size : (part + 1) * size])[2])
     return quietest
 
 
@@ -117,22 +115,6 @@ def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _longest_run(trace, top, first, shortest):  # type: ignore[no-untyped-def]
-    """Length and end of the longest run of `top`, if one has at least `shortest` samples."""
-    longest = end = 0
-    for sample in range(first, len(trace), shortest):  # no such run fits in between
-        if trace[sample] == top:
-            start = stop = sample
-            while start > first and trace[start - 1] == top:
-                start -= 1
-            while stop < len(trace) and trace[stop] == top:
-                stop += 1
-            if stop - start > longest:
-                longest, end = stop - start, stop
-    return longest, end
-
-
-@compiled
 def is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore[no-untyped-def]
     """Whether the top of a measured trace is flatter than noise and ADC steps can explain.
 
@@ -140,7 +122,16 @@ def is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore
     mostly does (coarse steps, or no noise), the fall after the flat top decides: clipping
     cuts off far more than one step.
     """
-    longest, end = _longest_run(trace, top, top_sample, saturation_run)
+    longest = end = 0  # length and end of the longest run of `top`
+    for sample in range(top_sample, len(trace), saturation_run):  # no long run fits in between
+        if trace[sample] == top:
+            start = stop = sample
+            while start > top_sample and trace[start - 1] == top:
+                start -= 1
+            while stop < len(trace) and trace[stop] == top:
+                stop += 1
+            if stop - start > longest:
+                longest, end = stop - start, stop
     if longest < saturation_run:
         return False
     if top == 65535 or top == 16383 or top == 4095:  # full scale of 16, 14 and 12 bits
@@ -186,13 +177,28 @@ def tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
     return total / tail_samples
 
 
-# Stable rejection codes; `preparation.Rejection` names them.
-ACCEPTED, NAN, CONSTANT, SATURATED = range(4)
-WINDOW_OUTSIDE_RECORD, NO_AMPLITUDE, TAIL_NOT_POSITIVE = range(4, 7)
-PULSE_AT_EDGE, NO_PLATEAU, SECOND_PULSE = range(7, 10)
+class Rejection(IntEnum):
+    """Reason why a pulse was rejected; values and labels are stored and never change.
 
-# Columns of the table of numbers kept for each pulse.
-BASELINE, SCALE, ALIGN_SAMPLE, BASELINE_RMS, BASELINE_SLOPE, TAIL_SLOPE, CHI2 = range(7)
+    Examples
+    --------
+    >>> Rejection(4).label
+    'window_outside_record'
+    """
+
+    ACCEPTED, NAN, CONSTANT, SATURATED = range(4)
+    WINDOW_OUTSIDE_RECORD, NO_AMPLITUDE, TAIL_NOT_POSITIVE = range(4, 7)
+    PULSE_AT_EDGE, NO_PLATEAU, SECOND_PULSE = range(7, 10)
+    ENERGY_UNKNOWN, ENERGY_OUTSIDE_SELECTION, NOT_DRAWN, COPIES = range(16, 20)
+    TAIL_SLOPE, CHI2, BASELINE, BASELINE_SLOPE = range(32, 36)
+
+    @property
+    def label(self) -> str:
+        """Name used in counts and reports."""
+        return self.name.lower()
+
+
+COLUMNS = 7  # numbers of a pulse, see `_prepare_one`
 
 # The alignment moves the window of the baseline, and this the level at which it is searched.
 # Two rounds settle all but exact ties.
@@ -226,7 +232,7 @@ class Settings(NamedTuple):
     simulated: bool
     samples_before: int
     samples_after: int
-    align_fraction: float  # of the maximum; 0 for half of the height
+    of_maximum: float  # at which pulses are aligned; 0 for half of the height
     baseline_samples: int
     tail_samples: int
     tail_level: float
@@ -256,22 +262,6 @@ def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _align_sample(trace, base, top, top_sample, fraction, preferred):  # type: ignore[no-untyped-def]
-    """The alignment sample; `preferred` if rounding alone could move it there or away.
-
-    Without this preference, one prepared pulse in ten thousand would shift by a sample
-    when prepared again.
-    """
-    threshold = base + fraction * (top - base)
-    slack = _ROUNDING * (top - base)
-    first = crossing(trace, top_sample, threshold - slack)
-    last = crossing(trace, top_sample, min(threshold + slack, top))
-    if first <= preferred <= last:
-        return preferred
-    return crossing(trace, top_sample, threshold)
-
-
-@compiled
 def _baseline_stretch(length, start, s):  # type: ignore[no-untyped-def]
     """Samples of the record in the baseline part of a window; at least one."""
     first = min(max(start, 0), length - 1)
@@ -288,9 +278,14 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
         base = mean_of(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
     align = -1
     for _ in range(_ROUNDS):
-        refined = _align_sample(
-            trace, base, top, top_sample, s.align_fraction, s.samples_before
-        )
+        # Without a preference for an aligned sample that rounding alone could move, a prepared
+        # pulse in ten thousand would shift by a sample when prepared again.
+        threshold = base + s.of_maximum * (top - base)
+        slack, refined = _ROUNDING * (top - base), s.samples_before
+        first = crossing(trace, top_sample, threshold - slack)
+        last = crossing(trace, top_sample, min(threshold + slack, top))
+        if not first <= refined <= last:
+            refined = crossing(trace, top_sample, threshold)
         if refined == align:
             break
         align = refined
@@ -367,16 +362,6 @@ def _half_crossing(trace, smooth, align, level, s):  # type: ignore[no-untyped-d
 
 
 @compiled
-def _is_normalised(trace, base, s):  # type: ignore[no-untyped-def]
-    """Whether a trace as long as a window has the baseline and the scale of a prepared one."""
-    if s.simulated:
-        scale = np.float64(highest_of(trace))
-    else:
-        scale = tail_mean(trace, len(trace), s.tail_samples) / s.tail_level
-    return abs(base) < _NORMALISED and abs(scale - 1.0) < _NORMALISED
-
-
-@compiled
 def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     """The sample nearest to the crossing of half the height, base, height and rise."""
     length = len(trace)
@@ -384,7 +369,12 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     if length == s.samples_before + s.samples_after:  # prepared already?
         align = s.samples_before
         base, height, rise = _level_at(trace, align, s)
-        near = max(s.prepared, _NEAREST) if _is_normalised(trace, base, s) else _NEAREST
+        if s.simulated:
+            scale = np.float64(highest_of(trace))
+        else:
+            scale = tail_mean(trace, length, s.tail_samples) / s.tail_level
+        normalised = abs(base) < _NORMALISED and abs(scale - 1.0) < _NORMALISED
+        near = max(s.prepared, _NEAREST) if normalised else _NEAREST
         if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < near:
             return align, base, height, rise
     top = highest_of(smooth)
@@ -434,9 +424,8 @@ def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-d
 @compiled
 def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
     """Write `(trace - base) / scale`: 0 before the record, its last value after it."""
-    length = len(trace)
+    length, factor = len(trace), 1.0 / scale
     first, stop = max(0, -start), min(len(window), length - start)
-    factor = 1.0 / scale
     window[:first] = 0
     for i in range(first, stop):
         window[i] = (trace[start + i] - base) * factor
@@ -445,18 +434,22 @@ def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
 
 @compiled
 def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-untyped-def]
-    """Fill `window` and `numbers` from one trace and return its code."""
+    """Fill a window and numbers from a trace and return its code.
+
+    The numbers are baseline, scale, aligned sample, RMS and slope of the baseline over the
+    scale, slope of the logarithm of the tail, and its chi-square; slopes are per sample.
+    """
     if not all_finite(trace):
-        return NAN
+        return Rejection.NAN
     length, top = len(trace), np.float64(highest_of(trace))
     if top == lowest_of(trace):
-        return CONSTANT
+        return Rejection.CONSTANT
     top_sample = first_at(trace, top)
     quiet = min(s.baseline_samples, max(2, top_sample // 2), length)
     if not s.simulated and is_saturated(trace, quiet, top, top_sample, s.saturation_run):
-        return SATURATED
+        return Rejection.SATURATED
 
-    if s.align_fraction == 0:
+    if s.of_maximum == 0:
         align, base, height, rise = _aligned_half(trace, smooth, s)
         top = np.float64(highest_of(trace[: min(align + s.samples_after, length)]))
     else:
@@ -470,8 +463,8 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
         scale = top - base
     else:
         quietest = quietest_rms(trace[first:last])
-        if height < (_MIN_HEIGHT_RMS if s.align_fraction == 0 else _MIN_TOP_RMS) * quietest:
-            return NO_AMPLITUDE
+        if height < (_MIN_HEIGHT_RMS if s.of_maximum == 0 else _MIN_TOP_RMS) * quietest:
+            return Rejection.NO_AMPLITUDE
         first, last = _before_pulse(trace, align, mean, top, quietest, s)
         _, slope, rms = line(trace[first:last])
         # no samples for the baseline, or more to fill in than is allowed
@@ -479,62 +472,32 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
         if start < -before or stop > length + s.max_padding_after:
             highest, quiet_base = highest_of(trace), mean_of(trace[:quiet])
             if highest - quiet_base < _MAX_RISE * (highest - lowest_of(trace)):
-                return NO_AMPLITUDE  # the pulse goes down
+                return Rejection.NO_AMPLITUDE  # the pulse goes down
             short = length + before + s.max_padding_after < len(window)
-            return WINDOW_OUTSIDE_RECORD if short else PULSE_AT_EDGE
+            return Rejection.WINDOW_OUTSIDE_RECORD if short else Rejection.PULSE_AT_EDGE
         base = mean
         scale = (tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
         if rise > max(_MAX_RISE * height, _MAX_RISE_RMS * quietest):
-            return SECOND_PULSE if _jumps(smooth, align, rise, s) else NO_PLATEAU
+            jumps = _jumps(smooth, align, rise, s)
+            return Rejection.SECOND_PULSE if jumps else Rejection.NO_PLATEAU
     if not scale > 0:
-        return NO_AMPLITUDE
+        return Rejection.NO_AMPLITUDE
 
     _fill(trace, start, base, scale, window)
     tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
     if math.isnan(tail_slope):
-        return TAIL_NOT_POSITIVE
-    numbers[BASELINE], numbers[SCALE], numbers[ALIGN_SAMPLE] = base, scale, align
-    numbers[BASELINE_RMS], numbers[BASELINE_SLOPE] = rms / scale, slope / scale
-    numbers[TAIL_SLOPE], numbers[CHI2] = tail_slope, chi2
-    return ACCEPTED
+        return Rejection.TAIL_NOT_POSITIVE
+    numbers[0], numbers[1], numbers[2], numbers[3] = base, scale, align, rms / scale
+    numbers[4], numbers[5], numbers[6] = slope / scale, tail_slope, chi2
+    return Rejection.ACCEPTED
 
 
 @compiled
-def _prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
+def prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
     """Prepare all traces; accepted ones fill the first rows.  Return how many there are."""
     logs, smooth = np.empty(s.decay_fit_samples), np.empty(waveforms.shape[1])
-    kept = 0
+    n = 0
     for i in range(len(waveforms)):
-        codes[i] = _prepare_one(waveforms[i], s, windows[kept], numbers[kept], logs, smooth)
-        kept += codes[i] == ACCEPTED
-    return kept
-
-
-def prepare_block(
-    waveforms: npt.NDArray[np.float32], settings: Settings
-) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32], npt.NDArray[np.float64]]:
-    """Prepare every trace of a block.
-
-    Parameters
-    ----------
-    waveforms
-        Raw traces, shape ``(n, length)`` with at least one sample each.
-    settings
-        Settings of the preparation.
-
-    Returns
-    -------
-    tuple
-        Codes of shape ``(n,)``.  For the accepted traces, windows of shape ``(kept,
-        samples_before + samples_after)`` and numbers of shape ``(kept, columns)``, with
-        slopes per sample.
-    """
-    n = len(waveforms)
-    length = settings.samples_before + settings.samples_after
-    windows = np.empty((n, length), np.float32)
-    numbers = np.empty((n, CHI2 + 1))
-    codes = np.empty(n, np.uint8)
-    kept = _prepare_block(np.ascontiguousarray(waveforms), settings, windows, numbers, codes)
-    # Releases the unused rows without copying the others.
-    windows.resize((kept, length), refcheck=False)
-    return codes, windows, numbers[:kept]
+        codes[i] = _prepare_one(waveforms[i], s, windows[n], numbers[n], logs, smooth)
+        n += codes[i] == Rejection.ACCEPTED
+    return n

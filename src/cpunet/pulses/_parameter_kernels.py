@@ -84,49 +84,12 @@ def averaged_maxima(current, first, samples, upsampling, widths, ends):  # type:
         highest[:] = values[ends]
         for i in range(ends, fine - ends):
             for lane in range(LANES):
-                # a NaN is kept
+                # a NaN remains
                 if not values[i, lane] <= highest[lane]:
                     highest[lane] = values[i, lane]
         for lane in range(min(LANES, n - begin)):
             maxima[begin + lane] = highest[lane]
     return maxima
-
-
-@_compiled
-def currents(waveforms):  # type: ignore[no-untyped-def]
-    """Differences of neighbouring samples, and the index of the largest one of each pulse.
-
-    A pulse with a NaN has a current of NaN.
-    """
-    n, samples = waveforms.shape[0], waveforms.shape[1] - 1
-    current, steepest = np.empty((n, samples), np.float32), np.empty(n, np.int64)
-    for row in range(len(waveforms)):
-        unknown = False
-        best = 0
-        for i in range(samples):
-            current[row, i] = waveforms[row, i + 1] - waveforms[row, i]
-            unknown |= math.isnan(waveforms[row, i])
-        unknown |= math.isnan(waveforms[row, samples])
-        if unknown:
-            current[row] = math.nan
-        for i in range(samples):
-            if current[row, i] > current[row, best]:
-                best = i
-        steepest[row] = best
-    return current, steepest
-
-
-@_compiled
-def maxima_elsewhere(current, first, samples):  # type: ignore[no-untyped-def]
-    """Largest current of each pulse outside the `samples` samples that start at `first`."""
-    highest = np.empty(len(current), np.float32)
-    for row in range(len(current)):
-        highest[row] = -math.inf
-        for i in range(current.shape[1]):
-            inside = first[row] <= i < first[row] + samples
-            if not (inside or current[row, i] <= highest[row]):
-                highest[row] = current[row, i]
-    return highest
 
 
 @_compiled

@@ -1,4 +1,4 @@
-"""What noise and pile-up tails need of raw traces, kept while these are read once."""
+"""What noise and pile-up tails need of raw traces."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import FloatColumn, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
-TRACES = 16384  # whose baselines are kept
-WHOLE = 1024  # traces of the selected energies that are kept as a whole
+TRACES = 16384  # whose baselines are stored
+WHOLE = 1024  # traces of the selected energies that are stored as a whole
 SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those used
-KEPT_SHARE = 0.5  # the same for those kept, since those of some of the traces may be longer
+STORED_SHARE = 0.5  # the same for those stored, since those of some traces may be longer
 # Threshold of the start of a pulse, and time before it in which the pulse may already rise.
 START_FRACTION, START_SIGMAS, MARGIN_NS = 0.01, 8.0, 960.0
 
@@ -81,15 +81,21 @@ class Baselines:
         like: Baselines | None = None,
     ) -> Self:
         """Baselines of some traces, raw and prepared, as long as those of the first ones."""
-        before = samples_before_pulses(prepared, config)
+        config, windows = config.at(prepared.pulses.dt_ns), prepared.pulses.waveforms
+        # start of the pulse proper: all samples from there to the alignment are above threshold
+        level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+        above = windows[:, : config.samples_before] >= level[:, np.newaxis]
+        start = config.samples_before - (~above[:, ::-1]).argmax(axis=1)
+        before = np.asarray(
+            prepared.align_sample - config.samples_before + start - config.samples(MARGIN_NS)
+        )
         if like is not None:
-            length, kept = like.length, like.first.length
+            length, stored = like.length, like.first.length
         else:
-            shares = np.quantile(before if len(before) else [0], (SHORTEST_SHARE, KEPT_SHARE))
-            length, kept = (max(int(samples), 0) for samples in shares)
-        windows = prepared.pulses.waveforms
+            shares = np.quantile(before if len(before) else [0], (SHORTEST_SHARE, STORED_SHARE))
+            length, stored = (max(int(samples), 0) for samples in shares)
         return cls(
-            first=raw.with_waveforms(raw.waveforms[:, :kept].copy()),
+            first=raw.with_waveforms(raw.waveforms[:, :stored].copy()),
             prepared=replace(
                 prepared, pulses=prepared.pulses.with_waveforms(windows[:, :0].copy())
             ),
@@ -109,16 +115,3 @@ class Baselines:
             length=parts[0].length,
             whole=whole,
         )
-
-
-def samples_before_pulses(prepared: Prepared, config: PreparationConfig) -> Rows:
-    """Number of samples of each raw trace that safely precede its pulse, shape ``(n,)``."""
-    config = config.at(prepared.pulses.dt_ns)
-    windows = prepared.pulses.waveforms[:, : config.samples_before]
-    level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
-    above = windows >= level[:, np.newaxis]
-    # Start of the pulse proper: every sample from there to the alignment is above threshold.
-    start = windows.shape[1] - (~above[:, ::-1]).argmax(axis=1)
-    return np.asarray(
-        prepared.align_sample - config.samples_before + start - config.samples(MARGIN_NS)
-    )

@@ -187,3 +187,15 @@ def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> 
 def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:
     """Slices of `size` rows that cover `n` pulses."""
     return (slice(first, first + size) for first in range(0, n, size))
+
+
+def line_slope(n: int) -> npt.NDArray[np.float64]:
+    """Weights of `n` equally spaced values that give the slope of a straight line per sample.
+
+    Examples
+    --------
+    >>> float(line_slope(5) @ np.array([3.0, 5.0, 7.0, 9.0, 11.0]))
+    2.0
+    """
+    lever = np.arange(n) - (n - 1) / 2
+    return np.asarray(lever / (lever @ lever))

@@ -62,7 +62,12 @@ def legend_parameters(
         times[name] = last = interpolated_time_point_thresh(
             corrected, fraction * height, np.ceil(np.nan_to_num(last)).astype(int), 0, ord("l")
         )
-    filtered = _t0_filtered(corrected, dt_ns)
+    # behind dspeed's ``t0_filter``: the mean just now minus that before
+    rise, fall = round(T0_RISE_NS / dt_ns), round(T0_FALL_NS / dt_ns)
+    ramp = 2 * np.arange(rise, 0, -1) / (rise * (rise + 1))
+    weights = np.concatenate([ramp, np.full(fall, -1 / fall)])
+    filtered = fftconvolve(corrected, weights[np.newaxis], axes=1)[:, : corrected.shape[1]]
+    filtered[:, : len(weights)] = 0.0  # which needs samples before the record
     threshold = np.maximum(noise, SILENT)
     times["tp_0_est"] = interpolated_time_point_thresh(
         filtered, threshold, filtered.argmax(axis=1), 0, ord("l")
@@ -75,17 +80,6 @@ def legend_parameters(
     ):
         n = round(over_ns / dt_ns)
         areas[name] = over_ns * trap_pickoff(corrected, n, 0, begin + 2 * n) / height
-    found = {name: (time - aligned) * dt_ns for name, time in times.items()}
-    found["rise_time"] = found["tp_90"] - found.pop("tp_10")
-    return found | areas
-
-
-def _t0_filtered(waveforms: Values, dt_ns: float) -> Values:
-    """Pulses behind dspeed's ``t0_filter``: their mean just now minus that before."""
-    rise, fall = round(T0_RISE_NS / dt_ns), round(T0_FALL_NS / dt_ns)
-    ramp = 2 * np.arange(rise, 0, -1) / (rise * (rise + 1))
-    kernel = np.concatenate([ramp, np.full(fall, -1 / fall)])
-    filtered = fftconvolve(waveforms, kernel[np.newaxis], axes=1)
-    filtered = filtered[:, : waveforms.shape[1]]
-    filtered[:, : len(kernel)] = 0.0  # which needs samples before the record
-    return np.asarray(filtered)
+    times = {name: (time - aligned) * dt_ns for name, time in times.items()}
+    times["rise_time"] = times["tp_90"] - times.pop("tp_10")
+    return times | areas

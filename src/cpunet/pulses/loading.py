@@ -17,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
-from cpunet.pulses.baselines import Baselines
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.doubts import explained, require_sense
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import (
     Codes,
@@ -32,15 +33,24 @@ from cpunet.pulses.preparation import (
     prepare,
     rejections_of,
 )
-from cpunet.pulses.provenance import recorded_detector
+from cpunet.pulses.provenance import (
+    apparent_side,
+    recorded_detector,
+    recorded_side,
+    refuse_other_side,
+)
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import PulseSource
-from cpunet.pulses.seen import Seen
+from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import PreparationConfig, Recipe
+
+log = logging.getLogger(__name__)
 
 # Traces per block: 20 to 130 MB for the record lengths in use.
 BLOCK_SIZE = 4096
 FEW = 10  # pulses of the wanted energies whose rejection is a reason
+RATE_TRACES = 512  # first traces of a file, which are checked
+MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
+SWAPPED = "are `sim` and `data` swapped?"
 
 _REMEDIES = {
     Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
@@ -65,157 +75,6 @@ _REMEDIES = {
     ),
     Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
 }
-
-
-def load_prepared(
-    source: PulseSource,
-    config: PreparationConfig,
-    kind: Kind,
-    *,
-    selection: EnergySelection | None = None,
-    max_pulses: int | None = None,
-    seen: Seen | None = None,
-) -> Prepared:
-    """Read, select, prepare and collect the pulses of a file.
-
-    Parameters
-    ----------
-    source
-        Source of the raw pulses.
-    config, kind
-        See `prepare`.
-    selection
-        The wanted energies.  Without it all pulses are wanted, even those of unknown energy.
-    max_pulses
-        Maximum number of accepted pulses to keep.  If there are more, a random sample of them
-        is kept, always the same for the same file.  This bounds the memory.
-    seen
-        Keeps what is needed of the raw traces.
-
-    Returns
-    -------
-    Prepared
-        Accepted pulses of the file; every pulse read has a code.
-
-    Raises
-    ------
-    CpunetError
-        If no pulse is left; the message gives the file, the counts by reason and a remedy.
-    """
-    sets: list[Prepared] = []
-    n_kept, seen_before = 0, set[int]()
-    rng, drawn = np.random.default_rng(0), list[FloatColumn]()
-    with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
-        for block in source.blocks(BLOCK_SIZE):
-            whole = None
-            if seen is not None and seen.more_baselines:  # which those of all energies have
-                whole = prepare(block, config, kind)
-            part = _selected(block, config, kind, selection, whole)
-            part = part.rejected(_copies(block[part.index], kind, seen_before))
-            if seen is not None:
-                seen.keep(block, whole, part)
-            n_kept += len(part)
-            sets.append(part)
-            drawn.append(rng.random(len(part)))
-            if max_pulses is not None and n_kept > 1.5 * max_pulses:
-                n_kept = _thin(sets, drawn, max_pulses)
-            bar.update(len(block))
-    if not n_kept:
-        raise _nothing_left(source, sets)
-    if max_pulses is not None and n_kept > max_pulses:
-        n_kept = _thin(sets, drawn, max_pulses)
-    return _joined(sets, n_kept)
-
-
-def _copies(pulses: Pulses, kind: Kind, before: set[int]) -> Codes:
-    """Codes of pulses, in which those read before, as of rows written twice, are copies.
-
-    Simulated pulses without noise can be alike; their events must be the same, too.
-    """
-    codes: Codes = np.zeros(len(pulses), np.uint8)
-    numbers = pulses.event_number if kind == "simulated" else codes
-    for row, (trace, number) in enumerate(zip(pulses.waveforms, numbers, strict=True)):
-        key = hash((int(number), trace.tobytes()))
-        codes[row] = Rejection.COPIES if key in before else Rejection.ACCEPTED
-        before.add(key)
-    return codes
-
-
-def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> int:
-    """Keep the `max_pulses` pulses with the smallest random numbers; return their number.
-
-    A pulse dropped now would also be dropped after all later pulses were read, so the result is
-    a uniform random sample of the whole file.
-    """
-    bound = np.partition(np.concatenate(drawn), max_pulses)[max_pulses]
-    for number, part in enumerate(sets):
-        stays = drawn[number] < bound
-        codes = np.where(stays, Rejection.ACCEPTED, Rejection.NOT_DRAWN).astype(np.uint8)
-        sets[number], drawn[number] = part.rejected(codes), drawn[number][stays]
-    return max_pulses
-
-
-def _joined(sets: list[Prepared], n: int) -> Prepared:
-    """Concatenate blocks; each block's waveforms are released once they are copied."""
-    # this memory is allocated as it is filled, so the pulses never exist twice in full
-    waveforms = np.empty((n, sets[0].pulses.length), np.float32)
-    first = 0
-    for number, part in enumerate(sets):
-        waveforms[first : first + len(part)] = part.pulses.waveforms
-        first += len(part)
-        empty = np.empty((len(part), 0), np.float32)
-        sets[number] = replace(part, pulses=part.pulses.with_waveforms(empty))
-    joined = Prepared.concatenate(sets)
-    return replace(joined, pulses=joined.pulses.with_waveforms(waveforms))
-
-
-def _selected(
-    block: Pulses,
-    config: PreparationConfig,
-    kind: Kind,
-    selection: EnergySelection | None,
-    whole: Prepared | None,
-) -> Prepared:
-    """The selected pulses of a block, those of `whole` if all of it is prepared already."""
-    codes: Codes = np.zeros(len(block), np.uint8)
-    if selection is not None:
-        known = np.isfinite(block.energy_kev)
-        codes[known] = np.where(
-            selection.select(block.energy_kev[known]),
-            Rejection.ACCEPTED,
-            Rejection.ENERGY_OUTSIDE_SELECTION,
-        )
-        codes[~known] = Rejection.ENERGY_UNKNOWN
-    rows = np.flatnonzero(codes == Rejection.ACCEPTED)
-    if whole is None:
-        part = prepare(block[rows], config, kind)
-        codes[rows] = part.codes
-        part = replace(part, index=rows[part.index], codes=codes)
-    else:
-        part = whole.rejected(codes[whole.index])
-        part = replace(part, codes=np.where(codes == Rejection.ACCEPTED, part.codes, codes))
-    if selection is None:
-        return part
-    peak = label_peaks(part.pulses.energy_kev, selection.peaks)
-    return replace(part, pulses=replace(part.pulses, peak=peak))
-
-
-def _nothing_left(source: PulseSource, sets: list[Prepared]) -> CpunetError:
-    codes = np.concatenate([s.codes for s in sets]) if sets else np.zeros(0, np.uint8)
-    if not len(codes):
-        return CpunetError(f"{source.path}: holds no pulses", "choose another file or table")
-    counts = np.bincount(codes)
-    reasons = ", ".join(f"{n} {reason}" for reason, n in rejections_of(codes).items())
-    text = f"{source.path}: none of {len(codes)} pulses can be used ({reasons})"
-    # of pulses of the wanted energies, if there are any, since these are what is missed
-    wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
-    reason = int((wanted if wanted.sum() >= FEW else counts).argmax())
-    return CpunetError(text, _REMEDIES[Rejection(reason)])
-
-
-log = logging.getLogger(__name__)
-
-MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 
 
 class InfoPart(BaseModel):
@@ -263,12 +122,11 @@ class SideInfo(InfoPart):
 
     def reading(self, file: PulseFile) -> PulseFile:
         """A file with the reading options that the training had for it as defaults."""
-        told = self.read_as
-        if self.place != str(file.path.resolve()):
+        own = self.read_as
+        other = any(own.get(name) != value for name, value in file.options.items())
+        if other or self.place != str(file.path.resolve()):
             return file
-        if any(told.get(name) != value for name, value in file.options.items()):
-            return file
-        return replace(file, **told)
+        return replace(file, **own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,46 +202,178 @@ def load_pulses(
     """
     with file.open() as source:
         recipe = recipe.at(source.dt_ns)
-        seen = Seen(source, side, recipe.preparation, insist=file.insist)
-        try:
-            prepared = load_prepared(
-                source,
-                recipe.preparation,
-                side,
-                selection=selection,
-                max_pulses=max_pulses,
-                seen=seen,
-            )
-        except CpunetError as error:
-            explained = seen.explained(error, selection)
-            if explained is error:
-                raise
-            raise explained from error
-    cuts = None
+        recorded = recorded_side(source)
+        refuse_other_side(recorded, file.path, side, SWAPPED)
+        guess = recorded is None and not file.insist
+        raw = _read(source, side, recipe.preparation, selection, max_pulses, guess)
+    prepared, cuts, baselines = raw.prepared, None, None
     if side == "measured":
-        seen.require_sense()
+        if not file.insist:
+            require_sense(file.path, raw.first, raw.energies_kev, raw.amplitudes)
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
-    elif tell and _decays(prepared, recipe):
-        log.warning(
-            f"{file.path.name}: these pulses decay; "
-            "are they simulated ones, without electronics?"
-        )
-    rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+        whole = Pulses.concatenate(raw.whole)[np.isin(raw.whole_rows, prepared.index)]
+        baselines = Baselines.concatenate(raw.baselines, whole)
+    elif tell:
+        ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
+        if np.median(ends) < MIN_SIMULATED_END:
+            log.warning(
+                f"{file.path.name}: these pulses decay; "
+                "are they simulated ones, without electronics?"
+            )
     if tell:
+        rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
         log.info(
             f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
             + (f" (left out: {rejected})" if rejected else "")
         )
+    counts, low, high = None, raw.lowest, raw.highest
+    if high >= low and (raw.first == raw.first.round()).all():
+        counts = int(low), int(high)
+    kev = raw.energies_kev[np.isfinite(raw.energies_kev)]
     return InputSet(
-        prepared, source.dt_ns, file.path, seen.energies_kev, cuts, file.options,
-        recorded_detector(source), None if cuts is None else seen.baselines(prepared),
-        seen.counts,
+        prepared, source.dt_ns, file.path, kev, cuts, file.options,
+        recorded_detector(source), baselines, counts,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """Prepared pulses of a file, and what of all its traces is needed."""
+
+    prepared: Prepared
+    first: FloatArray
+    energies_kev: FloatColumn
+    amplitudes: FloatColumn
+    baselines: list[Baselines]
+    whole: list[Pulses]
+    whole_rows: Rows
+    lowest: float
+    highest: float
+
+
+def _read(
+    source: PulseSource,
+    side: Kind,
+    config: PreparationConfig,
+    selection: EnergySelection,
+    max_pulses: int | None,
+    guess: bool,
+) -> _Read:
+    """Read, select, prepare and collect the pulses of a file in one pass.
+
+    If there are more than `max_pulses`, those with the smallest random numbers stay.  A pulse
+    that is dropped early would also be dropped after all later ones were read, so they are a
+    uniform sample of the whole file, always the same for the same file.
+    """
+    sets, drawn, before = list[Prepared](), list[FloatColumn](), set[int]()
+    seen = list[tuple[FloatColumn, FloatColumn]]()
+    baselines, whole, whole_rows = list[Baselines](), list[Pulses](), list[Rows]()
+    first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
+    lowest, highest = np.inf, -np.inf
+    with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
+        for block in source.blocks(BLOCK_SIZE):
+            if not start:
+                first = block.waveforms[:RATE_TRACES].copy()
+                if guess:
+                    refuse_other_side(apparent_side(first), source.path, side, SWAPPED)
+            all_of_it = None
+            if side == "measured" and sum(map(len, baselines)) < TRACES:
+                all_of_it = prepare(block, config, side)  # baselines of any energy
+                like = baselines[:1]
+                baselines.append(Baselines.of_block(block, all_of_it, config, *like))
+            part = _selected(block, config, side, selection, all_of_it)
+            part = part.rejected(_copies(block[part.index], side, before))
+            if side == "measured":
+                good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
+                lowest, highest = good.min(initial=lowest), good.max(initial=highest)
+                rows = part.index[: max(WHOLE - sum(map(len, whole)), 0)]
+                whole.append(block[rows])
+                whole_rows.append(start + rows)
+            seen.append((block.energy_kev, amplitude(block.waveforms)))
+            sets.append(part)
+            drawn.append(rng.random(len(part)))
+            start, n = start + len(block), n + len(part)
+            if max_pulses is not None and n > 1.5 * max_pulses:
+                n = _thin(sets, drawn, max_pulses)
+            bar.update(len(block))
+    energies, heights = map(np.concatenate, zip(*seen, strict=True))
+    if not n:
+        error = _nothing_left(source.path, np.concatenate([part.codes for part in sets]))
+        raise explained(error, source.path, first, energies, heights, side, selection)
+    if max_pulses is not None and n > max_pulses:
+        n = _thin(sets, drawn, max_pulses)
+    # this memory is allocated as it is filled, so the pulses never exist twice in full
+    waveforms, filled = np.empty((n, sets[0].pulses.length), np.float32), 0
+    for number, part in enumerate(sets):
+        waveforms[filled : filled + len(part)] = part.pulses.waveforms
+        filled += len(part)
+        empty = np.empty((len(part), 0), np.float32)
+        sets[number] = replace(part, pulses=part.pulses.with_waveforms(empty))
+    prepared = Prepared.concatenate(sets)
+    prepared = replace(prepared, pulses=prepared.pulses.with_waveforms(waveforms))
+    rows = np.concatenate([np.zeros(0, np.int64), *whole_rows])
+    return _Read(prepared, first, energies, heights, baselines, whole, rows, lowest, highest)
+
+
+def _selected(
+    block: Pulses,
+    config: PreparationConfig,
+    side: Kind,
+    selection: EnergySelection,
+    prepared: Prepared | None,
+) -> Prepared:
+    """The selected pulses of a block, those of `prepared` if all of it is prepared already."""
+    codes: Codes = np.zeros(len(block), np.uint8)
+    codes[~selection.select(block.energy_kev)] = Rejection.ENERGY_OUTSIDE_SELECTION
+    codes[~np.isfinite(block.energy_kev)] = Rejection.ENERGY_UNKNOWN
+    if prepared is None:
+        rows = np.flatnonzero(codes == Rejection.ACCEPTED)
+        part = prepare(block[rows], config, side)
+        codes[rows] = part.codes
+        part = replace(part, index=rows[part.index], codes=codes)
+    else:
+        part = prepared.rejected(codes[prepared.index])
+        part = replace(part, codes=np.where(codes == Rejection.ACCEPTED, part.codes, codes))
+    peak = label_peaks(part.pulses.energy_kev, selection.peaks)
+    return replace(part, pulses=replace(part.pulses, peak=peak))
+
+
+def _copies(pulses: Pulses, side: Kind, before: set[int]) -> Codes:
+    """Codes of pulses, in which those read before, as of rows written twice, are copies.
+
+    Simulated pulses without noise can be alike; their events must be the same, too.
+    """
+    codes: Codes = np.zeros(len(pulses), np.uint8)
+    numbers = pulses.event_number if side == "simulated" else codes
+    for row, (trace, number) in enumerate(zip(pulses.waveforms, numbers, strict=True)):
+        key = hash((int(number), trace.tobytes()))
+        codes[row] = Rejection.COPIES if key in before else Rejection.ACCEPTED
+        before.add(key)
+    return codes
+
+
+def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> int:
+    """Keep the `max_pulses` pulses with the smallest random numbers; return their number."""
+    bound = np.partition(np.concatenate(drawn), max_pulses)[max_pulses]
+    for number, part in enumerate(sets):
+        stays = drawn[number] < bound
+        codes = np.where(stays, Rejection.ACCEPTED, Rejection.NOT_DRAWN).astype(np.uint8)
+        sets[number], drawn[number] = part.rejected(codes), drawn[number][stays]
+    return max_pulses
+
+
+def _nothing_left(path: Path, codes: Codes) -> CpunetError:
+    reasons = ", ".join(f"{n} {reason}" for reason, n in rejections_of(codes).items())
+    text = f"{path}: none of {len(codes)} pulses can be used ({reasons})"
+    # of pulses of the wanted energies, if there are any, since these are what is missed
+    wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
+    reason = int((wanted if wanted.sum() >= FEW else np.bincount(codes)).argmax())
+    return CpunetError(text, _REMEDIES[Rejection(reason)])
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:
@@ -400,18 +390,17 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         If a selected line or range has pulses on one side only.
     """
     for part in selection.parts:
-        counts = [
-            int(part.select(side.prepared.pulses.energy_kev).sum()) for side in (sim, data)
-        ]
+        sides = (sim, data)
+        counts = [int(part.select(side.prepared.pulses.energy_kev).sum()) for side in sides]
         if max(counts) == 0:
             raise CpunetError(
                 f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
                 "leave it out of `peak`",
             )
         if min(counts) == 0:
-            missing, there = (sim, data) if counts[0] == 0 else (data, sim)
+            missing, other = sides if counts[0] == 0 else (data, sim)
             raise CpunetError(
-                f"{missing.path}: no pulse of {part.name} can be used, {there.path.name} has "
+                f"{missing.path}: no pulse of {part.name} can be used, {other.path.name} has "
                 f"{max(counts)}",
                 "leave it out of `peak`, or give a file that has them",
             )
@@ -430,9 +419,3 @@ def require_same_sampling(sim: InputSet, data: InputSet) -> None:
             f"{data.dt_ns:g} ns",
             "resample one of them, or give `dt_ns` if one says it wrongly",
         )
-
-
-def _decays(prepared: Prepared, recipe: Recipe) -> bool:
-    """Whether simulated pulses end below their maximum, as measured ones do."""
-    end = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
-    return bool(np.median(end) < MIN_SIMULATED_END)

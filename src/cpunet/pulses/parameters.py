@@ -5,7 +5,7 @@ evaluates a translation (section 4.3).  The first two are those of dspeed's proc
 equal the values of the experiments' production analysis.
 
 Where pulses cross half of their maximum, and what they are when shifted by parts of a sample,
-is told by the cubic spline through the samples: linear interpolation would smooth the edge.
+is given by the cubic spline through the samples: linear interpolation would smooth the edge.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.pulses import _parameter_kernels as kernels
-from cpunet.pulses.container import FloatArray, Pulses, blocks
+from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
 Values = npt.NDArray[np.float64]
@@ -136,9 +136,28 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     array([0.005])
     """
     averages = Averages.at(dt_ns)
-    shortest = max(averages.widths) // averages.steps + 3
-    of_block = partial(_current_amplitude, dt_ns=dt_ns, averages=averages)
-    return _by_blocks(of_block, waveforms, shortest)
+    (steps, widths), reach = averages, averages.reach
+    near = max(round(NEIGHBOURHOOD_NS / dt_ns), 5 * reach)
+
+    def of_block(block: FloatArray) -> Values:
+        current = np.diff(block, axis=1)
+        current[np.isnan(block).any(axis=1)] = np.nan
+        samples, start = current.shape[1], np.zeros(len(current), np.int64)
+        highest = partial(kernels.averaged_maxima, upsampling=steps, widths=widths)
+        if samples <= near:
+            return np.asarray(highest(current, start, samples, ends=0), float)
+        first = np.clip(current.argmax(axis=1) - near // 2, 0, samples - near)
+        # near the ends of the neighbourhood the averages differ from those of the whole pulse
+        values = np.asarray(highest(current, first, near, ends=reach * steps), float)
+        # samples that those averages do not reach
+        after = np.arange(samples) - first[:, np.newaxis]
+        inside = (after >= 2 * reach) & (after < near - 2 * reach)
+        elsewhere = np.where(inside, -np.inf, current).max(axis=1)
+        if len(unsure := np.flatnonzero(~(elsewhere <= values))):
+            values[unsure] = highest(current[unsure], start, samples, ends=0)
+        return values
+
+    return _by_blocks(of_block, waveforms, max(widths) // steps + 3)
 
 
 def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
@@ -252,8 +271,7 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
     >>> (-1e3 / tail_slope(decay, dt_ns=16, fit_samples=300)).round(2)  # in µs
     array([54.6])
     """
-    lever = np.arange(fit_samples) - (fit_samples - 1) / 2
-    weights = lever / (lever @ lever) / (dt_ns * 1e-6)
+    weights = line_slope(fit_samples) / (dt_ns * 1e-6)
 
     def one_block(block: FloatArray) -> Values:
         tail = block[:, -fit_samples:].astype(float)
@@ -304,40 +322,6 @@ def _by_blocks(
     for rows in blocks(len(waveforms), BLOCK):
         values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
     return values
-
-
-def _current_amplitude(waveforms: FloatArray, dt_ns: float, averages: Averages) -> Values:
-    n, length = waveforms.shape
-    reach = averages.reach
-    near = max(round(NEIGHBOURHOOD_NS / dt_ns), 5 * reach)
-    current, steepest = kernels.currents(waveforms)
-    start = np.zeros(n, np.int64)
-    if length - 1 <= near:
-        return _maximum(current, start, length - 1, 0, averages)
-    first = np.clip(steepest - near // 2, 0, length - 1 - near)
-    # near the ends of the neighbourhood the averages differ from those of the whole pulse
-    values = _maximum(current, first, near, reach, averages)
-    # samples that those averages do not reach
-    elsewhere = kernels.maxima_elsewhere(current, first + 2 * reach, near - 4 * reach)
-    unsure = np.flatnonzero(~(elsewhere <= values))
-    if len(unsure):
-        values[unsure] = _maximum(current[unsure], start, length - 1, 0, averages)
-    return values
-
-
-def _maximum(
-    current: FloatArray,
-    first: npt.NDArray[np.int64],
-    samples: int,
-    ends: int,
-    averages: Averages,
-) -> Values:
-    """Maximum of the averaged current, excluding `ends` samples at each end."""
-    steps, widths = averages
-    highest: FloatArray = kernels.averaged_maxima(
-        current, first, samples, steps, widths, ends * steps
-    )
-    return highest.astype(float)
 
 
 _compiled: Any = kernel(error_model="numpy")
@@ -393,70 +377,13 @@ BISECTIONS = 30  # of one sample: a precision of 1e-9
 PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
 
 
-class Splines:
-    """Cubic splines through pulses, constant beyond their ends.
-
-    Parameters
-    ----------
-    waveforms
-        Finite pulses, shape ``(n, samples)``.
-    """
-
-    def __init__(self, waveforms: FloatArray | Values) -> None:
-        from scipy.ndimage import spline_filter1d
-
-        padded = np.pad(waveforms.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
-        self.coefficients: Values = spline_filter1d(padded, order=3, axis=1)
-
-    def crossing(self, before: npt.NDArray[np.intp], level: Values) -> Values:
-        """Time, in samples, at which each pulse reaches `level` after sample `before`."""
-        times = np.empty(len(level))
-        _crossings(self.coefficients, before, PAD, level, BISECTIONS, times)
-        return times
-
-    def shifted(self, times: Values, n_before: int, n_after: int) -> Values:
-        """Each pulse from `n_before` samples before its time to `n_after` samples after it.
-
-        Returns
-        -------
-        numpy.ndarray
-            Shape ``(n, n_before + n_after)``; NaN outside the record.
-        """
-        moved = np.full((len(times), n_before + n_after), np.nan)
-        _shifted(self.coefficients, times, PAD, n_before, moved)
-        return moved
-
-
-def last_below_half(
-    waveforms: FloatArray | Values,
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Find the last upward crossing of half of the maximum before the maximum.
-
-    Parameters
-    ----------
-    waveforms
-        Pulses with the baseline at 0, shape ``(n, samples)``.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Mask of the finite pulses with such a crossing, and the sample before it.
-    """
-    finite = np.isfinite(waveforms).all(axis=1)
-    top = np.where(finite, waveforms.argmax(axis=1), 0)
-    height = waveforms[np.arange(len(waveforms)), top]
-    there, last = last_below(waveforms, top, 0.5 * height)
-    return finite & (height > 0) & there, last
-
-
 def last_below(
     waveforms: FloatArray | Values, top: npt.NDArray[np.intp], level: FloatArray | Values
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
     """Whether each pulse is below a level before its `top`, and the last such sample."""
     below = waveforms < level[:, np.newaxis]
     below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
-    there = np.asarray(below.any(axis=1))
-    return there, waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    return np.asarray(below.any(axis=1)), waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
 
 
 def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
@@ -512,12 +439,20 @@ def require_pulses(waveforms: FloatArray, shortest: int) -> None:
 
 def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     """One block of `align_half_maximum`, in float64."""
+    from scipy.ndimage import spline_filter1d
+
     moved = np.full((len(waveforms), n_before + n_after), np.nan)
-    usable, before = last_below_half(waveforms)
-    if usable.any():
+    finite = np.isfinite(waveforms).all(axis=1)
+    top = np.where(finite, waveforms.argmax(axis=1), 0)
+    height = waveforms[np.arange(len(waveforms)), top]
+    crosses, before = last_below(waveforms, top, 0.5 * height)
+    if (usable := finite & (height > 0) & crosses).any():
         pulses = waveforms[usable]
-        splines = Splines(pulses)
+        padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
+        coefficients = spline_filter1d(padded, order=3, axis=1)
+        times, shifted = np.empty(len(pulses)), moved[usable]
         level = 0.5 * pulses.max(axis=1).astype(float)
-        times = splines.crossing(before[usable], level)
-        moved[usable] = splines.shifted(times, n_before, n_after)
+        _crossings(coefficients, before[usable], PAD, level, BISECTIONS, times)
+        _shifted(coefficients, times, PAD, n_before, shifted)
+        moved[usable] = shifted
     return moved

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
 from typing import Literal
 
 import numpy as np
@@ -35,6 +34,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses import _kernels
+from cpunet.pulses._kernels import Rejection as Rejection
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import CutConfig, PreparationConfig
 from cpunet.settings import Config
@@ -42,40 +42,6 @@ from cpunet.settings import Config
 Kind = Literal["simulated", "measured"]
 FloatColumn = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint8]
-
-
-class Rejection(IntEnum):
-    """Reason why a pulse was rejected; values and labels are stored and never change.
-
-    Examples
-    --------
-    >>> Rejection(4).label
-    'window_outside_record'
-    """
-
-    ACCEPTED = _kernels.ACCEPTED
-    NAN = _kernels.NAN
-    CONSTANT = _kernels.CONSTANT
-    SATURATED = _kernels.SATURATED
-    WINDOW_OUTSIDE_RECORD = _kernels.WINDOW_OUTSIDE_RECORD
-    NO_AMPLITUDE = _kernels.NO_AMPLITUDE
-    TAIL_NOT_POSITIVE = _kernels.TAIL_NOT_POSITIVE
-    PULSE_AT_EDGE = _kernels.PULSE_AT_EDGE
-    NO_PLATEAU = _kernels.NO_PLATEAU
-    SECOND_PULSE = _kernels.SECOND_PULSE
-    ENERGY_UNKNOWN = 16
-    ENERGY_OUTSIDE_SELECTION = 17
-    NOT_DRAWN = 18
-    COPIES = 19
-    TAIL_SLOPE = 32
-    CHI2 = 33
-    BASELINE = 34
-    BASELINE_SLOPE = 35
-
-    @property
-    def label(self) -> str:
-        """Name used in counts and reports."""
-        return self.name.lower()
 
 
 def rejections_of(codes: Codes) -> dict[str, int]:
@@ -189,17 +155,6 @@ class Prepared:
 _PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name != "codes")
 
 
-_IN_SAMPLES = (
-    "samples_before",
-    "samples_after",
-    "baseline_samples",
-    "tail_samples",
-    "tail_level",
-    "decay_fit_samples",
-    "saturation_run",
-)
-
-
 def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     """Align, cut out and normalise every pulse (paper, section 3.3).
 
@@ -250,18 +205,22 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     config = config.at(pulses.dt_ns)
     settings = _kernels.Settings(
         simulated=kind == "simulated",
-        align_fraction=0.0 if config.align_at == "half_height" else config.align_at,
+        of_maximum=0.0 if config.align_at == "half_height" else config.align_at,
         max_padding_before=config.samples(config.padding_before_ns),
         max_padding_after=config.samples(config.padding_after_ns),
         smoothed=config.samples(0.5 * _kernels.SMOOTHED_NS),
         begun_margin=config.samples(_kernels.BEGUN_MARGIN_NS),
         prepared=config.samples(_kernels.PREPARED_NS),
-        **{name: getattr(config, name) for name in _IN_SAMPLES},
+        **{n: getattr(config, n) for n in _kernels.Settings._fields if hasattr(config, n)},
     )
-    codes, windows, numbers = _kernels.prepare_block(pulses.waveforms, settings)
-    rows = np.flatnonzero(codes == Rejection.ACCEPTED)
-    per_ms = 1e6 / pulses.dt_ns
-    begin = numbers[:, _kernels.ALIGN_SAMPLE] - config.samples_before
+    n, length = len(pulses), config.length
+    windows, codes = np.empty((n, length), np.float32), np.empty(n, np.uint8)
+    numbers, traces = np.empty((n, _kernels.COLUMNS)), np.ascontiguousarray(pulses.waveforms)
+    n = _kernels.prepare_block(traces, settings, windows, numbers, codes)
+    windows.resize((n, length), refcheck=False)  # releases the other rows without a copy
+    baseline, scale, align, rms, slope, tail_slope, chi2 = numbers[:n].T.copy()
+    rows, per_ms = np.flatnonzero(codes == Rejection.ACCEPTED), 1e6 / pulses.dt_ns
+    begin = (align - config.samples_before) * pulses.dt_ns
     return Prepared(
         pulses=Pulses(
             waveforms=windows,
@@ -269,16 +228,16 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
             energy_kev=pulses.energy_kev[rows],
             event_number=pulses.event_number[rows],
             peak=pulses.peak[rows],
-            t0_ns=pulses.t0_ns[rows] + begin * pulses.dt_ns,
+            t0_ns=pulses.t0_ns[rows] + begin,
         ),
         index=rows,
-        baseline=numbers[:, _kernels.BASELINE].copy(),
-        scale=numbers[:, _kernels.SCALE].copy(),
-        align_sample=numbers[:, _kernels.ALIGN_SAMPLE].astype(np.int64),
-        baseline_rms=numbers[:, _kernels.BASELINE_RMS].copy(),
-        baseline_slope=numbers[:, _kernels.BASELINE_SLOPE] * per_ms,
-        tail_slope=numbers[:, _kernels.TAIL_SLOPE] * per_ms,
-        chi2=numbers[:, _kernels.CHI2].copy(),
+        baseline=baseline,
+        scale=scale,
+        align_sample=align.astype(np.int64),
+        baseline_rms=rms,
+        baseline_slope=slope * per_ms,
+        tail_slope=tail_slope * per_ms,
+        chi2=chi2,
         codes=codes,
     )
 
@@ -367,12 +326,6 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
     return CutWindows(amplitude=amplitude, noise=noise, windows=tuple(windows))
 
 
-def compared(prepared: Prepared, cuts: CutWindows, window: CutWindow) -> FloatColumn:
-    """Value of each pulse in the form that `window` bounds, for cuts and figures."""
-    values, weights = _values(prepared, window.name, cuts.amplitude, cuts.noise)
-    return window.centre + (values - window.centre) * weights
-
-
 def apply_cuts(prepared: Prepared, cuts: CutWindows) -> Prepared:
     """Drop the pulses outside any window and count each under the first one it fails.
 
@@ -380,7 +333,8 @@ def apply_cuts(prepared: Prepared, cuts: CutWindows) -> Prepared:
     """
     reasons: npt.NDArray[np.uint8] = np.zeros(len(prepared), np.uint8)
     for window in cuts.windows:
-        values = compared(prepared, cuts, window)
+        values, weights = _values(prepared, window.name, cuts.amplitude, cuts.noise)
+        values = window.centre + (values - window.centre) * weights
         outside = np.zeros(len(prepared), bool)
         if window.low is not None:
             outside |= values < window.low

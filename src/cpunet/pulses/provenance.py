@@ -6,7 +6,7 @@ import json
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -72,32 +72,30 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
         If the file states that its pulses are of the other side, or if they appear to be
         and `insist` is False.
     """
-    found = recorded_side(source)
-    if found is None and not insist:
-        found = apparent_side(next(iter(source.blocks(_FIRST_PULSES))).waveforms)
-    refuse_other_side(found, source.path, wanted, remedy)
+    side = recorded_side(source)
+    if side is None and not insist:
+        side = apparent_side(next(iter(source.blocks(_FIRST_PULSES))).waveforms)
+    refuse_other_side(side, source.path, wanted, remedy)
 
 
-def refuse_other_side(found: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
-    """Refuse pulses of a file that are `found` to be of the other side; see `require_side`."""
-    if found is not None and found.side != wanted:
+def refuse_other_side(side: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
+    """Refuse pulses of a file that are of the other side; see `require_side`."""
+    if side is not None and side.side != wanted:
         begin = " If" if remedy.endswith("?") else "; if"
-        sure = "" if found.certain else f"{begin} they are {wanted}, say so with `insist`"
+        sure = "" if side.certain else f"{begin} they are {wanted}, say so with `insist`"
         raise CpunetError(
-            f"{path}: given as {wanted} pulses, but these {found.why}", f"{remedy}{sure}"
+            f"{path}: given as {wanted} pulses, but these {side.why}", f"{remedy}{sure}"
         )
 
 
 def recorded_side(source: PulseSource) -> Recognised | None:
     """Side recorded in a file that this program wrote; None for other files."""
-    told = recorded_attributes(source)
-    side, made_by, translated_by = (
-        told.get(name, "") for name in (SIDE, MADE_BY, TRANSLATED_BY)
-    )
+    side, made_by = source.attrs.get(SIDE), source.attrs.get(MADE_BY, "")
+    translated_by = source.attrs.get(TRANSLATED_BY)
     if translated_by in (REN, IREN):
         kind: Kind = "measured" if translated_by == REN else "simulated"
-        name = translated_by.rpartition(" ")[2].upper()
-        return Recognised(kind, f"were translated by {name} already", certain=True)
+        why = f"were translated by {_network(translated_by)} already"
+        return Recognised(kind, why, certain=True)
     if made_by.startswith(SIMULATE) or side == "simulated":
         return Recognised("simulated", f"were simulated by {made_by}", certain=True)
     if side == "measured":
@@ -107,16 +105,14 @@ def recorded_side(source: PulseSource) -> Recognised | None:
     return None
 
 
-def recorded_attributes(source: PulseSource) -> dict[str, str]:
-    """Attributes in which this program records how it made the pulses; none in other files."""
-    names = (SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION, TRANSLATION)
-    return {name: text for name in names if (text := source.table.attrs.get(name))}
+def _network(translated_by: str) -> str:
+    return translated_by.rpartition(" ")[2].upper()
 
 
 def recorded_detector(source: PulseSource) -> str | None:
     """Name of the simulated detector; None if the file does not contain it."""
     with suppress(ValueError, LookupError, TypeError):
-        return str(json.loads(recorded_attributes(source)[SIMULATION])["detector"]["name"])
+        return str(json.loads(source.attrs[SIMULATION])["detector"]["name"])
     return None
 
 
@@ -144,32 +140,24 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
     >>> apparent_side((charge + noise / 3000)[None]) is None
     True
     """
-    known = waveforms[:_FIRST_PULSES]
-    known = known[np.isfinite(known).all(axis=1)].astype(float)
-    known = known[np.ptp(known, axis=1) > 0] if known.size else known
-    if not len(known) or known.shape[1] < _MIN_SAMPLES:
+    traces = waveforms[:_FIRST_PULSES]
+    traces = traces[np.isfinite(traces).all(axis=1)].astype(float)
+    traces = traces[np.ptp(traces, axis=1) > 0] if traces.size else traces
+    if not len(traces) or traces.shape[1] < _MIN_SAMPLES:
         return None
-    height = np.ptp(known, axis=1)
-    few = known.shape[1] // 10
-    before = np.median(_turns(known[:, :few], height))
-    after = np.median(_turns(known[:, -few:], height))
-    whole = (known == np.round(known)).all() and np.median(height) > _FULL_HEIGHT
-    if whole and before >= _TURNS:
+    height, few, turns = np.ptp(traces, axis=1), traces.shape[1] // 10, []
+    for part in (traces[:, :few], traces[:, -few:]):  # before the pulse and after it
+        steps = np.diff(part, axis=1)
+        signs = np.where(np.abs(steps) > _SMALL * height[:, np.newaxis], np.sign(steps), 0)
+        turns.append(np.median([np.count_nonzero(np.diff(row[row != 0])) for row in signs]))
+    whole = (traces == np.round(traces)).all() and np.median(height) > _FULL_HEIGHT
+    if whole and turns[0] >= _TURNS:
         why = "look measured (whole numbers with noise before the pulse)"
         return Recognised("measured", why, certain=False)
-    end = (known[:, -few:].mean(axis=1) - known.min(axis=1)) / height
-    if max(before, after) < _TURNS and np.median(end) > _MIN_END:
+    end = (traces[:, -few:].mean(axis=1) - traces.min(axis=1)) / height
+    if max(turns) < _TURNS and np.median(end) > _MIN_END:
         return Recognised("simulated", "look simulated (no noise, no decay)", certain=False)
     return None
-
-
-def _turns(
-    part: npt.NDArray[np.float64], height: npt.NDArray[np.float64]
-) -> npt.NDArray[np.int64]:
-    """Number of turning points of each trace."""
-    steps = np.diff(part, axis=1)
-    signs = np.where(np.abs(steps) > _SMALL * height[:, np.newaxis], np.sign(steps), 0)
-    return np.array([np.count_nonzero(np.diff(row[row != 0])) for row in signs])
 
 
 def provenance(source: PulseSource) -> dict[str, str]:
@@ -181,31 +169,29 @@ def provenance(source: PulseSource) -> dict[str, str]:
         Text by name, such as ``made by``, ``detector``, ``hits`` and ``translated``; empty for
         files of other programs.
     """
-    told = recorded_attributes(source)
-    words = {"made by": told.get(MADE_BY, ""), "side": told.get(SIDE, "")}
-    if TRANSLATED_BY in told:
-        part = told[TRANSLATED_BY].rpartition(" ")[2].upper()
-        words["translated"] = f"by the {part} of {told.get(RUN, 'an unknown run')}"
+    attrs = source.attrs
+    words = {"made by": attrs.get(MADE_BY, ""), "side": attrs.get(SIDE, "")}
+    if translated_by := attrs.get(TRANSLATED_BY):
+        run = attrs.get(RUN) or "an unknown run"
+        words["translated"] = f"by the {_network(translated_by)} of {run}"
     # other programs may have attributes of these names
     with suppress(ValueError, LookupError, TypeError, AttributeError):
-        words |= _of_simulation(json.loads(told[SIMULATION]))
+        made = json.loads(attrs[SIMULATION])
+        detector, hits, fwhm = made["detector"], made["hits"], made["settings"]["cloud_fwhm_mm"]
+        physics = f"{detector['bias_V']:g} V, {detector['temperature_K']:g} K"
+        simulated = {
+            "detector": f"{detector['name']}, {physics}, charge clouds of {fwhm:g} mm",
+            "hits": hits.get("monte_carlo", ""),
+        }
+        if "file" in hits:
+            flipped = ", z flipped" if hits["flip_z"] else ""
+            origin = f"origin {hits['origin_mm']} mm{flipped}"
+            simulated["hits"] = f"{Path(hits['file']).name}, {origin}"
+        if "events" in made:  # a stand records them in its ``stand.json``
+            lost = f"of which {made['events_without_signal']} without a signal"
+            simulated["events"] = f"{made['events']}, {lost}; seed {made['seed']}"
+        words |= simulated
     with suppress(ValueError, LookupError, TypeError, AttributeError):
-        given = flat(json.loads(told[TRANSLATION])["options"], " ")
+        given = flat(json.loads(attrs[TRANSLATION])["options"], " ")
         words["options"] = ", ".join(f"{k} {v}" for k, v in given if v is not None)
     return {name: text for name, text in words.items() if text}
-
-
-def _of_simulation(made: Any) -> dict[str, str]:
-    detector, hits, cloud = made["detector"], made["hits"], made["settings"]["cloud_fwhm_mm"]
-    physics = f"{detector['name']}, {detector['bias_V']:g} V, {detector['temperature_K']:g} K"
-    words = {
-        "detector": f"{physics}, charge clouds of {cloud:g} mm",
-        "hits": hits.get("monte_carlo", ""),
-    }
-    if "file" in hits:
-        flipped = ", z flipped" if hits["flip_z"] else ""
-        words["hits"] = f"{Path(hits['file']).name}, origin {hits['origin_mm']} mm{flipped}"
-    if "events" in made:  # a stand records them in its ``stand.json``
-        lost, seed = made["events_without_signal"], made["seed"]
-        words["events"] = f"{made['events']}, of which {lost} without a signal; seed {seed}"
-    return words

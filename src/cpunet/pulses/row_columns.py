@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, TypeAlias
 
 import h5py
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays
 
 from cpunet.hdf5_files import lh5_rows, members, one_line, text_attribute, units_of
-from cpunet.pulses.reading.energies import Column
+from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.units import factor
 
@@ -40,43 +41,42 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     left_out
         The reason for each column that cannot be copied.
     """
-    if (group := source.table.group) is None:
-        columns = {
-            name: column
-            for name, column in source.columns.items()
-            if not _is_same(name, column.units, own)
-        }
-        shown = _renamed(columns, own)
-        return lambda start, n: {
-            shown[name]: _from_column(column, start, n) for name, column in columns.items()
-        }, {}
-    chosen = source.table.name.rpartition("/")[2]
-    names, left_out = list[str](), dict[str, str]()
-    rows, size = source.table.chosen, source.table.n_all or source.n_pulses or 0
-    with one_line(source.path):
-        for name, item in members(group).items():
-            is_plain = isinstance(item, h5py.Dataset)
-            units = units_of(item) if is_plain else ""
-            if name == chosen or (is_plain and _is_same(name, units, own)):
-                continue
-            if reason := _unreadable(item, size):
-                left_out[name] = reason
-            else:
-                names.append(name)
-    shown = _renamed(names, own)
+    readers, left_out = dict[str, Callable[[int, int], LGDO]](), dict[str, str]()
+    if (group := source.group) is None:
+        for name, column in source.columns.items():
+            if not _is_same(name, column.units, own):
+                readers[name] = partial(_from_column, column)
+    else:
+        waveforms, size = source.name.rpartition("/")[2], source.n_all or source.n_pulses or 0
+        with one_line(source.path):
+            for name, item in members(group).items():
+                is_plain = isinstance(item, h5py.Dataset)
+                units = units_of(item) if is_plain else ""
+                if name == waveforms or (is_plain and _is_same(name, units, own)):
+                    continue
+                if reason := _unreadable(item, size):
+                    left_out[name] = reason
+                else:
+                    readers[name] = partial(_rows, group[name], source.chosen)
+    shown, taken = {}, {*readers, *own}
+    for name in readers:
+        shown[name] = name
+        while name in own and shown[name] in taken:
+            shown[name] += SUFFIX
+        taken.add(shown[name])
 
     def read(start: int, n: int) -> dict[str, LGDO]:
-        some = None if rows is None else rows[start : start + n]
         with one_line(source.path):
-            return {shown[name]: _rows(group[name], start, n, some) for name in names}
+            return {shown[name]: reader(start, n) for name, reader in readers.items()}
 
     return read, left_out
 
 
 def _rows(
-    item: h5py.Group | h5py.Dataset, start: int, n: int, some: npt.NDArray[Any] | None = None
+    item: h5py.Group | h5py.Dataset, chosen: npt.NDArray[Any] | None, start: int, n: int
 ) -> LGDO:
-    """Rows from one on, or some of them, which ascend."""
+    """Rows from a first one on, of all or of some chosen ones, which ascend."""
+    some = None if chosen is None else chosen[start : start + n]
     if text_attribute(item, "datatype"):
         return lh5_rows(item, 0 if some is not None else start, n, some)
     attrs = {"units": units} if (units := units_of(item)) else {}
@@ -102,18 +102,6 @@ def _is_same(name: str, units: str, own: Collection[str]) -> bool:
     return name in own and (name == "event_number" or in_energy_units)
 
 
-def _renamed(names: Collection[str], own: Collection[str]) -> dict[str, str]:
-    """Name in the output for each column: its own, or one with `SUFFIX` that is still free."""
-    renamed = {name: name for name in names}
-    taken = {*names, *own}
-    for name in names:
-        if name in own:
-            while renamed[name] in taken:
-                renamed[name] += SUFFIX
-            taken.add(renamed[name])
-    return renamed
-
-
 def _unreadable(item: h5py.Group | h5py.Dataset, n_pulses: int) -> str:
     """Reason why a column cannot be copied; empty if it can."""
     if not text_attribute(item, "datatype"):
@@ -125,7 +113,7 @@ def _unreadable(item: h5py.Group | h5py.Dataset, n_pulses: int) -> str:
     else:
         try:
             rows = lh5.read_n_rows(item.name, item.file)
-            _rows(item, 0, 1)
+            _rows(item, None, 0, 1)
         except Exception as error:  # the library raises various errors on foreign types
             return f"the LH5 library cannot read it ({' '.join(str(error).split())})"
     return "" if rows == n_pulses else f"{rows} rows beside {n_pulses} pulses"

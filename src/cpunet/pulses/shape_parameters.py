@@ -111,40 +111,49 @@ def all_parameters(
     >>> from cpunet.recipes import load_recipe
     >>> recipe = load_recipe("paper")
     >>> ramp = np.clip((np.arange(800) - 300) / 100, 0, 1)[np.newaxis]
-    >>> found = all_parameters(Pulses.of(ramp, dt_ns=16), recipe.preparation, recipe.scores)
-    >>> found["rise_10_90"].round(3), found["dt_eff"].round(1)  # 800 less part of a sample
+    >>> values = all_parameters(Pulses.of(ramp, dt_ns=16), recipe.preparation, recipe.scores)
+    >>> values["rise_10_90"].round(3), values["dt_eff"].round(1)  # 800 less part of a sample
     (array([1280.]), array([789.2]))
     """
-    preparation = preparation.at(pulses.dt_ns)
+    dt_ns, preparation = pulses.dt_ns, preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:
         raise CpunetError(
             f"the pulses have {pulses.length} samples and prepared ones "
             f"{preparation.length}; prepare them first"
         )
     values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
+    fractions = np.array([*TIME_POINTS.values()])
     for rows in blocks(len(pulses), BLOCK):
         block = np.array(pulses.waveforms[rows], dtype=np.float32, order="C")
         damaged = ~np.isfinite(block).all(axis=1)
         block[damaged] = np.nan  # treat infinities as NaN
         # overflows become NaN below
         with np.errstate(all="ignore"):
-            found = {
-                "current_amplitude": current_amplitude(block, pulses.dt_ns)
+            columns = {
+                "current_amplitude": current_amplitude(block, dt_ns)
                 if amplitudes is None
                 else np.where(damaged, np.nan, amplitudes[rows]),
-                "drift_time": drift_time(block, pulses.dt_ns, scores.drift_start_fraction),
-                **_times(block, pulses.dt_ns, preparation.samples_before),
-                "tail_slope": tail_slope(block, pulses.dt_ns, preparation.decay_fit_samples),
+                "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
+                "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
                 "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
             }
-        for name, column in found.items():
+            height = block.max(axis=1)
+            positive = height > 0  # False for NaN
+            stop = np.where(positive, block.argmax(axis=1), 0)
+            levels = np.outer(np.where(positive, height, np.nan), fractions)
+            samples = kernels.crossings(block, levels.astype(np.float32), stop)
+            times = (samples - preparation.samples_before) * dt_ns
+            columns |= dict(zip(TIME_POINTS, times.T, strict=True))
+            for name, (begin, end) in RISE_TIMES.items():
+                columns[name] = columns[end] - columns[begin]
+        for name, column in columns.items():
             values[name][rows] = np.where(np.isfinite(column), column, np.nan)
     if decay_ns is None:
         decay_ns = median_decay_ns(values["tail_slope"])
     for rows in blocks(len(pulses), BLOCK):
         good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
         block, noise = pulses.waveforms[good], values["baseline_rms"][good]
-        how = (decay_ns, noise, pulses.dt_ns, preparation.samples_before)
+        how = (decay_ns, noise, dt_ns, preparation.samples_before)
         for name, column in legend_parameters(block, *how).items():
             values[name][good] = column
     return values
@@ -152,23 +161,9 @@ def all_parameters(
 
 def median_decay_ns(slopes: Values) -> float:
     """Time constant of the median tail slope (1/ms); infinite if it does not fall."""
-    known = slopes[np.isfinite(slopes)]
-    slope = float(np.median(known)) if known.size else 0.0
+    finite = slopes[np.isfinite(slopes)]
+    slope = float(np.median(finite)) if finite.size else 0.0
     return -1e6 / slope if slope < 0 else np.inf
-
-
-def _times(block: FloatArray, dt_ns: float, aligned: int) -> dict[str, Values]:
-    """Time points and the times derived from them, in ns."""
-    top, height = block.argmax(axis=1), block.max(axis=1)
-    positive = height > 0  # False for NaN
-    stop = np.where(positive, top, 0)
-    levels = np.outer(np.where(positive, height, np.nan), np.array(list(TIME_POINTS.values())))
-    samples = kernels.crossings(block, levels.astype(np.float32), stop)
-    times: dict[str, Values] = dict(
-        zip(TIME_POINTS, ((samples - aligned) * dt_ns).T, strict=True)
-    )
-    rises = {name: times[end] - times[begin] for name, (begin, end) in RISE_TIMES.items()}
-    return {**times, **rises}
 
 
 def _rms_about_line(baseline: FloatArray) -> Values:
@@ -277,9 +272,9 @@ class Histogram(hist.Hist[Any], family=hist):
         ax = own_axes(ax)
         names = list(categories[0]) if categories else []
         for name in names or [None]:
-            one: Any = self if name is None else self[name, :]
+            counts: Any = self if name is None else self[name, :]
             text = {} if name is None else {"label": label(name)}
-            ax.stairs(one.values(), axis.edges, **text | how)
+            ax.stairs(counts.values(), axis.edges, **text | how)
         ax.set(xlabel=axis.label, ylabel="Counts")
         if names:
             ax.legend()

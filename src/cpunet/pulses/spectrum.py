@@ -1,4 +1,4 @@
-"""Lines found in a spectrum, and the calibration that they suggest."""
+"""Lines of a spectrum, and the calibration that they suggest."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-Values = npt.NDArray[np.float64]
-
 WITHIN = 0.03  # relative half-width of the search range of a line
 BIN_KEV = 1.0
 MIN_COUNTS = 30  # minimum counts in the highest bins of a line
-ABOVE = 4.0  # minimum ratio of a line's counts to those beside it
+ABOVE = 4.0  # minimum ratio of a line's counts to those around it
 WIDTH_BINS = 3  # to either side of the highest bin; their mean is the energy
 
 
@@ -81,7 +79,7 @@ class Suggestion(NamedTuple):
     source
         Calibration source of the lines.
     lines_kev
-        Energies in keV of the lines found.
+        Energies in keV of these lines.
     """
 
     kev_per_adc: float
@@ -107,68 +105,53 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     Returns
     -------
     Suggestion or None
-        None if too few lines of every source are found.
+        None if too few lines of every source stand out.
 
     Examples
     --------
     >>> rng = np.random.default_rng(1)
     >>> lines = np.repeat([2614.5, 583.2, 1592.5, 2103.5], [300, 600, 100, 90])
     >>> spectrum = np.append(rng.uniform(100, 2600, 3000), rng.normal(lines, 1.5))
-    >>> found = suggested_calibration(spectrum / 0.065)
-    >>> found.source, round(found.kev_per_adc, 4)
+    >>> calibration = suggested_calibration(spectrum / 0.065)
+    >>> calibration.source, round(calibration.kev_per_adc, 4)
     ('Th-228', 0.065)
     """
-    known = np.asarray(amplitudes, float)
-    known = np.log(known[np.isfinite(known) & (known > 0)])
-    if len(known) < MIN_COUNTS:
+    logs = np.asarray(amplitudes, float)
+    logs = np.log(logs[np.isfinite(logs) & (logs > 0)])
+    if len(logs) < MIN_COUNTS:
         return None
-    edges = np.arange(known.min() - LOG_BIN, known.max() + 2 * LOG_BIN, LOG_BIN)
+    edges = np.arange(logs.min() - LOG_BIN, logs.max() + 2 * LOG_BIN, LOG_BIN)
     if len(edges) < MIN_BINS:  # one energy
         return None
-    excess = _excess(np.histogram(known, edges)[0])
-    found = [one for source in SOURCES if (one := _shifted(known, edges[0], excess, source))]
-    return max(found, key=lambda one: one[0])[1] if found else None
-
-
-def _excess(counts: npt.NDArray[np.integer]) -> Values:
-    """Excess of the counts of three bins over their background, in standard deviations."""
+    # excess of the counts of three bins over their background, in standard deviations
+    counts = np.histogram(logs, edges)[0]
     reflected = np.pad(counts.astype(float), BACKGROUND, "symmetric")
     around = np.lib.stride_tricks.sliding_window_view(reflected, 2 * BACKGROUND + 1)
     under = 3 * np.maximum(np.median(around, axis=1), 0.3 * around.mean(axis=1))
     near = np.convolve(counts, np.ones(3), "same")
-    return np.asarray((near - under) / np.sqrt(np.maximum(under, 1.0)))
-
-
-def _shifted(
-    log_amplitudes: Values, first: float, excess: Values, source: str
-) -> tuple[float, Suggestion] | None:
-    """Largest excess of counts at the lines of a source, and the shift that leads to it."""
-    lines_kev = SOURCES[source]
-    places = np.log(lines_kev) / LOG_BIN
-    offsets = np.round(places - places[0]).astype(int)
-    n = len(excess)
-    at = np.arange(n)[:, np.newaxis] + offsets
-    inside = (at >= 0) & (at < n)
-    values = np.where(inside, excess[np.clip(at, 0, n - 1)], 0.0)
-    # the first (strongest) line must be present
-    score = np.clip(values, -CLEAR, HIGHEST).sum(axis=1)
-    score[values[:, 0] < CLEAR] = -np.inf
-    best = int(score.argmax())
-    # two lines coincide by chance more easily than three
-    limit = CLEAR if len(lines_kev) > 2 else 2 * CLEAR
-    clear = tuple(
-        line for line, value in zip(lines_kev, values[best], strict=True) if value > limit
-    )
-    if not np.isfinite(score[best]) or len(clear) < min(MIN_LINES, len(lines_kev)):
-        return None
-    log_factor = float(places[0] * LOG_BIN - first - (best + 0.5) * LOG_BIN)
-    factor = _refined(log_amplitudes, log_factor, clear)
-    return float(score[best]), Suggestion(factor, source, clear)
-
-
-def _refined(log_amplitudes: Values, log_factor: float, lines_kev: tuple[float, ...]) -> float:
-    """The calibration factor from the amplitudes near the highest line."""
-    line = max(lines_kev)
-    near = np.abs(log_amplitudes + log_factor - np.log(line)) < 2 * LOG_BIN
-    middle = float(np.median(log_amplitudes[near])) if near.any() else np.log(line) - log_factor
-    return float(line / np.exp(middle))
+    excess = (near - under) / np.sqrt(np.maximum(under, 1.0))
+    best: tuple[float, Suggestion] | None = None
+    for source, lines_kev in SOURCES.items():
+        places = np.log(lines_kev) / LOG_BIN
+        offsets = np.round(places - places[0]).astype(int)
+        at = np.arange(len(excess))[:, np.newaxis] + offsets
+        inside = (at >= 0) & (at < len(excess))
+        values = np.where(inside, excess[np.clip(at, 0, len(excess) - 1)], 0.0)
+        # the first (strongest) line must be present
+        score = np.clip(values, -CLEAR, HIGHEST).sum(axis=1)
+        score[values[:, 0] < CLEAR] = -np.inf
+        shift = int(score.argmax())
+        # two lines coincide by chance more easily than three
+        limit = CLEAR if len(lines_kev) > 2 else 2 * CLEAR
+        clear = tuple(np.array(lines_kev)[values[shift] > limit].tolist())
+        if not np.isfinite(score[shift]) or len(clear) < min(MIN_LINES, len(lines_kev)):
+            continue
+        if best is None or score[shift] > best[0]:
+            # from the amplitudes near the highest line
+            log_factor = float(places[0] * LOG_BIN - edges[0] - (shift + 0.5) * LOG_BIN)
+            line = max(clear)
+            of_line = logs[np.abs(logs + log_factor - np.log(line)) < 2 * LOG_BIN]
+            middle = float(np.median(of_line)) if len(of_line) else np.log(line) - log_factor
+            factor = float(line / np.exp(middle))
+            best = float(score[shift]), Suggestion(factor, source, clear)
+    return None if best is None else best[1]

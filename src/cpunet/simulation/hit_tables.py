@@ -19,8 +19,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.pulses.reading.division import divides, dividing, labels, texts
-from cpunet.pulses.reading.source import whole_numbers
+from cpunet.pulses.reading.columns import divides, dividing, labels, texts, whole_numbers
 from cpunet.simulation.hits import FloatArray, HitOptions, IntArray
 from cpunet.units import factor, unit_names
 

@@ -34,11 +34,13 @@ NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What is added to a batch of pulses, and what must be known of them.
+class Batch:
+    """Prepared windows, and what is added to them.
 
     Parameters
     ----------
+    windows
+        Float32, shape (n, samples).
     energy_kev
         Energy of each pulse; electronic noise is scaled by its inverse.
     noise
@@ -49,23 +51,24 @@ class Drawn:
         Pile-up tails under each pulse, in keV.
     piled
         Piled-up pulses within the records.
+    trace
+        Samples of a raw trace before the alignment of a pulse without noise, and all; None for
+        windows.
     """
 
+    windows: FloatArray
     energy_kev: Energies | None = None
     noise: bool = True
     generator: np.random.Generator = field(default_factory=np.random.default_rng)
     tails_kev: Energies | None = None
     piled: InTracePileUp | None = None
+    trace: tuple[int, int] | None = None
 
-    @property
-    def others(self) -> bool:
-        """Whether there are other pulses under these."""
-        return self.tails_kev is not None or self.piled is not None
-
-    def of_rows(self, rows: npt.NDArray[np.integer]) -> Drawn:
+    def of_rows(self, rows: npt.NDArray[np.integer]) -> Batch:
         """The same for some of the pulses."""
         return replace(
             self,
+            windows=self.windows[rows],
             energy_kev=None if self.energy_kev is None else self.energy_kev[rows],
             tails_kev=None if self.tails_kev is None else self.tails_kev[rows],
             piled=None if self.piled is None else self.piled.of_rows(rows),
@@ -83,66 +86,60 @@ class Translated(NamedTuple):
         A `Rejection` for each row.
     begin
         First sample of each, in samples after the first one of what was translated.
-    charge
-        Of a window of height 1; of a readout chain only.
     """
 
     windows: FloatArray
     codes: Codes
     begin: npt.NDArray[np.int64]
-    charge: FloatArray | None = None
 
 
+@dataclass(eq=False)
 class Backend(ABC):
     """Translates a batch of prepared windows.
 
-    Attributes
+    Parameters
     ----------
     network
         What the run stores.
-    config : PreparationConfig
-        Preparation of the pulses that it gives.
-    dt_ns : float
-        Their sampling period in ns.
-    needs_energies : bool
-        Whether the noise depends on the energies.
-    chain : ResponseGenerator or None
-        Readout chain, which gives traces of any length (`levels`).
-    noise : BaselineNoise or None
-        Noise that is added to the output of the network.
-    tails : DrawnTails or None
-        Distribution of the pile-up tails under the data, if known.
-    by_height : ByHeight or None
+    config, dt_ns
+        Preparation of the pulses that it gives, and their sampling period in ns.
+    noise
+        Noise that is added to the output of the network, if any.
+    tails
+        Distribution of the pile-up tails under the data, if it was measured.
+    by_height
         What the electronics do by the height of a pulse, if anything.
+    needs_energies
+        Whether the noise depends on the energies.
     """
 
     network: Generator | ResponseGenerator | Inverse
     config: PreparationConfig
     dt_ns: float
-    needs_energies: bool = False
-    chain: ResponseGenerator | None = None
     noise: BaselineNoise | None = None
     tails: DrawnTails | None = None
     by_height: ByHeight | None = None
+    needs_energies: bool = False
+
+    @property
+    def chain(self) -> ResponseGenerator | None:
+        """Readout chain, which gives traces of any length."""
+        return self.network if isinstance(self.network, ResponseGenerator) else None
 
     @abstractmethod
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
+    def translate(self, batch: Batch) -> Translated:
         """Translate a batch of windows."""
 
-    def levels(self, windows: FloatArray, n_pre: int, length: int) -> Translated:
-        """Noise-free traces of any length, aligned at sample `n_pre`; of a chain only."""
-        raise NotImplementedError
-
-    def finished(self, windows: FloatArray, records: FloatArray, drawn: Drawn) -> Translated:
+    def finished(self, records: FloatArray, windows: FloatArray, batch: Batch) -> Translated:
         """Records with noise in proportion to 1/energy and other pulses, prepared like data.
 
         `windows` are those of which `shapes` makes the other pulses.
         """
-        energy_kev, piled, added = drawn.energy_kev, drawn.piled, None
-        if drawn.others and energy_kev is not None:
+        energy_kev, piled, added = batch.energy_kev, batch.piled, None
+        if energy_kev is not None and (batch.tails_kev is not None or piled is not None):
             added = np.zeros(records.shape)
-            if drawn.tails_kev is not None and self.tails is not None:
-                left = drawn.tails_kev * self.tails.height / energy_kev
+            if batch.tails_kev is not None and self.tails is not None:
+                left = batch.tails_kev * self.tails.height / energy_kev
                 added += left[:, np.newaxis] * self.tails.decay(records.shape[1])
             if piled is not None and len(piled.row):
                 # with shapes of the same batch; early ones need longer records
@@ -152,9 +149,9 @@ class Backend(ABC):
             records,
             self.config,
             dt_ns=self.dt_ns,
-            noise=self.noise if drawn.noise else None,
+            noise=self.noise if batch.noise else None,
             energy_kev=energy_kev,
-            seed=drawn.generator,
+            seed=batch.generator,
             added=added,
             by_height=self.by_height,
         )
@@ -166,55 +163,30 @@ class Backend(ABC):
 
 
 class NetworkBackend(Backend):
-    """A network that maps windows to windows.
-
-    Parameters
-    ----------
-    network
-        Network; its noise is the latent noise unless `kept` is given.
-    config
-        The preparation of the data, which noisy pulses go through again.
-    kept
-        Noise of the data's baselines, which is added to the output of the network.
-    tails
-        Distribution of the pile-up tails under the data, if known.
-    """
+    """A network that maps windows to windows, with latent noise or that of the baselines."""
 
     network: Generator
 
-    def __init__(
-        self,
-        network: Generator,
-        config: PreparationConfig,
-        kept: KeptNoise | None = None,
-        tails: DrawnTails | None = None,
-    ) -> None:
-        self.network, self.config, self.dt_ns = network.eval(), config, config.sampled_ns
-        if kept is not None:
-            self.noise, self.tails, self.needs_energies = kept.noise, tails, True
-
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
+    def translate(self, batch: Batch) -> Translated:
         """Run the network; add noise in proportion to 1/energy, and prepare like data."""
         import torch
 
-        device = next(self.network.parameters()).device
-        generator = torch.Generator(device).manual_seed(int(drawn.generator.integers(2**62)))
+        device, (n, length) = next(self.network.parameters()).device, batch.windows.shape
+        generator = torch.Generator(device).manual_seed(int(batch.generator.integers(2**62)))
         with torch.inference_mode():
-            batch = torch.from_numpy(windows).to(device)
+            given = torch.from_numpy(batch.windows).to(device)
             if self.network.linear is None:
-                out = self.network.unet(
-                    batch[:, None], generator=generator, mean=not drawn.noise
-                )[:, 0]
+                mean = not batch.noise
+                out = self.network.unet(given[:, None], generator=generator, mean=mean)[:, 0]
             else:
-                out = self.network(batch)
+                out = self.network(given)
         clean: FloatArray = out.cpu().numpy()
-        if (n := windows.shape[1]) < clean.shape[1]:  # records
+        if length < clean.shape[1]:  # records
             first = padding(self.dt_ns)[0]
-            return self.finished(clean[:, first : first + n], clean, drawn)
-        if self.noise is None or not drawn.noise:
-            n = len(windows)
+            return self.finished(clean, clean[:, first : first + length], batch)
+        if self.noise is None or not batch.noise:
             return Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
-        return self.finished(clean, with_room(clean, self.config, self.dt_ns), drawn)
+        return self.finished(with_room(clean, self.config, self.dt_ns), clean, batch)
 
     def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
         return with_room(windows, self.config, self.dt_ns, reach)
@@ -223,22 +195,31 @@ class NetworkBackend(Backend):
 class ResponseBackend(Backend):
     """A readout chain with electronic noise and the preparation of measured traces."""
 
-    needs_energies = True
     network: ResponseGenerator
-    chain: ResponseGenerator
 
-    def __init__(self, generator: ResponseGenerator, config: PreparationConfig) -> None:
-        self.network = self.chain = generator
-        self.noise, self.tails = generator.noise, generator.tails
-        self.config, self.dt_ns = config, float(generator.response.dt_ns)
-        self.by_height = generator.response.by_height
-
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
+    def translate(self, batch: Batch) -> Translated:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
-        return self.finished(windows, self.network(windows), drawn)
+        windows, energies, piled = batch.windows, batch.energy_kev, batch.piled
+        if batch.trace is None:
+            return self.finished(self.network(windows), windows, batch)
+        n_pre, length = batch.trace
+        assert energies is not None  # those of the pulses
+        levels, codes, begin, charge = self._levels(windows, n_pre, length)
+        if batch.noise and self.noise is not None:
+            levels += self.noise.draw(energies, length, batch.generator)
+        if piled is not None and len(piled.row):
+            # early piled-up pulses need longer traces
+            reached = length + piled.reach(self.dt_ns)
+            shapes = self._levels(windows[piled.partner], n_pre, reached)[0]
+            levels += piled.added(np.nan_to_num(shapes), energies, self.dt_ns, length)
+        if self.by_height is not None:
+            levels = self.by_height(levels * charge, energies) / charge
+        return Translated(levels, codes, begin)
 
-    def levels(self, windows: FloatArray, n_pre: int, length: int) -> Translated:
-        """Noise-free traces of prepared simulated windows, aligned at sample `n_pre`."""
+    def _levels(
+        self, windows: FloatArray, n_pre: int, length: int
+    ) -> tuple[FloatArray, Codes, npt.NDArray[np.int64], FloatArray]:
+        """Noise-free traces, aligned at sample `n_pre`, their codes, begins and charge."""
         before = max(0, n_pre - self.config.samples_before)
         after = max(0, length - n_pre - self.config.samples_after)
         # before the window no charge has moved, after it all charge has been collected
@@ -252,16 +233,15 @@ class ResponseBackend(Backend):
         levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / height
         begin = np.zeros(len(windows), np.int64)
         begin[clean.index] = clean.align_sample - n_pre - before - padding(self.dt_ns)[0]
-        charge = np.ones(len(windows), np.float32)
-        charge[clean.index] = clean.scale
-        return Translated(levels, clean.codes, begin, charge)
+        charge = np.ones((len(windows), 1), np.float32)
+        charge[clean.index] = height
+        return levels, clean.codes, begin, charge
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
         """Records without noise, and the same prepared; flat tops do not count as saturated."""
         records = self.network(windows)
         config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
-        pulses = Pulses.of(records, dt_ns=self.dt_ns)
-        return records, prepare(pulses, config, "measured")
+        return records, prepare(Pulses.of(records, dt_ns=self.dt_ns), config, "measured")
 
     def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
         records, clean = self._clean(np.pad(windows, ((0, 0), (0, reach)), mode="edge"))
@@ -275,13 +255,9 @@ class InverseBackend(Backend):
 
     network: Inverse
 
-    def __init__(self, inverse: Inverse, config: PreparationConfig, dt_ns: float) -> None:
-        self.network = inverse
-        self.config = config
-        self.dt_ns = dt_ns
-
-    def __call__(self, windows: FloatArray, drawn: Drawn) -> Translated:
+    def translate(self, batch: Batch) -> Translated:
         """Invert the response and suppress the noise; deterministic."""
+        windows = batch.windows
         pulses = np.asarray(self.network(windows), np.float32)
         prepared = prepare(Pulses.of(pulses, dt_ns=self.dt_ns), self.config, "simulated")
         result, begin = np.full_like(windows, np.nan), np.zeros(len(windows), np.int64)
@@ -298,38 +274,43 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
     CpunetError
         If the weights of the run do not match its recipe.
     """
-    recipe, forward = run.recipe, part == "ren"
-    generator, preparation = recipe.generator, recipe.preparation
+    recipe, forward, dt_ns = run.recipe, part == "ren", run.dt_ns
+    generator, config = recipe.generator, recipe.preparation
     if isinstance(generator, PunetConfig):
         require_torch()
         from cpunet.training.network_runs import applied, fill_generator, generators
 
-        made = generators(recipe)
+        parts = generators(recipe)
         if generator.linear == "learned":  # the inverse is that of the response
-            fill_generator(run, "ren", made["ren"], device)
-        network = fill_generator(run, part, made[part], device)
+            fill_generator(run, "ren", parts["ren"], device)
+        network = fill_generator(run, part, parts[part], device).eval()
         if not forward and generator.linear == "learned":
-            return InverseBackend(applied(network), preparation, run.dt_ns)
+            return InverseBackend(applied(network), config, dt_ns)
         if not forward or recipe.cyclegan.training.noise == "none":
-            return NetworkBackend(network, preparation)
-        kept = run.fill(NOISE, KeptNoise(run.dt_ns))
-        return NetworkBackend(network, preparation, kept, run.tails)
-    if forward:
-        response = run.fill(part, ResponseGenerator(generator, run.dt_ns))
-        response.tails, response.residual = run.tails, _residual(run, part, device)
-        return ResponseBackend(response, preparation)
-    inverse = run.fill(part, LinearInverse(preparation.length, recipe.matching.training))
-    inverse.residual = _residual(run, part, device)
-    return InverseBackend(inverse, preparation, run.dt_ns)
+            return NetworkBackend(network, config, config.sampled_ns)
+        noise = run.fill(NOISE, KeptNoise(dt_ns)).noise
+        return NetworkBackend(
+            network, config, config.sampled_ns, noise, run.tails, needs_energies=True
+        )
+    residual, name = None, f"{part}_residual"  # what a network adds to the pulses
+    if any(key.startswith(f"{name}.") for key in run.weights):
+        require_torch()
+        from cpunet.training import adversarial, network_runs
+
+        added = adversarial.Residual(recipe.cyclegan.generator, dt_ns)
+        residual = network_runs.applied(run.fill(name, added, device))
+    if not forward:
+        inverse = run.fill(part, LinearInverse(config.length, recipe.matching.training))
+        inverse.residual = residual
+        return InverseBackend(inverse, config, dt_ns)
+    chain = run.fill(part, ResponseGenerator(generator, dt_ns))
+    chain.tails, chain.residual = run.tails, residual
+    return response_backend(chain, config)
 
 
-def _residual(run: Run, part: str, device: str) -> Residual | None:
-    """What a network adds to the pulses of a part, if there is one."""
-    name = f"{part}_residual"
-    if not any(key.startswith(f"{name}.") for key in run.weights):
-        return None
-    require_torch()
-    from cpunet.training import adversarial, network_runs
-
-    network = adversarial.Residual(run.recipe.cyclegan.generator, run.dt_ns)
-    return network_runs.applied(run.fill(name, network, device))
+def response_backend(chain: ResponseGenerator, config: PreparationConfig) -> ResponseBackend:
+    """The backend of a readout chain."""
+    response = chain.response
+    return ResponseBackend(
+        chain, config, float(response.dt_ns), chain.noise, chain.tails, response.by_height, True
+    )

@@ -53,7 +53,7 @@ def export_onnx(
 ) -> Export:
     """Export the deterministic part of a run as ONNX, and check it against the run.
 
-    If the run adds electronic noise, ``NAME.noise.npz`` beside ``NAME.onnx`` (or another name
+    If the run adds electronic noise, ``NAME.noise.npz`` next to ``NAME.onnx`` (or another name
     of `out`) contains its spectrum.  Recipe, line, seed and sampling period are metadata of the
     graph.
 
@@ -117,14 +117,6 @@ class Graph:
     expected: Callable[[Inputs], FloatArray]
 
 
-def example_windows(length: int, n: int) -> FloatArray:
-    """Prepared pulses with edges of several widths and positions."""
-    rng = np.random.default_rng(n)
-    width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
-    charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
-    return charge.astype(np.float32)
-
-
 def graph_of(network: Any, length: int) -> Graph:
     """What can be exported of the network, chain or inverse of a run, for windows of a length.
 
@@ -134,7 +126,11 @@ def graph_of(network: Any, length: int) -> Graph:
     """
 
     def windows(n: int) -> Inputs:
-        return {"windows": example_windows(length, n)}
+        """Prepared pulses with edges of several widths and positions."""
+        rng = np.random.default_rng(n)
+        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
+        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
+        return {"windows": charge.astype(np.float32)}
 
     behind = getattr(network, "linear", None) or getattr(network, "residual", None)
     if behind is not None:

@@ -18,14 +18,9 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_existing, refuse_inputs
 from cpunet.processes import give_back_large_arrays
-from cpunet.progress import Stage, stage
+from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.provenance import (
-    TRANSLATED_BY,
-    TRANSLATION,
-    recorded_attributes,
-    require_side,
-)
+from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.row_columns import other_columns
@@ -56,8 +51,7 @@ OWN_COLUMNS = frozenset(
 class Counts:
     """Numbers of rows: read, translated, rejected by reason, and saturated ones in ADC.
 
-    Of several files also their number, and how many were there already; 1 or 0 for a single
-    one.
+    Of several files also their number, and how many existed already; 1 or 0 for a single file.
     """
 
     read: int = 0
@@ -74,12 +68,12 @@ class Counts:
         return cls(len(block.codes), int(block.valid.sum()), block.rejections, saturated)
 
     def __add__(self, other: Counts) -> Counts:
-        known = [n for n in (self.saturated, other.saturated) if n is not None]
+        saturated = [n for n in (self.saturated, other.saturated) if n is not None]
         return Counts(
             self.read + other.read,
             self.translated + other.translated,
             dict(Counter(self.rejections) + Counter(other.rejections)),
-            sum(known) if known else None,
+            sum(saturated) if saturated else None,
             skipped=self.skipped + other.skipped,
         )
 
@@ -111,9 +105,10 @@ class FileTranslation:
     def warn(self) -> None:
         """Say what the user should know of the output."""
         if self.form.fills_in:
+            window = self.translator.recipe.preparation.length
             log.warning(
-                f"a network knows windows of {self.form.config.length} samples alone; beyond "
-                "them stand baseline and decay without noise"
+                f"a network knows windows of {window} samples alone; beyond them stand "
+                "baseline and decay without noise"
             )
 
     def __call__(
@@ -125,7 +120,7 @@ class FileTranslation:
         resume: bool = False,
         force: bool = False,
     ) -> Counts:
-        """Translate a file, block by block, keeping its rows and other columns.
+        """Translate a file, block by block, with its rows and other columns.
 
         Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
         ``rejection`` contains the reason (0: translated).
@@ -140,7 +135,7 @@ class FileTranslation:
             Name that is combined with the seed, so that the noise of files or channels
             differs; None for the noise of `cpunet.translation.translator.Translator.translate`.
         resume
-            Whether to keep an output that was made from this source with this run and options.
+            Whether an output that was made from this source with this run and options stays.
         force
             Whether to replace an existing file.
 
@@ -159,15 +154,14 @@ class FileTranslation:
         refuse_existing(out, force=force)
         counts = Counts()
         give_back_large_arrays()
-        with self.opened(source) as pulses, self.writer(out, force=force) as writer:
+        with self._opened(source) as pulses, self.writer(out, force=force) as writer:
             read_others, left_out = other_columns(pulses, OWN_COLUMNS)
             for column, reason in left_out.items():
                 log.warning(f"{source.path.name}: column {column} is left out: {reason}")
             for block in self._blocks(pulses, noise_key):
-                beside = read_others(counts.read, len(block.codes))
-                writer.append(block.pulses, {**block.columns, **beside})
+                others = read_others(counts.read, len(block.codes))
+                writer.append(block.pulses, {**block.columns, **others})
                 counts += Counts.of(block)
-            self._require_some(source, counts)
             if source_print(source) != before:
                 raise CpunetError(
                     f"{source.path}: changed while it was read; translate it once it is "
@@ -186,24 +180,16 @@ class FileTranslation:
         CpunetError
             If the source cannot be used, or no pulse can be translated.
         """
-        with self.opened(source) as pulses:
+        with self._opened(source) as pulses:
             blocks = list(self._blocks(pulses, None))
-        counts = sum(map(Counts.of, blocks), Counts())
-        self._require_some(source, counts)
-        return TranslatedPulses.joined(blocks), counts
+        return TranslatedPulses.joined(blocks), sum(map(Counts.of, blocks), Counts())
 
-    def opened(self, source: PulseFile) -> PulseSource:
-        """Open a file of pulses that this run can translate.
-
-        Raises
-        ------
-        CpunetError
-            If it cannot be read, has another sampling period or is of the other side.
-        """
+    def _opened(self, source: PulseFile) -> PulseSource:
+        """Open a file of pulses that this run can translate."""
         pulses = source.open()
         self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
         remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
-        if TRANSLATED_BY in recorded_attributes(pulses):
+        if pulses.attrs.get(TRANSLATED_BY):
             remedy = f"translate the {self.kind.takes} ones that they were made of"
         require_side(pulses, self.kind.takes, remedy, insist=source.insist)
         return pulses
@@ -213,34 +199,30 @@ class FileTranslation:
         return PulseWriter(
             out,
             table=self.options.table or f"geds/{self.kind.part}",
-            waveform_units=self.form.units,
+            waveform_units="ADC" if self.options.adc else "",
             attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
             samples=self.form.samples,
             force=force,
         )
 
-    def _require_some(self, source: PulseFile, counts: Counts) -> None:
+    def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[TranslatedPulses]:
+        """Translate block by block; the noise depends only on the order of the pulses."""
+        size = max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))  # fits in memory
+        counts = Counts()
+        with stage("Translating", pulses.n_pulses) as bar:
+            for number, block in enumerate(regrouped(pulses.blocks(size), NOISE_ROWS)):
+                seed = noise_seed(self.options.seed, noise_key, number)
+                generator = np.random.default_rng(seed)
+                done = self.form(block, noise=self.options.noise, generator=generator)
+                counts += Counts.of(done)
+                yield done
+                bar.update(len(block))
         if not counts.translated:
             reasons = ", ".join(f"{n} {why}" for why, n in counts.rejections.items())
             raise CpunetError(
-                f"{source.path}: none of {counts.read} pulses can be translated "
-                f"({reasons}); are these {self.translator.takes} pulses?"
+                f"{pulses.path}: none of {counts.read} pulses can be translated "
+                f"({reasons}); are these {self.kind.takes} pulses?"
             )
-
-    def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[TranslatedPulses]:
-        """Translate block by block; the noise depends only on the order of the pulses."""
-        with stage("Translating", pulses.n_pulses) as bar:
-            for number, block in enumerate(regrouped(_read(pulses, bar), NOISE_ROWS)):
-                seed = noise_seed(self.options.seed, noise_key, number)
-                generator = np.random.default_rng(seed)
-                yield self.form(block, noise=self.options.noise, generator=generator)
-
-
-def _read(pulses: PulseSource, bar: Stage) -> Iterator[Pulses]:
-    """Blocks of a file that fit in memory, whatever the length of its traces."""
-    for block in pulses.blocks(max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))):
-        yield block
-        bar.update(len(block))
 
 
 def source_print(source: PulseFile) -> str:
@@ -258,14 +240,14 @@ def source_print(source: PulseFile) -> str:
     elsewhere = (source.energy or "").rpartition(":")[0]
     if elsewhere and Path(elsewhere).is_file():
         paths.append(Path(elsewhere))
-    known: list[Any] = [source.table, source.energy, source.kev_per_adc, source.dt_ns]
+    facts: list[Any] = [source.table, source.energy, source.kev_per_adc, source.dt_ns]
     for path in paths:
         try:
             stat = path.stat()
         except OSError:
             raise CpunetError(f"{path}: no such file; check the name") from None
-        known.append((path.name, stat.st_size, stat.st_mtime_ns))
-    return hashlib.sha256(repr(known).encode(errors="surrogateescape")).hexdigest()
+        facts.append((path.name, stat.st_size, stat.st_mtime_ns))
+    return hashlib.sha256(repr(facts).encode(errors="surrogateescape")).hexdigest()
 
 
 def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:
@@ -304,17 +286,17 @@ def finished(out: Path, wanted: dict[str, Any]) -> Counts:
     """
     try:
         with opened(out) as file:
-            found = json.loads(file.attrs[TRANSLATION])
+            record = json.loads(file.attrs[TRANSLATION])
     except (CpunetError, LookupError) as error:
         raise CpunetError(
             f"{out}: is no translation that is finished; choose another `out` or give `force`"
         ) from error
     for what, value in wanted.items():
-        if found[what] == value:
+        if record[what] == value:
             continue
         other = f"another {what}"
         if what == "options":
-            names = ", ".join(n for n in value if found[what].get(n, ...) != value[n])
+            names = ", ".join(n for n in value if record[what].get(n, ...) != value[n])
             other = f"other options ({names})"
         raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
-    return Counts(**found["counts"])
+    return Counts(**record["counts"])

@@ -10,7 +10,7 @@ baseline before them and with the decay fitted to their end after them, both wit
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,6 @@ from cpunet.networks.response_layer import padding, record_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Rejection
 from cpunet.training.run import Run
-from cpunet.translation.backends import Drawn, Translated
 from cpunet.translation.options import LEARNED, NONE, Adc, TranslateOptions
 from cpunet.translation.translator import TranslatedPulses, Translator
 
@@ -34,181 +33,123 @@ RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
 
-class Windows:
-    """Prepared windows: baseline at 0, tail at 0.80; NaN for rejected pulses.
+@dataclass(frozen=True)
+class Form:
+    """Prepared windows, NaN for rejected pulses, or raw traces in ADC counts, 0 for these.
 
     Parameters
     ----------
     translator
         Trained run.
-    tails
-        Distribution of the pile-up tails; None for none.
-    pile_up
-        Rate and energies of piled-up pulses; None for none.
-
-    Attributes
-    ----------
-    samples, units
-        Type and units of the stored samples.
     n_pre, length
         Samples of a trace before the alignment of a pulse without noise, and all.
-    record
-        The same of the record within which pulses pile up.
-    fills_in
-        Whether traces are padded with baseline and decay without noise.
+    tails
+        Distribution of the pile-up tails, which raise the baseline at the start of a trace;
+        None for none.
+    pile_up
+        Rate and energies of piled-up pulses; None for none.
+    scale
+        ADC counts per prepared unit and keV, and baseline in ADC counts; None for windows.
+    ends
+        Lowest and highest count.
     """
 
-    samples: npt.DTypeLike = np.float32
-    units = ""
-    fills_in = False
+    translator: Translator
+    n_pre: int
+    length: int
+    tails: DrawnTails | None = None
+    pile_up: DrawnPileUp | None = None
+    scale: tuple[float, float] | None = None
+    ends: tuple[int, int] = (0, HIGHEST)
 
-    def __init__(
-        self,
-        translator: Translator,
-        tails: DrawnTails | None = None,
-        pile_up: DrawnPileUp | None = None,
-    ) -> None:
-        self.translator, self.tails, self.pile_up = translator, tails, pile_up
-        self.config = config = translator.recipe.preparation
-        self.n_pre, self.length = config.samples_before, config.length
-        before = padding(translator.dt_ns)[0]
-        self.record = before + self.n_pre, record_length(self.length, translator.dt_ns)
+    @property
+    def samples(self) -> npt.DTypeLike:
+        """Type of the stored samples."""
+        return np.float32 if self.scale is None else _kind(self.ends)
+
+    @property
+    def fills_in(self) -> bool:
+        """Whether traces are padded with baseline and decay without noise."""
+        config = self.translator.recipe.preparation
+        after = self.length - self.n_pre
+        beyond = self.n_pre > config.samples_before or after > config.samples_after
+        return self.translator.backend.chain is None and beyond
 
     def __call__(
         self, pulses: Pulses, *, noise: bool, generator: np.random.Generator
     ) -> TranslatedPulses:
-        """Translate pulses, keeping their rows."""
-        left, piled = drawn_kev(self.tails, len(pulses), generator), None
-        truth: Columns = {} if left is None else {"tails_kev": (left, "keV")}
+        """Translate pulses, of which all rows stay; raw traces need energies."""
+        translator, dt_ns = self.translator, self.translator.dt_ns
+        left, piled, n = None, None, len(pulses)
+        truth: Columns = {}
+        if self.tails is not None:
+            left = self.tails.draw_kev(n, generator)
+            truth = {"tails_kev": (left, "keV")}
         if self.pile_up is not None:
-            piled = self.pile_up.draw(len(pulses), *self.record, generator)
+            record = self.n_pre, self.length
+            if self.scale is None:
+                record = padding(dt_ns)[0] + self.n_pre, record_length(self.length, dt_ns)
+            piled = self.pile_up.draw(n, *record, generator)
             truth |= piled.columns()
-        known = Drawn(pulses.energy_kev, noise, generator, left, piled)
-        return replace(self._translated(pulses, known), truth=truth)
-
-    def _translated(self, pulses: Pulses, known: Drawn) -> TranslatedPulses:
-        return self.translator.translate_drawn(pulses, known)
-
-
-class AdcTraces(Windows):
-    """Raw traces in ADC counts; 0 for rejected pulses.
-
-    Parameters
-    ----------
-    translator
-        Trained run.
-    per_kev, baseline
-        ADC counts per prepared unit and keV, and baseline in ADC counts, see `adc_scale`.
-    adc
-        Number of samples of a trace, and of those before the alignment of the pulse without
-        noise; the values of the prepared window if None.
-    tails
-        Distribution of the pile-up tails, which raise the baseline at the start
-        of a trace; None for none.
-    pile_up
-        Rate and energies of piled-up pulses within a trace; None for none.
-
-    Raises
-    ------
-    CpunetError
-        If `n_pre` is not within the trace.
-    """
-
-    samples: npt.DTypeLike = np.uint16
-    units = "ADC"
-
-    def __init__(
-        self,
-        translator: Translator,
-        per_kev: float,
-        baseline: float,
-        adc: Adc,
-        tails: DrawnTails | None = None,
-        pile_up: DrawnPileUp | None = None,
-        ends: tuple[int, int] = (0, HIGHEST),
-    ) -> None:
-        super().__init__(translator, tails, pile_up)
-        self.per_kev, self.baseline, self.ends = per_kev, baseline, ends
-        self.samples = _kind(ends)
-        chain = translator.backend.chain
-        if pile_up is not None and chain is None:
-            raise CpunetError(
-                "a network knows no shapes beyond its windows, so it gives no raw traces with "
-                "piled-up pulses; leave out `pile_up_khz` or `adc`"
-            )
-        before, window = self.n_pre, self.length
-        self.length = window if adc.length is None else adc.length
-        self.n_pre = before if adc.n_pre is None else adc.n_pre
-        if not 0 <= self.n_pre < self.length:
-            raise CpunetError(
-                f"`n_pre` {self.n_pre} is not within a trace of {self.length} samples; "
-                "give less, or a longer `length`"
-            )
-        self.record = self.n_pre, self.length
-        beyond = self.n_pre > before or self.length - self.n_pre > window - before
-        self.fills_in = chain is None and beyond
-
-    def _translated(self, pulses: Pulses, known: Drawn) -> TranslatedPulses:
-        """Traces of all pulses; those without energy are rejected."""
-        if self.translator.backend.chain is not None:
-            done = self.translator.translate_drawn(pulses, known, self._of_chain, self.length)
-            windows, t0_ns = done.pulses.waveforms, done.pulses.t0_ns
-        else:
-            done = self.translator.translate_drawn(pulses, replace(known, tails_kev=None))
-            windows = extended(
-                done.pulses.waveforms, self.config, pulses.dt_ns, self.length, self.n_pre
-            )
-            earlier = self.n_pre - self.config.samples_before
-            t0_ns = done.pulses.t0_ns - earlier * pulses.dt_ns
-        codes = done.codes
+        chain = translator.backend.chain is not None
+        done = translator.translate_pulses(
+            pulses,
+            noise=noise,
+            generator=generator,
+            tails_kev=left if chain or self.scale is None else None,
+            piled=piled,
+            trace=(self.n_pre, self.length) if chain and self.scale is not None else None,
+        )
+        if self.scale is None:
+            return replace(done, truth=truth)
+        codes, windows, t0_ns = done.codes, done.pulses.waveforms, done.pulses.t0_ns
+        if not chain:
+            config = translator.recipe.preparation
+            windows = extended(windows, config, dt_ns, self.length, self.n_pre)
+            t0_ns = t0_ns - (self.n_pre - config.samples_before) * dt_ns
         unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
         codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
-        if known.tails_kev is not None and self.tails is not None:
+        if left is not None and self.tails is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
-                heights = known.tails_kev * self.tails.height / pulses.energy_kev
-            decay = self.tails.decay(self.length, lead_us=0.0)
-            windows += heights[:, np.newaxis] * decay
+                heights = left * self.tails.height / pulses.energy_kev
+            windows += heights[:, np.newaxis] * self.tails.decay(self.length, lead_us=0.0)
         windows[codes != Rejection.ACCEPTED] = np.nan
-        scale = np.where(unknown, 0.0, self.per_kev * pulses.energy_kev)
-        traces, saturated = to_adc(windows, scale, self.baseline, self.ends)
+        per_kev, baseline = self.scale
+        scale = np.where(unknown, 0.0, per_kev * pulses.energy_kev)
+        traces, saturated = to_adc(windows, scale, baseline, self.ends)
         # single precision represents these integers exactly
         whole = replace(pulses, waveforms=traces.astype(np.float32), t0_ns=t0_ns)
-        return TranslatedPulses(whole, codes, saturated)
-
-    def _of_chain(self, windows: FloatArray, known: Drawn) -> Translated:
-        """Traces in prepared units from a readout chain."""
-        backend, piled, dt_ns = self.translator.backend, known.piled, self.translator.dt_ns
-        energies = known.energy_kev
-        assert energies is not None  # those of the pulses
-        levels, codes, begin, charge = backend.levels(windows, self.n_pre, self.length)
-        if known.noise and backend.noise is not None:
-            levels += backend.noise.draw(energies, self.length, known.generator)
-        if piled is not None and len(piled.row):
-            # early piled-up pulses need longer traces
-            reached = self.length + piled.reach(dt_ns)
-            shapes = backend.levels(windows[piled.partner], self.n_pre, reached).windows
-            levels += piled.added(np.nan_to_num(shapes), energies, dt_ns, self.length)
-        if backend.by_height is not None and charge is not None:
-            scale = charge[:, np.newaxis]
-            levels = backend.by_height(levels * scale, energies) / scale
-        return Translated(levels, codes, begin)
+        return TranslatedPulses(whole, codes, saturated, truth)
 
 
-def form_of(run: Run, translator: Translator, options: TranslateOptions) -> Windows:
+def form_of(run: Run, translator: Translator, options: TranslateOptions) -> Form:
     """The form that options ask for.
 
     Raises
     ------
     CpunetError
-        If the run lacks information for it.
+        If the run lacks information for it, or `n_pre` is not within the trace.
     """
-    adc = options.adc
+    adc, config = options.adc, translator.recipe.preparation
     tails = wanted_tails(translator, options.tails, raw=adc is not None)
     pile_up = wanted_pile_up(translator, options.pile_up_khz)
+    n_pre, length = config.samples_before, config.length
     if adc is None:
-        return Windows(translator, tails, pile_up)
-    scale = adc_scale(run, translator, adc)
-    return AdcTraces(translator, *scale, adc, tails, pile_up, adc_ends(run, adc))
+        return Form(translator, n_pre, length, tails, pile_up)
+    scale, ends = adc_scale(run, translator, adc), adc_ends(run, adc)
+    if pile_up is not None and translator.backend.chain is None:
+        raise CpunetError(
+            "a network knows no shapes beyond its windows, so it gives no raw traces with "
+            "piled-up pulses; leave out `pile_up_khz` or `adc`"
+        )
+    length = length if adc.length is None else adc.length
+    n_pre = n_pre if adc.n_pre is None else adc.n_pre
+    if not 0 <= n_pre < length:
+        raise CpunetError(
+            f"`n_pre` {n_pre} is not within a trace of {length} samples; "
+            "give less, or a longer `length`"
+        )
+    return Form(translator, n_pre, length, tails, pile_up, scale, ends)
 
 
 def adc_ends(run: Run, adc: Adc) -> tuple[int, int]:
@@ -298,38 +239,27 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
         raise CpunetError(f"`adc_per_kev` is {adc_per_kev}; expected a number above 0")
     if baseline is not None and not (np.isfinite(baseline) and baseline >= 0):
         raise CpunetError(f"`baseline` is {baseline}; expected a number that is not negative")
-    known_gain, known_baseline = None, None
-    cuts, peak = run.data.cuts, run.recipe.peaks.get(run.peak)
+    per_kev, cuts, peak = None, run.data.cuts, run.recipe.peaks.get(run.peak)
     if cuts is not None and cuts.amplitude >= MIN_ADC:
-        known_gain = None if peak is None else cuts.amplitude / peak.energy_kev
-        known_baseline = {one.name: one.centre for one in cuts.windows}.get("baseline")
-    per_kev = known_gain if adc_per_kev is None else adc_per_kev / _height(translator)
-    level = known_baseline if baseline is None else baseline
+        per_kev = None if peak is None else cuts.amplitude / peak.energy_kev
+        if baseline is None:
+            baseline = {window.name: window.centre for window in cuts.windows}.get("baseline")
+    if adc_per_kev is not None:  # of the maximum, in prepared units, of a fast pulse
+        config = translator.recipe.preparation
+        time = np.arange(config.length) - config.samples_before
+        ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
+        pulse = translator.apply(ramp[np.newaxis], energy_kev=np.ones(1), noise=False)
+        height = float(pulse.max())
+        if not (np.isfinite(height) and height > 0):
+            raise CpunetError("the run cannot translate a fast pulse; train again")
+        per_kev = adc_per_kev / height
     if per_kev is None:
         raise CpunetError(
             f"{run.name}: does not say how many ADC counts a keV is; give `adc_per_kev`"
         )
-    if level is None:
+    if baseline is None:
         raise CpunetError(f"{run.name}: does not say where the baseline is; give `baseline`")
-    return per_kev, level
-
-
-def _height(translator: Translator) -> float:
-    """Maximum, in prepared units, of a fast pulse without noise."""
-    config = translator.recipe.preparation
-    time = np.arange(config.length) - config.samples_before
-    ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
-    height = float(translator.apply(ramp[np.newaxis], energy_kev=np.ones(1), noise=False).max())
-    if not (np.isfinite(height) and height > 0):
-        raise CpunetError("the run cannot translate a fast pulse; train again")
-    return height
-
-
-def drawn_kev(
-    tails: DrawnTails | None, n: int, generator: np.random.Generator
-) -> npt.NDArray[np.float64] | None:
-    """Pile-up tails of `n` pulses in keV, drawn from the random generator of the noise."""
-    return None if tails is None else tails.draw_kev(n, generator)
+    return per_kev, baseline
 
 
 def wanted_tails(
@@ -361,12 +291,12 @@ def wanted_tails(
             rate = np.nan
         if not (np.isfinite(rate) and rate >= 0):
             raise CpunetError(f"`tails` {wanted}: expected learned, none, or a rate in kHz")
-    known = _known_tails(translator, f"`tails` {wanted}")
+    tails = _tails_of(translator, f"`tails` {wanted}")
     if rate is not None:
-        known = known.uncut(rate)
+        tails = tails.uncut(rate)
     elif raw:
-        known = known.uncut()
-    return known if known.law.rate_khz > 0 else None
+        tails = tails.uncut()
+    return tails if tails.law.rate_khz > 0 else None
 
 
 def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | None:
@@ -388,11 +318,11 @@ def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | Non
         raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
     if rate_khz == 0:
         return None
-    known = _known_tails(translator, f"`pile_up_khz` {rate_khz:g}")
-    return DrawnPileUp(rate_khz, known.law.energies_kev, translator.dt_ns)
+    tails = _tails_of(translator, f"`pile_up_khz` {rate_khz:g}")
+    return DrawnPileUp(rate_khz, tails.law.energies_kev, translator.dt_ns)
 
 
-def _known_tails(translator: Translator, asked: str) -> DrawnTails:
+def _tails_of(translator: Translator, asked: str) -> DrawnTails:
     if translator.tails is None:
         raise CpunetError(
             f"{asked}: the run tells nothing of pile-up tails and of other pulses (a network, "

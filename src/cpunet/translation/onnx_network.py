@@ -6,10 +6,9 @@ import copy
 import logging
 import warnings
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -19,27 +18,20 @@ from cpunet.pulses.container import FloatArray
 from cpunet.translation.onnx_readout import OPSET
 
 
-class NetworkGraph(PositionalUNet):
+class NetworkGraph(nn.Module):
     """A Positional U-Net whose latent draw is an input."""
 
     def __init__(self, network: PositionalUNet) -> None:
-        nn.Module.__init__(self)  # all attributes of the base are taken over
-        self.__dict__.update(copy.deepcopy(network).cpu().eval().__dict__)
+        super().__init__()
+        self.network = copy.deepcopy(network).cpu().eval()
         # (channels, samples) of the draw
         self.latent = network.latent_mean.out_channels, network.length // 16
 
-    def forward(self, windows: Tensor, epsilon: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(self, windows: Tensor, epsilon: Tensor) -> Tensor:
         """Windows (batch, samples) and epsilon (batch, channels, samples / 16) → windows."""
-        # the base passes its generator on to `_latent`; here this argument is the draw itself
-        drawn = cast(torch.Generator, epsilon)
-        return super().forward(windows[:, None], generator=drawn)[:, 0]
+        return self.network(windows[:, None], epsilon=epsilon)[:, 0]  # type: ignore[no-any-return]
 
-    def _latent(self, x: Tensor, generator: Any, mean: bool) -> Tensor:
-        del mean
-        centre: Tensor = self.latent_mean(x)
-        return centre + torch.exp(0.5 * self.latent_log_variance(x)) * cast(Tensor, generator)
-
-    def expected(self, given: Mapping[str, FloatArray]) -> npt.NDArray[np.float32]:
+    def expected(self, given: Mapping[str, FloatArray]) -> FloatArray:
         """What the network makes of windows and draw."""
         with torch.inference_mode():
             translated = self(*(torch.from_numpy(values) for values in given.values()))
@@ -63,7 +55,7 @@ class NetworkGraph(PositionalUNet):
                 # exporters warn of their own deprecations
                 warnings.simplefilter("ignore")
                 shapes = tuple({0: batch} for _ in given)
-                program = torch.onnx.export(
+                program: Any = torch.onnx.export(
                     torch.export.export(self, example, dynamic_shapes=shapes),
                     input_names=list(given),
                     output_names=["translated"],
@@ -75,4 +67,4 @@ class NetworkGraph(PositionalUNet):
             raise CpunetError("ONNX has no operators for this run's U-Net") from error
         finally:
             logger.setLevel(level)
-        return cast(Any, program).model_proto
+        return program.model_proto

@@ -116,15 +116,8 @@ def translate(
         )
     if jobs < 1:
         raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")
-    options = TranslateOptions(
-        inverse,
-        noise,
-        seed,
-        out_table,
-        scale if adc else None,
-        tails,
-        pile_up_khz,
-    )
+    scale_ = scale if adc else None
+    options = TranslateOptions(inverse, noise, seed, out_table, scale_, tails, pile_up_khz)
     files = list(_files(pulses, read, insist, run))
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
@@ -134,8 +127,8 @@ def translate(
         run = used_run(run)
         job = FileTranslation(run, options)
         job.warn()
-        kept, counts = job.in_memory(files[0])
-        return Translation(run.name, run.recipe, counts, adc, kept=kept, writer=job.writer)
+        in_memory, counts = job.in_memory(files[0])
+        return Translation(run.name, run.recipe, counts, adc, None, in_memory, job.writer)
     to_files = _ToFiles(options, resume, force)
     if channels:
         if len(files) > 1:
@@ -188,11 +181,10 @@ class _ToFiles:
         run.  The noise depends on the seed and the name of the channel, so that of channels
         differs.
         """
-        channels: dict[str, Pair] = {n: (one, one) for n, one in channels_of(source).items()}
+        channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
         if len(channels) == 1 and not isinstance(runs, Run):
-            own = (own_folder(Path(runs), name, INFO).is_dir() for name in channels)
-            if not any(own):
-                (single,) = channels.values()
+            (name, single), *_ = channels.items()
+            if not own_folder(Path(runs), name, INFO).is_dir():
                 trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
                 channels = dict.fromkeys(trained, single) or channels
         return each_channel(channels, out, partial(self.of_channel, runs))
@@ -215,7 +207,11 @@ class _ToFiles:
             Before the translation, if the run cannot be used, or outputs exist (without
             `resume` or `force`) or would have the same names; at the end, if files failed.
         """
-        tasks = [(source, out / _name(source.path)) for source in sources]
+        tasks = [(file, out / file.path.name) for file in sources]
+        tasks = [
+            (file, to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5"))
+            for file, to in tasks
+        ]
         if out.exists() and not out.is_dir():
             raise CpunetError(f"{out}: is a file, but several outputs need a folder")
         self._check(tasks, run.folder)
@@ -224,9 +220,9 @@ class _ToFiles:
         failed: list[str] = []
         with (
             stage("Translating", len(tasks)) as bar,
-            closing(outcomes(partial(self.work, run), tasks, jobs, once=True)) as found,
+            closing(outcomes(partial(self.work, run), tasks, jobs, once=True)) as results,
         ):
-            for (source, target), outcome in found:
+            for (source, target), outcome in results:
                 bar.update()
                 if isinstance(outcome, CpunetError):
                     text = str(outcome)
@@ -290,10 +286,6 @@ def expanded(name: Path) -> list[Path]:
     if not fitting:
         raise CpunetError(f"{name}: no such files; check the name")
     return [*map(Path, fitting)]
-
-
-def _name(path: Path) -> str:
-    return path.name if path.suffix.lower() in OF_HDF5 else f"{path.stem}.lh5"
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

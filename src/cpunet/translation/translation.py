@@ -53,7 +53,7 @@ class Translation:
         Whether the pulses are raw traces in ADC counts instead of normalised windows.
     path
         The file they were written to, or a folder of several; None if they are in memory only.
-    kept
+    in_memory
         The pulses if they are in memory.
     writer
         Opens a file for those in memory.
@@ -64,20 +64,24 @@ class Translation:
     counts: Counts
     adc: bool = False
     path: Path | None = None
-    kept: TranslatedPulses | None = None
+    in_memory: TranslatedPulses | None = None
     writer: Callable[..., PulseWriter] | None = None
 
     @cached_property
     def pulses(self) -> Pulses:
         """All pulses; those in a file are read on first access."""
-        return self.kept.pulses if self.kept else open_pulses(self._file).read()
+        if self.in_memory:
+            return self.in_memory.pulses
+        assert self.path is not None
+        return open_pulses(self.path).read()
 
     @cached_property
     def codes(self) -> Codes:
         """`cpunet.pulses.preparation.Rejection` code of each row; 0 for a translated pulse."""
-        if self.kept:
-            return self.kept.codes
-        column = open_pulses(self._file).columns["rejection"]
+        if self.in_memory:
+            return self.in_memory.codes
+        assert self.path is not None
+        column = open_pulses(self.path).columns["rejection"]
         return np.asarray(column.read(0, len(column)), np.uint8)
 
     @property
@@ -120,9 +124,9 @@ class Translation:
             If there is no such parameter.
         """
         values = named(self.parameters, parameter, "parameter")
-        made = Histogram(labelled(data_axis(values, MAX_BINS), parameter, bins))
-        made.fill(values[np.isfinite(values)])
-        return made
+        histogram = Histogram(labelled(data_axis(values, MAX_BINS), parameter, bins))
+        histogram.fill(values[np.isfinite(values)])
+        return histogram
 
     @styled
     def plot(self, n: int = DRAWN, ax: Axes | None = None) -> Axes:
@@ -161,16 +165,11 @@ class Translation:
         CpunetError
             If they are in a file, or the file exists (without `force`) or cannot be written.
         """
-        if self.kept is None or self.writer is None:
+        if self.in_memory is None or self.writer is None:
             raise CpunetError(f"{self.path}: holds these pulses already; copy it")
         with self.writer(Path(path), force=force) as writer:
-            writer.append(self.kept.pulses, self.kept.columns)
+            writer.append(self.in_memory.pulses, self.in_memory.columns)
         return Path(path)
-
-    @property
-    def _file(self) -> Path:
-        assert self.path is not None  # else they are in memory
-        return self.path
 
     def __len__(self) -> int:
         return self.counts.read
@@ -204,7 +203,7 @@ class Translation:
             "saturated": self.counts.saturated,
         }
         facts |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
-        small = self.kept is not None  # a file may be large
+        small = self.in_memory is not None  # a file may be large
         picture: str = ""
         if small and self.counts.translated:
             figure = Figure(figsize=(6.4, 3.2))

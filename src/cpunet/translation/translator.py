@@ -10,29 +10,27 @@ from __future__ import annotations
 import hashlib
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.drawn_pile_up import Columns, DrawnTails
+from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejections_of
 from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
 from cpunet.training.run import Run
-from cpunet.translation.backends import Backend, Drawn, Energies, Translated, backend_of
+from cpunet.translation.backends import Backend, Batch, Energies, Translated, backend_of
 
 if TYPE_CHECKING:
     import torch
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], "torch.Tensor", Pulses)
-
-Act: TypeAlias = Callable[[FloatArray, Drawn], Translated]
 
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
@@ -58,7 +56,7 @@ class TranslatedPulses:
     saturated
         Mask of the traces that reach an end of the digitiser's range; None for windows.
     truth
-        What is known of each pulse, arrays of shape (n,) with their units: ``tails_kev``
+        What was drawn for each pulse, arrays of shape (n,) with their units: ``tails_kev``
         with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
         pulses, see `InTracePileUp.largest`.
     """
@@ -80,7 +78,7 @@ class TranslatedPulses:
 
     @property
     def columns(self) -> Columns:
-        """Columns to be stored beside the pulses."""
+        """Columns to be stored with the pulses."""
         return {"rejection": (self.codes, ""), **self.truth}
 
     @classmethod
@@ -213,17 +211,21 @@ class Translator:
         array = given.detach().cpu().float().numpy() if tensor else np.asarray(given)
         if not array.ndim:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
-        self._require_energies(
-            Drawn(None if energy_kev is None else np.asarray(energy_kev, float), noise)
-        )
-        single = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
-        pulses = waveforms if isinstance(waveforms, Pulses) else single
-        if energy_kev is not None:
-            energies = _one_each("energy_kev", energy_kev, len(pulses))
-            pulses = replace(pulses, energy_kev=energies)
-        left = None
-        if tails_kev is not None:
-            left = _one_each("tails_kev", tails_kev, len(pulses))
+        self._by_energy(energy_kev, noise)
+        rows_of = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
+        pulses = waveforms if isinstance(waveforms, Pulses) else rows_of
+        kev: dict[str, Energies] = {}
+        for name, values in {"energy_kev": energy_kev, "tails_kev": tails_kev}.items():
+            shape = np.shape(np.asarray(values))
+            if shape not in ((), (len(pulses),)):
+                raise CpunetError(
+                    f"{name} has shape {shape} beside {len(pulses)} pulses; give one for each, "
+                    "or one for all"
+                )
+            if values is not None:
+                kev[name] = np.broadcast_to(np.asarray(values, float), len(pulses))
+        pulses = replace(pulses, energy_kev=kev.get("energy_kev", pulses.energy_kev))
+        left = kev.get("tails_kev")
         if seed is None:
             seed = int(np.random.default_rng().integers(2**63))
         blocks: list[TranslatedPulses] = []
@@ -260,8 +262,10 @@ class Translator:
         noise: bool = True,
         generator: np.random.Generator | None = None,
         tails_kev: Energies | None = None,
+        piled: InTracePileUp | None = None,
+        trace: tuple[int, int] | None = None,
     ) -> TranslatedPulses:
-        """Translate a set of pulses, keeping its rows; rejected rows are NaN and have a code.
+        """Translate a set of pulses; rejected rows stay, are NaN and have a code.
 
         Parameters
         ----------
@@ -274,53 +278,38 @@ class Translator:
             Random generator of the noise.
         tails_kev
             Pile-up tails under each pulse in keV, shape ``(n,)``.
+        piled, trace
+            See `Batch`; a chain alone gives raw traces.
 
         Raises
         ------
         CpunetError
             If the sampling period is not that of the training.
         """
-        generator = generator or np.random.default_rng()
-        drawn = Drawn(pulses.energy_kev, noise, generator, tails_kev)
-        return self.translate_drawn(pulses, drawn)
-
-    def translate_drawn(
-        self, pulses: Pulses, drawn: Drawn, act: Act | None = None, length: int | None = None
-    ) -> TranslatedPulses:
-        """Like `translate_pulses`, with all that is drawn; see `apply_with_codes`."""
         self.require_sampling("pulses", pulses.dt_ns)
         prepared = prepare(pulses, self.recipe.preparation, self.takes)
-        length = length or self.recipe.preparation.length
         codes = prepared.codes.copy()
-        if self._by_energy(drawn):
+        if self._by_energy(pulses.energy_kev, noise):
             unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
             codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
         rows = codes[prepared.index] == Rejection.ACCEPTED
-        waveforms = np.full((len(pulses), length), np.nan, np.float32)
         index = prepared.index[rows]
-        done = self.apply_with_codes(
-            prepared.pulses.waveforms[rows], drawn.of_rows(index), act, length
+        done = self._translated(
+            Batch(
+                prepared.pulses.waveforms[rows],
+                pulses.energy_kev[index],
+                noise,
+                generator or np.random.default_rng(),
+                None if tails_kev is None else tails_kev[index],
+                None if piled is None else piled.of_rows(index),
+                trace,
+            )
         )
+        waveforms = np.full((len(pulses), done.windows.shape[1]), np.nan, np.float32)
         waveforms[index], codes[index] = done.windows, done.codes
         t0_ns = pulses.t0_ns.copy()
         t0_ns[index] = prepared.pulses.t0_ns[rows] + done.begin * self.dt_ns - self.delay_ns
         return TranslatedPulses(replace(pulses, waveforms=waveforms, t0_ns=t0_ns), codes)
-
-    def _by_energy(self, drawn: Drawn) -> bool:
-        """Whether a translation depends on the energies."""
-        return self.backend.by_height is not None or (drawn.noise and self.needs_energies)
-
-    def _require_energies(self, drawn: Drawn) -> None:
-        if self._by_energy(drawn) and drawn.energy_kev is None:
-            raise CpunetError(NO_ENERGY if self.backend.by_height is None else NO_HEIGHT)
-
-    def require_sampling(self, what: str, dt_ns: float) -> None:
-        """Raise a `CpunetError` if pulses are not sampled like those of the training."""
-        if not np.isclose(dt_ns, self.dt_ns):
-            raise CpunetError(
-                f"{what} sampled every {dt_ns:g} ns, the run was trained on {self.dt_ns:g} ns; "
-                "resample the pulses"
-            )
 
     def apply(
         self,
@@ -330,50 +319,48 @@ class Translator:
         noise: bool = True,
         generator: np.random.Generator | None = None,
         tails_kev: Energies | None = None,
+        piled: InTracePileUp | None = None,
     ) -> FloatArray:
         """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        drawn = Drawn(energy_kev, noise, generator or np.random.default_rng(), tails_kev)
-        return self.apply_with_codes(windows, drawn).windows
+        generator = generator or np.random.default_rng()
+        batch = Batch(windows, energy_kev, noise, generator, tails_kev, piled)
+        return self._translated(batch).windows
 
-    def apply_with_codes(
-        self,
-        windows: FloatArray,
-        drawn: Drawn,
-        act: Act | None = None,
-        length: int | None = None,
-    ) -> Translated:
-        """Like `apply`, with a `Rejection` and the begin of each row.
-
-        Parameters
-        ----------
-        windows
-            Prepared windows, shape ``(n, window)``.
-        drawn
-            What is added to them.
-        act
-            What translates a batch; the backend by default.
-        length
-            Samples of its results; those of a window by default.
-
-        Raises
-        ------
-        CpunetError
-            If energies or what is known of other pulses are missing.
-        """
-        self._require_energies(drawn)
-        if drawn.others and not (drawn.noise and self.needs_energies):
+    def _translated(self, whole: Batch) -> Translated:
+        """Translate some windows at a time."""
+        self._by_energy(whole.energy_kev, whole.noise)
+        others = whole.tails_kev is not None or whole.piled is not None
+        if others and not (whole.noise and self.needs_energies):
             raise CpunetError(
                 "other pulses are drawn with electronic noise; leave out tails_kev and piled"
             )
-        if drawn.tails_kev is not None and self.tails is None:
+        if whole.tails_kev is not None and self.tails is None:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
-        result = np.empty((len(windows), length or windows.shape[1]), np.float32)
-        codes, begin = np.zeros(len(windows), np.uint8), np.zeros(len(windows), np.int64)
-        for first in range(0, len(windows), BATCH):
-            rows = np.arange(first, min(first + BATCH, len(windows)))
-            some = windows[rows], drawn.of_rows(rows)
-            result[rows], codes[rows], begin[rows] = (act or self.backend)(*some)[:3]
+        n, length = whole.windows.shape
+        length = length if whole.trace is None else whole.trace[1]
+        result = np.empty((n, length), np.float32)
+        codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
+        for first in range(0, n, BATCH):
+            rows = np.arange(first, min(first + BATCH, n))
+            done = self.backend.translate(whole.of_rows(rows))
+            result[rows], codes[rows], begin[rows] = done
         return Translated(result, codes, begin)
+
+    def _by_energy(self, energy_kev: npt.ArrayLike | None, noise: bool) -> bool:
+        """Whether a translation depends on the energies, which then must be given."""
+        by_height = self.backend.by_height is not None
+        depends = by_height or (noise and self.needs_energies)
+        if depends and energy_kev is None:
+            raise CpunetError(NO_HEIGHT if by_height else NO_ENERGY)
+        return depends
+
+    def require_sampling(self, what: str, dt_ns: float) -> None:
+        """Raise a `CpunetError` if pulses are not sampled like those of the training."""
+        if not np.isclose(dt_ns, self.dt_ns):
+            raise CpunetError(
+                f"{what} sampled every {dt_ns:g} ns, the run was trained on {self.dt_ns:g} ns; "
+                "resample the pulses"
+            )
 
 
 def noise_seed(seed: int, key: str | None, block: int) -> int:
@@ -395,17 +382,6 @@ def noise_seed(seed: int, key: str | None, block: int) -> int:
     digest = hashlib.sha256((key or "").encode(errors="surrogateescape")).digest()
     words = [seed, block, 0, int.from_bytes(digest[:16])]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
-
-
-def _one_each(name: str, energy_kev: npt.ArrayLike, n: int) -> Energies:
-    """Energies of `n` pulses, from `n` values or one common value."""
-    energies = np.asarray(energy_kev, float)
-    if energies.shape not in ((), (n,)):
-        raise CpunetError(
-            f"{name} has shape {energies.shape} beside {n} pulses; give one for each, or one "
-            "for all"
-        )
-    return np.broadcast_to(energies, (n,))
 
 
 class REN(Translator):

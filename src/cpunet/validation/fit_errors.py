@@ -37,12 +37,12 @@ def fit_ends(run: Run, ren: REN) -> Ends:
     def at(response: ElectronicsResponse) -> REN:
         moved = copy.copy(ren)
         moved.backend = of_end = copy.copy(backend)
-        chain = copy.copy(backend.chain)
+        chain = copy.copy(backend.network)
         chain.response = response
-        of_end.network = of_end.chain = chain
+        of_end.network = chain
         return moved
 
-    response = backend.chain.response
+    response = backend.network.response
     return [(at(a), at(b)) for a, b in error_ends(response, run.fit.covariance)]
 
 

@@ -34,7 +34,7 @@ from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.forms import drawn_kev, wanted_tails
+from cpunet.translation.forms import wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
 
@@ -366,7 +366,7 @@ def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> Float
         pulses.waveforms,
         energy_kev=pulses.energy_kev,
         generator=generator,
-        tails_kev=drawn_kev(tails, len(pulses), generator),
+        tails_kev=None if tails is None else tails.draw_kev(len(pulses), generator),
     )
 
 

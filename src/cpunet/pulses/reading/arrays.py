@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.energies import Column
+from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import RawTable, choose_table
+from cpunet.pulses.reading.source import PulseSource
 from cpunet.tables import shortened
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
@@ -56,17 +55,19 @@ def read_arrays(path: Path) -> Arrays:
         ) from error
 
 
-def read_memory(path: Path, pulses: Pulses) -> RawTable:
+def read_memory(options: PulseFile) -> PulseSource:
     """Pulses in memory."""
+    pulses = options.pulses
+    assert pulses is not None  # which are read in place of a file
     columns = {
         "energy_kev": Column.of(pulses.energy_kev),
         "event_number": Column.of(pulses.event_number),
         "dt_ns": Column.of(np.array(pulses.dt_ns)),
     }
-    return RawTable.of_array(path, "memory", "", pulses.waveforms, columns)
+    return PulseSource.of_array(options.path, "memory", "", pulses.waveforms, columns)
 
 
-def read_numpy(options: PulseFile) -> RawTable:
+def read_numpy(options: PulseFile) -> PulseSource:
     """Read a NumPy file.
 
     The waveforms of an ``.npz`` are ``waveform``, ``waveforms`` or ``values``, or the array
@@ -81,7 +82,7 @@ def read_numpy(options: PulseFile) -> RawTable:
             "give an array of two dimensions (event, sample)"
         )
     usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
-    name = choose_table(options, usual or matrices, "array", "arrays of two dimensions")
+    name = options.chosen_of(usual or matrices, "array", "arrays of two dimensions")
     if (kind := arrays[name].dtype).kind not in "iuf":
         raise CpunetError(
             f"{options.path}: array {name or 'in it'} is of {kind}; save plain numbers"
@@ -92,10 +93,10 @@ def read_numpy(options: PulseFile) -> RawTable:
         if (values.ndim <= 1 or (1 in values.shape and column != name))
         and values.dtype.kind in "iufb"
     }
-    return RawTable.of_array(options.path, "NumPy", name, arrays[name], columns)
+    return PulseSource.of_array(options.path, "NumPy", name, arrays[name], columns)
 
 
-def read_spectrum(options: PulseFile) -> RawTable:
+def read_spectrum(options: PulseFile) -> PulseSource:
     """Open a ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
     path, size = options.path, options.path.stat().st_size
     with path.open("rb") as file:
@@ -108,4 +109,4 @@ def read_spectrum(options: PulseFile) -> RawTable:
             f"{length * n_rows} samples; write it again"
         )
     values = np.memmap(path, "<f4", "r", _SPE.size, (n_rows, length))
-    return RawTable.of_array(path, "siggen spectrum", "", values, {})
+    return PulseSource.of_array(path, "siggen spectrum", "", values, {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.tables import shortened
 
 if TYPE_CHECKING:
     from cpunet.pulses.reading.source import PulseSource
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 ALL = "all"  # in place of the name of a table
 _ROWS = re.compile(r"(?:(.+)/)?(\w+=[^,/=]+(?:,\w+=[^,/=]+)*)")  # as raw/channel=3
-_TOLD = ("table", "energy", "kev_per_adc", "dt_ns")  # what a run keeps
+_OPTIONS = ("table", "energy", "kev_per_adc", "dt_ns")  # which a run stores
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,11 @@ class PulseFile:
         Skip the check whether pulses are simulated or measured.
     pulses
         Pulses in memory, which are read in place of a file.
+
+    Attributes
+    ----------
+    place, rows
+        The table alone, and values of the columns by which rows of it are chosen.
     """
 
     path: Path
@@ -106,9 +112,15 @@ class PulseFile:
     dt_ns: float | None = None
     insist: bool = False
     pulses: Pulses | None = None
+    place: str | None = field(init=False, compare=False)
+    rows: dict[str, str] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
+        match = _ROWS.fullmatch(self.table or "")
+        pairs = [] if match is None else [pair.split("=") for pair in match[2].split(",")]
         object.__setattr__(self, "path", Path(self.path))  # users may give text
+        object.__setattr__(self, "place", self.table if match is None else match[1])
+        object.__setattr__(self, "rows", dict(pairs))
         for name in ("kev_per_adc", "dt_ns"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0):
@@ -152,19 +164,6 @@ class PulseFile:
         return self[:].energy_kev
 
     @property
-    def place(self) -> str | None:
-        """The table alone, without what chooses rows of it."""
-        found = _ROWS.fullmatch(self.table or "")
-        return self.table if found is None else found[1]
-
-    @property
-    def rows(self) -> dict[str, str]:
-        """Values of the columns by which rows of the table are chosen."""
-        found = _ROWS.fullmatch(self.table or "")
-        pairs = [] if found is None else [one.split("=") for one in found[2].split(",")]
-        return dict(pairs)
-
-    @property
     def files(self) -> tuple[Path | str | None, ...]:
         """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
         return () if self.pulses is not None else (self.path, self.energy)
@@ -172,22 +171,55 @@ class PulseFile:
     @property
     def options(self) -> dict[str, str | float]:
         """The reading options given by the user."""
-        given = {name: getattr(self, name) for name in _TOLD}
+        given = {name: getattr(self, name) for name in _OPTIONS}
         return {name: value for name, value in given.items() if value is not None}
+
+    def chosen_of(
+        self,
+        tables: list[str],
+        one: str,
+        many: str,
+        remedy: str = "choose one with `table` (`sim_table`, `data_table`)",
+    ) -> str:
+        """The table that the user chose, or the only one.
+
+        Parameters
+        ----------
+        tables
+            Tables in the file, at least one.
+        one, many
+            What a table and several are called.
+        remedy
+            What to do if nothing was chosen.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such table, or there are several and none was chosen.
+        """
+        if self.place is None:
+            if len(tables) == 1:
+                return tables[0]
+            raise CpunetError(
+                f"{self.path}: {len(tables)} {many} ({shortened(tables)}); {remedy}"
+            )
+        if self.place not in tables:
+            raise CpunetError(
+                f"{self.path}: no {one} {self.place}; there are {shortened(tables)}"
+            )
+        return self.place
 
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
-        from cpunet.pulses.reading.arrays import read_memory
-        from cpunet.pulses.reading.source import PulseSource
-
-        if self.pulses is not None:
-            return PulseSource(self, read_memory(self.path, self.pulses))
-        module, _, name = FORMATS[recognise(self.path)][1].partition(".")
-        table = getattr(import_module(f"{__package__}.{module}"), name)(self)
+        reader = "arrays.read_memory"
+        if self.pulses is None:
+            reader = FORMATS[recognise(self.path)][1]
+        module, _, name = reader.partition(".")
+        source: PulseSource = getattr(import_module(f"{__package__}.{module}"), name)(self)
         try:
-            return PulseSource(self, table)
+            return source.resolved(self)
         except BaseException:
-            table.close()
+            source.close()
             raise
 
 
@@ -323,12 +355,12 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         If the file is missing or cannot be read.
     """
     path = Path(path)
-    found = recognise(path)
-    if found == "FlashCam":
+    format_ = recognise(path)
+    if format_ == "FlashCam":
         from cpunet.pulses.reading.flashcam import channel_sizes
 
         return channel_sizes(path)
-    if found != "HDF5":
+    if format_ != "HDF5":
         return {}
     from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import channel_tables
@@ -348,31 +380,6 @@ def recognise(path: Path) -> str:
         If there is no such file, or it is a folder, empty, of an unknown format, or of another
         format than its suffix says.
     """
-    head = _head(path)
-    # the FCIO library unpacks these two itself, by their suffix
-    if path.name.endswith((".fcio.gz", ".fcio.zst")):
-        return "FlashCam"
-    for name, (_, _, begins) in FORMATS.items():
-        if begins(head):
-            return name
-    foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
-    if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
-        foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
-    if foreign is not None:
-        raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
-    for name, (suffixes, _, _) in FORMATS.items():
-        if path.suffix.lower() in suffixes.split():
-            raise CpunetError(
-                f"{path}: not a {name} file, despite its name; "
-                "give a file of pulses or correct its suffix"
-            )
-    raise CpunetError(
-        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
-        "pickled pulses, or siggen's .spe"
-    )
-
-
-def _head(path: Path) -> bytes:
     try:
         if path.is_dir():
             raise CpunetError(f"{path}: is a folder; give a file of pulses")
@@ -384,4 +391,26 @@ def _head(path: Path) -> bytes:
         raise CpunetError(f"{path}: cannot be read ({error.strerror}); check it") from error
     if not head:
         raise CpunetError(f"{path}: is empty; copy or write it again")
-    return head
+    # the FCIO library unpacks these two itself, by their suffix
+    if path.name.endswith((".fcio.gz", ".fcio.zst")):
+        return "FlashCam"
+    formats = (name for name, (_, _, begins) in FORMATS.items() if begins(head))
+    if name := next(formats, None):
+        return name
+    foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
+    if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
+        foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
+    if foreign is not None:
+        raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
+    named = (
+        n for n, (suffixes, _, _) in FORMATS.items() if path.suffix.lower() in suffixes.split()
+    )
+    if name := next(named, None):
+        raise CpunetError(
+            f"{path}: not a {name} file, despite its name; "
+            "give a file of pulses or correct its suffix"
+        )
+    raise CpunetError(
+        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
+        "pickled pulses, or siggen's .spe"
+    )

@@ -5,22 +5,20 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from fcio import FCIO, Tags, fcio_open
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.energies import Column
+from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import RawTable, choose_table
+from cpunet.pulses.reading.source import PulseSource
 
 
-def read_flashcam(options: PulseFile) -> RawTable:
+def read_flashcam(options: PulseFile) -> PulseSource:
     """The traces of one channel; `table` is its index if there are several.
 
     Full and sparse events are both read; events without the channel are skipped.
@@ -28,13 +26,14 @@ def read_flashcam(options: PulseFile) -> RawTable:
     """
     stream = _open(options.path)
     channels = [str(channel) for channel in range(_n_channels(options.path, stream))]
-    name = choose_table(options, channels, "channel", "channels")
+    name = options.chosen_of(channels, "channel", "channels")
     period_ns = np.asarray(float(stream.config.sampling_period_ns))
     events = _Events(options.path, int(name), int(stream.config.eventsamples), stream)
-    return RawTable(
+    return PulseSource(
+        path=options.path,
         format="FlashCam",
         name=name,
-        n=None,
+        n_pulses=None,
         length=events.length,
         rows=events.rows,
         numbers=events.numbers,
@@ -73,7 +72,19 @@ class _Events:
             any_record = True
             if last is not None:
                 yield last
-            last = self._event(stream)
+            last, event = None, stream.event
+            if stream.tag not in (Tags.Event, Tags.SparseEvent):
+                continue
+            rows = np.flatnonzero(event.trace_list == self.channel)
+            if not rows.size:
+                continue
+            number, trace = int(event.eventnumber), event.trace[rows[0]].copy()
+            if len(trace) != self.length:
+                raise CpunetError(
+                    f"{self.path}: event {number}: {len(trace)} samples, before it "
+                    f"{self.length}; split the file by length"
+                )
+            last = trace, number
         # The library also reports an error if nothing follows the configuration, and from
         # 0.9 on none where a file is cut off.
         size = 0 if self.path.suffix in (".gz", ".zst") else self.path.stat().st_size
@@ -82,22 +93,6 @@ class _Events:
             raise CpunetError(f"{self.path}: {after}the file is cut off; copy it again")
         if last is not None:
             yield last
-
-    def _event(self, stream: FCIO) -> tuple[npt.NDArray[np.uint16], int] | None:
-        if stream.tag not in (Tags.Event, Tags.SparseEvent):
-            return None
-        event: Any = stream.event
-        rows = np.flatnonzero(event.trace_list == self.channel)
-        if rows.size == 0:
-            return None
-        number = int(event.eventnumber)
-        trace = event.trace[rows[0]].copy()
-        if len(trace) != self.length:
-            raise CpunetError(
-                f"{self.path}: event {number}: {len(trace)} samples, before it {self.length}; "
-                "split the file by length"
-            )
-        return trace, number
 
 
 def channel_sizes(path: Path) -> dict[str, int | None]:
@@ -133,22 +128,14 @@ def _next(path: Path, stream: FCIO) -> bool:
 
 
 def _open(path: Path) -> FCIO:
-    try:
-        with _quiet():
-            return fcio_open(str(path))
-    except Exception as error:  # the library raises various errors on damaged records
-        raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Hide the output of the C library: a harmless warning about older files."""
-    kept = os.dup(2)
-    sink = os.open(os.devnull, os.O_WRONLY)
+    # the C library writes a harmless warning about older files
+    stderr, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(sink, 2)
-        yield
+        return fcio_open(str(path))
+    except Exception as error:  # the library raises various errors on damaged records
+        raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
     finally:
-        os.dup2(kept, 2)
+        os.dup2(stderr, 2)
         os.close(sink)
-        os.close(kept)
+        os.close(stderr)

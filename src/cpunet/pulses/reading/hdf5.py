@@ -28,11 +28,10 @@ from cpunet.hdf5_files import (
     texts_of,
     units_of,
 )
-from cpunet.pulses.reading.division import divides, dividing, labels
-from cpunet.pulses.reading.energies import Column
+from cpunet.pulses.reading.columns import Column, divides, dividing, labels
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.published import is_majorana, read_majorana
-from cpunet.pulses.reading.source import RawTable
+from cpunet.pulses.reading.source import PulseSource
 from cpunet.tables import shortened
 
 # preference among several waveform columns of a table: full record, then full-rate window
@@ -42,40 +41,44 @@ log = logging.getLogger(__name__)
 _PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
 
 
-def read_hdf5(options: PulseFile) -> RawTable:
+def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
     path = options.path
     with one_line(path), ExitStack() as unless_read:
         file = unless_read.enter_context(open_hdf5(path))
-        table = _read(options, file)
+        source = read_majorana(options, file) if is_majorana(file) else _read(options, file)
         unless_read.pop_all()
-        return replace(table, close=file.close)
+        return replace(source, close=file.close)
 
 
-def _read(options: PulseFile, file: h5py.File) -> RawTable:
-    path = options.path
-    if is_majorana(file):
-        return read_majorana(options, file)
-    name = choose_waveforms(path, file, options.place)
+def _read(options: PulseFile, file: h5py.File) -> PulseSource:
+    path, name = options.path, choose_waveforms(options.path, file, options.place)
     table, _, own_name = name.rpartition("/")
     group, values = file[table or "/"], file[name]
     columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
     if isinstance(values, h5py.Dataset):
         columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-        found = RawTable.of_array(path, "HDF5", name, values, columns, attrs)
-        return replace(found, rows=reading(path, values, found.rows), group=group)
+        plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
+        return replace(plain, rows=reading(path, values, plain.rows), group=group)
     own, values = columns_of(path, values), values["values"]
-    n = _n_rows(values)
+    # a group holds the traces encoded, or as vectors of their own lengths
+    is_group, sized = isinstance(values, h5py.Group), values
+    if is_group:
+        sized = values.get("encoded_data", values).get("cumulative_length")
+    n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
     first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-    shortest, longest = _lengths(values) or first.shape[1:] * 2
+    shortest, longest = first.shape[1:] * 2
+    if n and is_group and "cumulative_length" in values:
+        lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
+        shortest, longest = int(lengths.min()), int(lengths.max())
     if shortest < longest and first.dtype.kind == "f":
         log.info(
             f"{path.name}: pulses of {shortest} to {longest} samples are continued with their "
             "last value"
         )
     rows = reading(path, values, partial(_lh5_traces, values, longest))
-    return RawTable(
-        "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
+    return PulseSource(
+        path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
         t0=own.get("t0"), group=group,
     )  # fmt: skip
 
@@ -111,21 +114,6 @@ def _lh5_traces(
     return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
 
 
-def _lengths(values: h5py.Group | h5py.Dataset) -> tuple[int, int] | None:
-    """Samples of the shortest and the longest pulse, where each is as long as its drift."""
-    if not isinstance(values, h5py.Group) or "cumulative_length" not in values:
-        return None
-    lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-    return (int(lengths.min()), int(lengths.max())) if len(lengths) else None
-
-
-def _n_rows(values: h5py.Group | h5py.Dataset) -> int:
-    """Number of traces; a group holds them encoded, or as vectors of their own lengths."""
-    if isinstance(values, h5py.Group):
-        values = values.get("encoded_data", values).get("cumulative_length")
-    return int(values.shape[0]) if values is not None and values.ndim else 0
-
-
 def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     """Path of the waveforms at `table`: a table, a waveform column, or a group around one.
 
@@ -137,33 +125,31 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     place = (table or "").strip("/")
     item = item_at(file, place)
     if item is None:
-        there = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
-        raise CpunetError(f"{path}: no table {place}; there are {shortened(there)}")
+        tables = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
+        raise CpunetError(f"{path}: no table {place}; there are {shortened(tables)}")
     if _is_lh5(item) or _is_array(item):
         return place
     folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
     for broken in (link for folder in folders for link in folder.broken):
         item_at(file, broken)  # which says what is wrong
-    found = [one for folder in folders for one in folder.waveforms]
-    if len(found) == 1:
-        return found[0]
-    if not found:
+    columns = [column for folder in folders for column in folder.waveforms]
+    if len(columns) == 1:
+        return columns[0]
+    if not columns:
         raise _no_waveforms(path, file, place)
-    tables = sorted({one.rpartition("/")[0] for one in found})
-    if len(tables) > 1:
+    tables = sorted({column.rpartition("/")[0] for column in columns})
+    names = {column.rpartition("/")[2]: column for column in columns}
+    best = next((name for name in _PREFERRED if name in names), None)
+    if len(tables) > 1 or best is None:
+        several = f"{len(columns)} waveform columns ({shortened(columns)})"
+        if len(tables) > 1:
+            several = f"{len(tables)} tables of waveforms ({shortened(tables)})"
         raise CpunetError(
-            f"{path}: {len(tables)} tables of waveforms ({shortened(tables)}); "
-            "choose one with `table` (`sim_table`, `data_table`)"
+            f"{path}: {several}; choose one with `table` (`sim_table`, `data_table`)"
         )
-    names = {one.rpartition("/")[2]: one for one in found}
-    if best := next((name for name in _PREFERRED if name in names), None):
-        others = ", ".join(sorted(names.keys() - {best}))
-        log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
-        return names[best]
-    raise CpunetError(
-        f"{path}: {len(found)} waveform columns ({shortened(found)}); "
-        "choose one with `table` (`sim_table`, `data_table`)"
-    )
+    others = ", ".join(sorted(names.keys() - {best}))
+    log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
+    return names[best]
 
 
 def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
@@ -195,10 +181,6 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
         f"({shortened(arrays)})",
         "if it holds traces, name it by `table` (`sim_table`, `data_table`); give `dt_ns`",
     )
-
-
-def _is_row(item: object) -> bool:
-    return _is_array(item) and 1 in item.shape
 
 
 def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
@@ -233,7 +215,7 @@ def waveform_tables(file: h5py.File) -> list[str]:
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
     """The same, with the rows of each channel where one table holds several."""
-    found: list[str] = []
+    channels: list[str] = []
     for table in waveform_tables(file):
         try:
             group = item_at(file, table) or file
@@ -241,15 +223,11 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
         except CpunetError:  # said where the table is opened
             columns = {}
         rows = max(map(len, columns.values()), default=0)
-        of = {
-            name: column.read(0, rows)
-            for name, column in columns.items()
-            if divides(name) and len(column) == rows
-        }
+        of = {n: c.read(0, rows) for n, c in columns.items() if divides(n) and len(c) == rows}
         names = dividing(of, rows)
         parts = np.unique(labels(of, names)) if names else [""]
-        found += [f"{table}/{part}".strip("/") for part in parts]
-    return found
+        channels += [f"{table}/{part}".strip("/") for part in parts]
+    return channels
 
 
 @dataclass(frozen=True)
@@ -275,21 +253,21 @@ def _folders(
     if (info.fileno, info.addr) in seen:
         return
     seen.add((info.fileno, info.addr))
-    found, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
+    items, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
     for name in group:
         try:
-            found[name] = item_at(group, name)
+            items[name] = item_at(group, name)
         except CpunetError:
             broken.append(name)
     is_table = text_attribute(group, "datatype").startswith("table")
-    names = [name for name, item in found.items() if _is_lh5(item)]
-    names = names or [name for name in _PLAIN if _is_array(found.get(name))][:1]
-    if is_table and {"dt", "values"} <= found.keys():
+    names = [name for name, item in items.items() if _is_lh5(item)]
+    names = names or [name for name in _PLAIN if _is_array(items.get(name))][:1]
+    if is_table and {"dt", "values"} <= items.keys():
         names = []  # the inside of waveforms
     of = f"{path}/".lstrip("/")
     lost = [] if names or is_table else [of + name for name in broken]
-    yield _Folder(path, found, is_table, [of + name for name in names], lost)
-    for name, item in found.items():
+    yield _Folder(path, items, is_table, [of + name for name in names], lost)
+    for name, item in items.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
             yield from _folders(item, of + name, seen)
@@ -302,14 +280,11 @@ def _is_lh5(item: object) -> bool:
 
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
-    """Columns of a group: its numeric datasets of one dimension, and its scalars.
-
-    Text counts where it separates channels; MATLAB has no vectors, but writes a row.
-    """
+    """Columns of a group: its numbers, and texts where they separate channels."""
     return {
         name: _stored(path, item)
         for name, item in members(group).items()
-        if is_column(item) or _is_row(item) or (divides(name) and is_text(item))
+        if _is_numeric(item) or (divides(name) and is_text(item))
     }
 
 
@@ -323,12 +298,17 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
     """
     file, place = open_hdf5(path), name.strip("/").rpartition("/")[0]
     with one_line(path):
-        parent, found = item_at(file, place), item_at(file, name)
+        parent, item = item_at(file, place), item_at(file, name)
         others = columns_of(path, parent) if isinstance(parent, h5py.Group) else {}
-        if is_column(found) or _is_row(found):
-            return _stored(path, found), others
-        there = list(others or file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(there)}")
+        if _is_numeric(item):
+            return _stored(path, item), others
+        names = list(others or file)
+    raise CpunetError(f"{path}: no column {name}; there are {shortened(names)}")
+
+
+def _is_numeric(item: object) -> bool:
+    """Whether an item is a column of numbers; MATLAB has no vectors, but writes a row."""
+    return is_column(item) or (_is_array(item) and 1 in item.shape)
 
 
 def _stored(path: Path, dataset: h5py.Dataset) -> Column:

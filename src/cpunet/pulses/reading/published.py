@@ -30,9 +30,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import is_column, reading
-from cpunet.pulses.reading.energies import Column
+from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import RawTable, choose_table
+from cpunet.pulses.reading.source import PulseSource
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
 _NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
@@ -52,12 +52,12 @@ def detectors(file: h5py.File) -> list[str]:
     return [str(number) for number in np.unique(file[DETECTOR][()])]
 
 
-def read_majorana(options: PulseFile, file: h5py.File) -> RawTable:
+def read_majorana(options: PulseFile, file: h5py.File) -> PulseSource:
     """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
     rows = np.arange(len(file[WAVEFORMS]))
     if options.table != WAVEFORMS:
         remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
-        chosen = choose_table(options, detectors(file), "detector", "detectors", remedy)
+        chosen = options.chosen_of(detectors(file), "detector", "detectors", remedy)
         rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
     columns = {}
     for name in file:
@@ -67,7 +67,9 @@ def read_majorana(options: PulseFile, file: h5py.File) -> RawTable:
             columns[shown] = Column.of(item[()], units)
     path, name, values = options.path, options.place or WAVEFORMS, file[WAVEFORMS]
     hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
-    table = RawTable.of_array(path, "Majorana release", name, values, columns, period_hint=hint)
+    table = PulseSource.of_array(
+        path, "Majorana release", name, values, columns, period_hint=hint
+    )
     return replace(table, rows=reading(path, values, table.rows)).at(rows)
 
 
@@ -94,7 +96,7 @@ class _Unpickler(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def read_pickles(options: PulseFile) -> RawTable:
+def read_pickles(options: PulseFile) -> PulseSource:
     """Read pickled dictionaries, one after the other or in lists; all are held in memory.
 
     Raises
@@ -132,7 +134,9 @@ def read_pickles(options: PulseFile) -> RawTable:
         columns[name] = Column.of(values, "keV" if name == "energy" else "")
     hint = "CPU-Net's pulses are sampled every 16 ns"
     waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
-    return RawTable.of_array(path, "pickled pulses", "", waveforms, columns, period_hint=hint)
+    return PulseSource.of_array(
+        path, "pickled pulses", "", waveforms, columns, period_hint=hint
+    )
 
 
 def _entries(path: Path) -> Iterator[Any]:

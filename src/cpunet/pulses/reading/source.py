@@ -1,7 +1,9 @@
-"""Files of pulses of any format, open: their traces and columns, and pulses in blocks."""
+"""A file of pulses of any format, open: its traces and columns, and pulses in blocks."""
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,42 +16,71 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.division import divides, dividing, labels, texts
-from cpunet.pulses.reading.energies import (
-    EVENT_KEYS,
-    TOLERANCE,
+from cpunet.pulses.reading.columns import (
     Column,
-    require_length,
-    resolve_energies,
-    resolve_sampling,
+    divides,
+    dividing,
+    labels,
     some_of,
+    texts,
+    whole_numbers,
 )
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.tables import shortened
-from cpunet.units import factor
+from cpunet.units import factor, unit_names
 
-if TYPE_CHECKING:  # of a library that other formats do not need
+if TYPE_CHECKING:  # of libraries that other formats do not need
     import h5py
 
     from cpunet.hdf5_files import Read
+    from cpunet.pulses.reading.files import PulseFile
+
+log = logging.getLogger(__name__)
 
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 ANY = "*"  # value of a column that separates no channels
-_MAX_NUMBER = 2.0**62
-_EVENT_NUMBERS = EVENT_KEYS[:-1]
+
+# Columns by which the rows of two files are joined; the last is no number of an event.
+EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
+_USUAL = ("energy_kev", "energy_keV", "energy")
+# LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units.
+_NAMED_IN_KEV = re.compile(r"(_cal|kev)$", re.IGNORECASE)
+
+# The first samples of a trace, before any pulse, for the amplitude's baseline.
+_BASELINE_FRACTION, _BASELINE_SAMPLES = 0.05, 10
+TOLERANCE = 1e-5  # relative, of periods, which files store in single precision
 
 
-@dataclass(frozen=True, eq=False)
-class RawTable:
-    """Traces of one channel, open for reading, as the reader of a format gives them.
+def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Maximum above the mean of the first twentieth (at least 10 samples), per trace.
+
+    Examples
+    --------
+    >>> amplitude(np.repeat(np.array([[3, 8]], np.float32), 50, axis=1))
+    array([5.])
+    """
+    n_baseline = max(_BASELINE_SAMPLES, round(_BASELINE_FRACTION * waveforms.shape[1]))
+    # A trace of infinities has no amplitude; the preparation rejects and counts it.
+    with np.errstate(invalid="ignore"):
+        baseline = waveforms[:, :n_baseline].mean(axis=1, dtype=np.float64)
+        return np.asarray(waveforms.max(axis=1) - baseline)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PulseSource:
+    """Pulses of an open file: iterate over its `blocks`, or `read` it as a whole.
+
+    The reader of a format gives the content, and `resolved` the sampling period and the
+    energies.  The file is closed at the end of a ``with``, or with the last reference to this.
+    The memory in use does not grow with the file, except for ``.npz`` and pickles, which are
+    read as a whole.
 
     Parameters
     ----------
-    format
-        Name of the format.
+    path, format
+        The file, and the name of its format.
     name
         Location of the traces in the file.
-    n
+    n_pulses
         Number of traces; None if it is unknown without reading the whole file.
     length
         Samples per trace.
@@ -74,11 +105,19 @@ class RawTable:
         Group of an HDF5 file with columns of any kind; closes the file.
     chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
+    dt_ns, periods
+        Sampling period in ns; reads that of each trace, if the file has it for each.
+    energies
+        The rule that gives each pulse its energy, in words.
+    kev_per_unit, energy_column
+        Factor to keV from values of the column, or from the amplitude if that is None; without
+        a factor energies are unknown.
     """
 
+    path: Path
     format: str
     name: str
-    n: int | None
+    n_pulses: int | None
     length: int
     rows: Read
     columns: Mapping[str, Column] = field(default_factory=dict)
@@ -92,6 +131,11 @@ class RawTable:
     close: Callable[[], None] = lambda: None
     chosen: npt.NDArray[np.int64] | None = None
     n_all: int | None = None
+    dt_ns: float = np.nan
+    periods: Read | None = None
+    energies: str = ""
+    kev_per_unit: float | None = None
+    energy_column: Column | None = None
 
     @classmethod
     def of_array(
@@ -103,7 +147,7 @@ class RawTable:
         columns: Mapping[str, Column],
         attrs: Mapping[str, str] = MappingProxyType({}),
         period_hint: str = "",
-    ) -> RawTable:
+    ) -> PulseSource:
         """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
 
         Raises
@@ -122,137 +166,81 @@ class RawTable:
             )
         period_name = "dt_ns" if "dt_ns" in columns else "dt"
         return cls(
-            format, name, n, length, lambda start, stop: values[start:stop], columns, attrs,
-            period_name, columns.get(period_name), period_hint,
+            path, format, name, n, length, lambda start, stop: values[start:stop], columns,
+            attrs, period_name, columns.get(period_name), period_hint,
         )  # fmt: skip
 
-    def of_channel(self, path: Path, chosen: Mapping[str, str]) -> RawTable:
-        """Rows with the chosen values of some columns, or all if they are of one channel.
+    def at(self, rows: npt.NDArray[np.int64]) -> PulseSource:
+        """Some rows, which ascend."""
+        period, t0 = (c and c.at(rows) for c in (self.period, self.t0))
+        return replace(
+            self, n_pulses=len(rows), rows=partial(some_of, self.rows, rows), period=period,
+            t0=t0, columns={n: c.at(rows) for n, c in self.columns.items()},
+            chosen=rows, n_all=self.n_pulses,
+        )  # fmt: skip
+
+    def resolved(self, file: PulseFile) -> PulseSource:
+        """With the rows, the sampling period and the energies that the user chose.
 
         Raises
         ------
         CpunetError
-            If there are none, or they are of several channels.
+            If it holds no pulses, or those of several channels, or the options do not fit.
         """
-        if self.n is None or self.chosen is not None:
+        if self.n_pulses == 0 or self.length == 0:
+            raise CpunetError(
+                f"{self.path}: {self.name or self.format} holds no pulses; "
+                "give a file with events"
+            )
+        of_channel = self._of_channel(file.rows)
+        dt_ns, periods = _sampling(of_channel, file.dt_ns)
+        energies, kev_per_unit, column = _energies(of_channel, file.energy, file.kev_per_adc)
+        for name in EVENT_KEYS[:-1]:
+            if name in of_channel.columns:
+                of_channel.columns[name].require_length(self.path, name, of_channel.n_pulses)
+                break
+        return replace(
+            of_channel, dt_ns=dt_ns, periods=periods, energies=energies,
+            kev_per_unit=kev_per_unit, energy_column=column,
+        )  # fmt: skip
+
+    def _of_channel(self, chosen: Mapping[str, str]) -> PulseSource:
+        """Rows with the chosen values of some columns, or all if they are of one channel."""
+        if self.n_pulses is None or self.chosen is not None:
             return self
-        whole = {n: c for n, c in self.columns.items() if len(c) == self.n}
-        rows = np.arange(self.n)
+        whole = {n: c for n, c in self.columns.items() if len(c) == self.n_pulses}
+        rows = np.arange(self.n_pulses)
         for name, value in chosen.items():
             if value == ANY:
                 continue
             if name not in whole:
-                raise CpunetError(f"{path}: no column {name}; there are {shortened(whole)}")
-            there = texts(whole[name].read(0, self.n))
-            rows = rows[there[rows] == value]
+                raise CpunetError(
+                    f"{self.path}: no column {name}; there are {shortened(whole)}"
+                )
+            values = texts(whole[name].read(0, self.n_pulses))
+            rows = rows[values[rows] == value]
             if not len(rows):
                 raise CpunetError(
-                    f"{path}: no {name} {value}; it holds {shortened(np.unique(there))}"
+                    f"{self.path}: no {name} {value}; it holds {shortened(np.unique(values))}"
                 )
-        of = {n: c.read(0, self.n)[rows] for n, c in whole.items() if divides(n)}
+        of = {n: c.read(0, self.n_pulses)[rows] for n, c in whole.items() if divides(n)}
         of = {name: values for name, values in of.items() if name not in chosen}
         if names := dividing(of, len(rows)):
-            held = list(np.unique(labels(of, names)))
+            channels = list(np.unique(labels(of, names)))
             also = ", or all for each" if self.format in ("LH5", "HDF5") else ""
             raise CpunetError(
-                f"{path}: one table of {len(held)} channels or detectors ({shortened(held)})",
-                f"choose one with `table` {held[0]} (`sim_table`, `data_table`){also}; "
+                f"{self.path}: one table of {len(channels)} channels or detectors "
+                f"({shortened(channels)})",
+                f"choose one with `table` {channels[0]} (`sim_table`, `data_table`){also}; "
                 f"{','.join(f'{name}={ANY}' for name in names)} takes them as one",
             )
-        return self if len(rows) == self.n else self.at(rows)
-
-    def at(self, rows: npt.NDArray[np.int64]) -> RawTable:
-        """Some rows, which ascend."""
-        period, t0 = (c and c.at(rows) for c in (self.period, self.t0))
-        return replace(
-            self, n=len(rows), rows=partial(some_of, self.rows, rows), period=period, t0=t0,
-            columns={n: c.at(rows) for n, c in self.columns.items()},
-            chosen=rows, n_all=self.n,
-        )  # fmt: skip
-
-
-def choose_table(
-    options: PulseFile,
-    known: list[str],
-    one: str,
-    many: str,
-    remedy: str = "choose one with `table` (`sim_table`, `data_table`)",
-) -> str:
-    """The table that the user chose, or the only one.
-
-    Parameters
-    ----------
-    options
-        The file and what was chosen.
-    known
-        Tables in the file, at least one.
-    one, many
-        What a table and several are called.
-    remedy
-        What to do if nothing was chosen.
-
-    Raises
-    ------
-    CpunetError
-        If there is no such table, or there are several and none was chosen.
-    """
-    if options.place is None:
-        if len(known) == 1:
-            return known[0]
-        raise CpunetError(f"{options.path}: {len(known)} {many} ({shortened(known)}); {remedy}")
-    if options.place not in known:
-        raise CpunetError(
-            f"{options.path}: no {one} {options.place}; there are {shortened(known)}"
-        )
-    return options.place
-
-
-class PulseSource:
-    """Pulses of an open file: iterate over its `blocks`, or `read` it as a whole.
-
-    The file is closed at the end of a ``with``, or with the last reference to this.  The memory
-    in use does not grow with the file, except for ``.npz`` and pickles, which are read as a
-    whole.
-
-    Attributes
-    ----------
-    path : pathlib.Path
-        The file.
-    dt_ns : float
-        Sampling period in ns.
-    n_pulses : int or None
-        Number of pulses; None if it is unknown without reading the whole file.
-    length : int
-        Samples per pulse.
-    table : RawTable
-        Content of the file.
-    energies : Energies
-        Rule that gives each pulse its energy.
-    """
-
-    def __init__(self, options: PulseFile, table: RawTable) -> None:
-        if table.n == 0 or table.length == 0:
-            raise CpunetError(
-                f"{options.path}: {table.name or table.format} holds no pulses; "
-                "give a file with events"
-            )
-        table = table.of_channel(options.path, options.rows)
-        self.path = options.path
-        self.n_pulses = table.n
-        self.length = table.length
-        self.table = table
-        self.dt_ns, self._periods = resolve_sampling(options, table)
-        self.energies = resolve_energies(options, table)
-        self._number_column = next((n for n in _EVENT_NUMBERS if n in table.columns), None)
-        if self._number_column is not None:
-            column = table.columns[self._number_column]
-            require_length(options.path, self._number_column, column, table.n)
+        return self if len(rows) == self.n_pulses else self.at(rows)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.table.close()
+        self.close()
 
     def blocks(self, size: int = 4096) -> Iterator[Pulses]:
         """Yield the pulses of the file in order, at most `size` at a time.
@@ -267,14 +255,14 @@ class PulseSource:
         """
         size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
         while start != self.n_pulses:
-            waveforms = self.table.rows(start, start + size)
-            if not len(waveforms):
+            traces = self.rows(start, start + size)
+            if not len(traces):
                 break
-            yield self._pulses(start, waveforms)
-            start += len(waveforms)
+            yield self._pulses(start, traces)
+            start += len(traces)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
-        column = self.energies.column
+        column = self.energy_column
         if column is not None and not column.constant and len(column) != start:
             raise CpunetError(
                 f"{self.path}: {start} waveforms, but {len(column)} energies; "
@@ -285,31 +273,33 @@ class PulseSource:
         """Read all pulses of the file, or some rows, at once; they must fit in memory."""
         if stop is None:
             return Pulses.concatenate(list(self.blocks()))
-        return self._pulses(start, self.table.rows(start, stop))
-
-    @property
-    def columns(self) -> Mapping[str, Column]:
-        """Columns with one value per event, by name."""
-        return self.table.columns
+        return self._pulses(start, self.rows(start, stop))
 
     def _pulses(self, start: int, traces: npt.NDArray[Any]) -> Pulses:
+        """Traces with their energies, numbers and times."""
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces, np.float32)
-        stop = start + len(waveforms)
+        n, stop = len(waveforms), start + len(waveforms)
         numbers = np.arange(start, stop)
-        if self._number_column is not None:
-            numbers = self.columns[self._number_column].read(start, stop)
-        elif self.table.numbers is not None:
-            numbers = self.table.numbers(start, stop)
-        energy_kev = self.energies.of(start, waveforms)
-        if len(energy_kev) != len(waveforms):
+        number_column = next((x for x in EVENT_KEYS[:-1] if x in self.columns), None)
+        if number_column is not None:
+            numbers = self.columns[number_column].read(start, stop)
+        elif self.numbers is not None:
+            numbers = self.numbers(start, stop)
+        energy_kev = np.full(n, np.nan)
+        if self.kev_per_unit is not None and self.energy_column is None:
+            energy_kev = self.kev_per_unit * amplitude(waveforms)
+        elif self.kev_per_unit is not None and self.energy_column is not None:
+            values = self.energy_column.read(start, stop)
+            energy_kev = self.kev_per_unit * np.asarray(values, np.float64)
+        if len(energy_kev) != n:
             raise CpunetError(
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
-        if self._periods is not None:
-            periods = self._periods(start, stop)
+        if self.periods is not None:
+            periods = self.periods(start, stop)
             other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
             if other.any():
                 first = int(other.argmax())
@@ -318,46 +308,134 @@ class PulseSource:
                     f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
                     "split the file by sampling period"
                 )
-        t0, t0_ns = self.table.t0, np.zeros(len(waveforms))
-        if t0 is not None and (ns_per_unit := factor(t0.units, "ns")) is not None:
-            t0_ns = ns_per_unit * np.asarray(t0.read(start, stop), np.float64)
+        t0_ns = np.zeros(n)
+        if self.t0 is not None and (ns_per_unit := factor(self.t0.units, "ns")) is not None:
+            t0_ns = ns_per_unit * np.asarray(self.t0.read(start, stop), np.float64)
         return Pulses.of(
-            waveforms,
-            dt_ns=self.dt_ns,
-            energy_kev=energy_kev,
-            event_number=event_number,
+            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number,
             t0_ns=t0_ns,
-        )
+        )  # fmt: skip
 
 
-def whole_numbers(
-    values: npt.NDArray[Any], where: str, start: int = 0
-) -> npt.NDArray[np.int64]:
-    """Numbers of events as integers; some files store them as floating-point numbers.
+def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Read | None]:
+    """The period in ns from the column of the file or from the user, and that of each trace.
 
-    Parameters
-    ----------
-    values
-        A number for each row.
-    where
-        File and column, for the message.
-    start
-        Row of the first number.
-
-    Raises
-    ------
-    CpunetError
-        If one is no whole number or too large.
+    A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
+    and ``dt_ns`` is required; the error message contains the hint of the format.  A file that
+    says another period than the user is corrected, with a warning.
     """
-    if values.dtype.kind != "i":
-        numbers = (
-            values.astype(float) if values.dtype.kind in "uf" else np.full(len(values), np.nan)
-        )
-        bad = ~((numbers == np.rint(numbers)) & (np.abs(numbers) < _MAX_NUMBER))
-        if bad.any():
-            row = int(bad.argmax())
+    path, name, column, hint = (
+        source.path, source.period_name, source.period, source.period_hint,
+    )  # fmt: skip
+    units = "" if column is None else column.units or ("ns" if name.endswith("_ns") else "")
+    ns_per_unit = factor(units, "ns") if units else None
+    if column is None or ns_per_unit is None:
+        if dt_ns is not None:
+            return dt_ns, None
+        if units:
             raise CpunetError(
-                f"{where}: row {start + row}: {values[row]} is no number of an event; number "
-                "the events anew"
+                f"{path}: the sampling period ({name}) is in {units!r}; expected one of "
+                f"{unit_names('ns')}"
             )
-    return values.astype(np.int64)
+        why = "is not in the file" if column is None else f"({name}) has no units"
+        raise CpunetError(
+            f"{path}: the sampling period {why}; give `dt_ns`{hint and f' ({hint})'}"
+        )
+    if len(column) != 1:
+        column.require_length(path, name, source.n_pulses)
+    period = float(column.read(0, 1)[0]) * ns_per_unit
+    is_period = np.isfinite(period) and period > 0
+    if dt_ns is None and not is_period:
+        raise CpunetError(
+            f"{path}: event 0: the sampling period ({name}) is {period:g} ns", "give `dt_ns`"
+        )
+    if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
+        log.warning(
+            f"{path.name}: says that it is sampled every {period:g} ns; taken as {dt_ns:g} ns, "
+            "as given (`dt_ns`)"
+        )
+        if not is_period:
+            return dt_ns, None
+        ns_per_unit *= dt_ns / period
+        period = dt_ns
+    if len(column) == 1:  # a scalar or an array of length 1 applies to all events
+        return period, None
+    return period, lambda start, stop: ns_per_unit * np.asarray(column.read(start, stop), float)
+
+
+def _energies(
+    source: PulseSource, energy: str | None, kev_per_adc: float | None
+) -> tuple[str, float | None, Column | None]:
+    """The rule of the energies in words, the factor to keV, and the column that it multiplies.
+
+    Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
+    is in energy units or ``kev_per_adc`` is given.  Otherwise the energy is the amplitude
+    times ``kev_per_adc``, or unknown without it.  ``energy`` names another column, or
+    ``FILE:path/to/column``.  Energies in units that are wrong or a little off are multiplied by
+    ``kev_per_adc`` as well, with a warning.
+    """
+    path = source.path
+    name = energy or next((name for name in _USUAL if name in source.columns), "")
+    if name:
+        column = source.columns[name] if name in source.columns else _elsewhere(source, name)
+        units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
+        kev_per_unit, rule = factor(units, "keV"), f"column {name} [{units}]"
+        if kev_per_unit is None and kev_per_adc is not None:
+            kev_per_unit, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
+        elif kev_per_unit is not None and kev_per_adc is not None:
+            log.warning(
+                f"{path.name}: column {name} is in {units}; its energies are multiplied by "
+                f"{kev_per_adc:g}, as given (`kev_per_adc`)"
+            )
+            kev_per_unit, rule = kev_per_unit * kev_per_adc, f"{rule} x {kev_per_adc:g}"
+        if kev_per_unit is not None:
+            column.require_length(path, name, source.n_pulses)
+            return rule, kev_per_unit, column
+        if energy is not None:
+            units = f"in {column.units}" if column.units else "without units"
+            raise CpunetError(
+                f"{path}: column {name} is {units}, no energy in keV; "
+                "add `kev_per_adc` (1 if it is in keV)"
+            )
+    if kev_per_adc is not None:
+        return f"amplitude x {kev_per_adc:g} keV/ADC", kev_per_adc, None
+    return f"not known{f' (column {name} is not in energy units)' if name else ''}", None, None
+
+
+def _elsewhere(source: PulseSource, energy: str) -> Column:
+    """A column of another file in the order of the pulses, if both tell of which events."""
+    path, columns = source.path, source.columns
+    file, colon, inner = energy.rpartition(":")
+    if not colon:
+        raise CpunetError(
+            f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
+        )
+    # Imported late: the LH5 library takes seconds to load, and most files do not need it.
+    from cpunet.pulses.reading.hdf5 import column_of
+
+    column, others = column_of(Path(file), inner)
+    if (rows := source.chosen) is not None and len(column) == source.n_all:
+        others = {n: c.at(rows) for n, c in others.items() if len(c) == len(column)}
+        column = column.at(rows)
+    key = next((k for k in EVENT_KEYS if k in columns and k in others), None)
+    if key is None or columns[key].constant or len(others[key]) != len(column):
+        return column
+    ours, theirs = (np.asarray(c[key].read(0, len(c[key]))) for c in (columns, others))
+    if np.array_equal(ours, theirs):
+        return column
+    order = np.argsort(theirs, kind="stable")
+    at = order[np.minimum(np.searchsorted(theirs[order], ours), len(theirs) - 1)]
+    shared = theirs[at] == ours
+    if not shared.any() or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
+        lost = f"{(~shared).sum()} of {len(ours)} are not there"
+        raise CpunetError(
+            f"{path}: {energy} is of other events than these pulses ({key}: "
+            f"{'twice' if shared.all() else lost})",
+            "give the energies of the same events",
+        )
+    log.info(
+        f"{path.name}: {energy} is in another order or of other events; joined by {key}, "
+        f"{(~shared).sum()} of {len(ours)} pulses have no energy there"
+    )
+    values = np.where(shared, np.asarray(column.read(0, len(column)), float)[at], np.nan)
+    return Column.of(values, column.units)

@@ -1,0 +1,266 @@
+"""Signs that pulses are not what they are given as.
+
+These are wrong polarity, counts that roll over, energies of other events, and a second rate.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
+from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.reading.source import amplitude
+from cpunet.pulses.spectrum import suggested_calibration
+
+if TYPE_CHECKING:  # compiled loops, which a look into a file does not need
+    from cpunet.pulses.preparation import Kind
+
+log = logging.getLogger(__name__)
+
+Values = npt.NDArray[np.float64]
+
+MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
+LOW_KEV = 300.0  # at lower energies, noise can be a good part of an amplitude
+MIN_PULSES = 30
+# Relative deviation from the common gain of what does not go together, and share of pulses up
+# to which amplitudes may differ as much and yet be all alike.
+FAR, ALIKE = 0.1, 0.1
+# Share of pulses whose amplitude and energy do not go together, from which they are refused,
+# and from which a warning says so.
+MAX_MISMATCHED, FEW_MISMATCHED = 0.2, 0.1
+# Samples over which noise is averaged, least part of the tail on either side of a change of
+# rate, and least factors by which noise and slope change there.
+SMOOTHED, MARGIN, MIN_NOISE, MIN_SLOPE = 64, 0.1, 1.2, 1.5
+# Counts that roll over: least period and number of traces, and share of the steep ones;
+# shares of traces: why no pulse is left, and from which all are refused.
+LEAST_PERIOD, MIN_ROLLED, MOSTLY = 256, 3, 0.9
+FEW_ROLLED, MAX_ROLLED = 0.02, 0.2
+
+
+def go_down(traces: FloatArray) -> bool:
+    """Whether most traces of shape (pulses, samples) fall from their baselines."""
+    if not len(traces):
+        return False
+    up, down = amplitude(traces), amplitude(-traces)
+    return bool(np.mean(down > 2 * np.maximum(up, 0)) > 0.5)
+
+
+class RolledOver(NamedTuple):
+    """Counts that jump by a period, the share of traces in which they do, and their type."""
+
+    period: int
+    share: float
+    signed: bool
+
+    def __str__(self) -> str:
+        return (
+            f"{100 * self.share:.0f} % of the traces jump by {self.period} = "
+            f"2^{self.period.bit_length() - 1} counts: "
+            + ("unsigned samples stored as signed, or " if self.signed else "")
+            + "counts beyond the range rolled over"
+        )
+
+    def refusal(self, path: Path) -> CpunetError:
+        """The error of a file with such counts."""
+        view = "as unsigned (values.view('uint16') in NumPy), or " if self.signed else ""
+        return CpunetError(
+            f"{path}: {self}",
+            f"write them {view}as numpy.unwrap(values.astype(float), period={self.period})",
+        )
+
+
+def rolled_over(traces: FloatArray) -> RolledOver | None:
+    """Find counts that jump by a power of two, where nothing else rises within a sample.
+
+    Parameters
+    ----------
+    traces
+        Raw traces, shape (pulses, samples).
+
+    Examples
+    --------
+    >>> ramp = 30_000 + 50.0 * np.arange(200) + np.arange(5)[:, np.newaxis]
+    >>> rolled_over(ramp) is None, rolled_over((ramp + 2**15) % 2**16 - 2**15)
+    (True, RolledOver(period=65536, share=1.0, signed=True))
+    """
+    jumps = np.abs(np.diff(traces, axis=1)).max(axis=1)
+    steep = (jumps > np.ptp(traces, axis=1) / 2) & (jumps >= LEAST_PERIOD / 2)
+    if steep.sum() < MIN_ROLLED or (traces[steep] != np.round(traces[steep])).any():
+        return None
+    period = 2 ** int(np.round(np.log2(np.median(jumps[steep]))))
+    left = np.abs(np.diff(np.unwrap(traces[steep], period=period), axis=1)).max(axis=1)
+    rolled = (np.abs(jumps[steep] - period) < period / 4) & (left < period / 4)
+    signed = period == 2**16 and bool(traces[steep].min() < 0)
+    return RolledOver(period, float(steep.mean()), signed) if rolled.mean() > MOSTLY else None
+
+
+def mismatched(kev: Values, amplitudes: Values) -> float:
+    """Fraction of the pulses whose amplitude does not go with their energy.
+
+    Of a detector and its readout, amplitudes are energies times a gain, but for a few percent
+    by trapping, for piled-up and for saturated pulses.  Returns 0 if there are too few, or if
+    all amplitudes are alike, as of pulses that were scaled to one height.
+    """
+    heights, gains = _of_usable(kev, amplitudes)
+    if len(heights) < MIN_PULSES or _far_from_median(heights) < ALIKE:
+        return 0.0
+    return _far_from_median(gains)
+
+
+def _of_usable(kev: Values, amplitudes: Values) -> tuple[Values, Values]:
+    """Amplitudes, and amplitudes over energies, of pulses well above the noise."""
+    with np.errstate(invalid="ignore"):
+        usable = (kev > LOW_KEV) & (amplitudes > 0)
+    return amplitudes[usable], amplitudes[usable] / kev[usable]
+
+
+def _far_from_median(values: Values) -> float:
+    return float(np.mean(np.abs(values / np.median(values) - 1) > FAR))
+
+
+class SecondRate(NamedTuple):
+    """A change of the rate within a trace: its sample, and how many samples are averaged."""
+
+    sample: int
+    averaged: float
+
+    def __str__(self) -> str:
+        return (
+            f"noise and slope of the tails change at sample {self.sample}, as if "
+            f"{self.averaged:.0f} samples were averaged from there: a second rate"
+        )
+
+
+def second_rate(traces: FloatArray) -> SecondRate | None:
+    """Find where digitisers begin to average samples, which are then further apart in time.
+
+    Averages of m samples have less noise, by the root of m if it is white, and the decay goes
+    on m times as fast from sample to sample.
+
+    Parameters
+    ----------
+    traces
+        Raw traces, shape (pulses, samples).
+    """
+    heights = amplitude(traces)
+    good = np.isfinite(heights) & (heights > 0)
+    if good.sum() < MIN_PULSES:
+        return None
+    heights = heights[good]
+    start = int(np.median(traces[good].argmax(axis=1))) + SMOOTHED
+    tail: Values = traces[good, start:].astype(np.float64)
+    n = tail.shape[1]
+    margin = max(2 * SMOOTHED, round(MARGIN * n))
+    if n < 3 * margin:
+        return None
+    curvature = np.diff(tail, 2, axis=1)
+    noise = np.log(np.median(np.abs(curvature), axis=0) + 1e-9)  # (samples,)
+    places = np.arange(margin, n - margin)
+    sums = np.concatenate([[0.0], np.cumsum(noise)])
+    left = sums[places] / places
+    right = (sums[-1] - sums[places]) / (len(noise) - places)
+    gain = (left - right) ** 2 * places * (len(noise) - places)
+    at = int(places[gain.argmax()])
+    lower = float(np.exp(left[gain.argmax()] - right[gain.argmax()]))
+    baselines = traces[good].max(axis=1) - heights
+    level = np.median((tail - baselines[:, np.newaxis]) / heights[:, np.newaxis], axis=0)
+    slopes = [
+        np.polyfit(np.arange(len(part)), np.log(np.maximum(part, 1e-3)), 1)[0]
+        for part in (level[:at], level[at:])
+    ]
+    faster = slopes[1] / slopes[0] if slopes[0] < 0 else 0.0
+    if lower < MIN_NOISE or faster < MIN_SLOPE:
+        return None
+    return SecondRate(start + at + 1, faster)
+
+
+def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Values) -> None:
+    """Refuse counts that roll over, and energies of other pulses; warn of a second rate.
+
+    Parameters
+    ----------
+    path
+        The file.
+    traces
+        Its first traces, shape (pulses, samples).
+    kev, amplitudes
+        Energies and amplitudes of all pulses.
+    """
+    rolled = rolled_over(traces)
+    if rolled is not None and rolled.share >= MAX_ROLLED:
+        raise rolled.refusal(path)
+    if rolled is not None:
+        log.warning(str(rolled.refusal(path)))
+    share = mismatched(kev, amplitudes)
+    text = f"{path}: {100 * share:.0f} % of amplitudes and energies do not go together"
+    if share > MAX_MISMATCHED:
+        heights, gains = _of_usable(kev, amplitudes)
+        low = heights[gains < (1 - FAR) * np.median(gains)]
+        top = float(np.quantile(heights, 0.99))
+        # they end at one height where something before the digitiser saturates
+        if len(low) and _far_from_median(low) < ALIKE and np.median(low) > (1 - FAR) * top:
+            raise CpunetError(
+                f"{text}: amplitudes end at {top:.0f}, as of a saturated amplifier",
+                "select lower energies (`peak`), or another channel",
+            )
+        # and are those of baselines where records begin with padding
+        padded = float(np.mean(np.ptp(traces[:, : traces.shape[1] // 20], axis=1) == 0))
+        if FEW_MISMATCHED < padded < 1:
+            raise CpunetError(
+                f"{text}: {100 * padded:.0f} % of the traces begin with equal samples, as if "
+                "padded",
+                "leave out these traces, or cut all where their records begin",
+            )
+        raise CpunetError(
+            f"{text}: these energies are not those of these traces",
+            "give the energy column of the same channel and events, in their order",
+        )
+    if share > FEW_MISMATCHED:
+        log.warning(text)
+    if (rate := second_rate(traces)) is not None:
+        log.warning(f"{path}: {rate}; cut the traces there, or resample them")
+
+
+def explained(
+    error: CpunetError,
+    path: Path,
+    traces: FloatArray,
+    kev: Values,
+    amplitudes: Values,
+    side: Kind,
+    selection: EnergySelection,
+) -> CpunetError:
+    """Why no pulse can be used, if traces or energies show it; else the error as it is."""
+    rolled = rolled_over(traces)
+    if rolled is not None and rolled.share >= FEW_ROLLED:
+        return rolled.refusal(path)
+    if go_down(traces):
+        return CpunetError(
+            f"{path}: the traces go down: their polarity is negative",
+            "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
+        )
+    kev = kev[np.isfinite(kev)]
+    if not len(kev):
+        calibration = suggested_calibration(amplitudes)
+        text = f"{error}; their amplitudes look like {calibration}"
+        return error if calibration is None else CpunetError(text)
+    if selection.select(kev).any():
+        return error
+    low, middle, high = np.quantile(kev, (0.05, 0.5, 0.95))
+    text = f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above "
+    text += f"{middle:.4g}"
+    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
+    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
+    if high > MAX_KEV and side == "measured":
+        text += f": if these are ADC counts, {give}"
+    elif 0 < high < MIN_KEV:
+        text += f": if these are MeV, {give} 1000"
+    elif n := int((kev >= from_kev).sum()):
+        text += f"; `peak` {from_kev:.0f}- takes {n} pulses"
+    return CpunetError(text)
