@@ -10,7 +10,7 @@ import numpy as np
 from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import hit_signals
+from cpunet.simulation.simulator import Simulator
 
 HITS = 2000
 CONSTANTS = ("temperature", 0.12, "siggen")
@@ -30,7 +30,7 @@ def main() -> None:
                 settings = SimulationSettings(
                     dt_ns=dt, length_ns=4000, diffusion_constant=constant
                 )
-                pulses = hit_signals(fields, x, y, z, np.full(HITS, 1592.0), settings)
+                pulses = Simulator(detector, settings, fields=fields).signals(*places, 1592.0)
                 rises = np.diff(pulses.waveforms[pulses.valid], prepend=0)
                 largest[constant] = rises.max(axis=1)
                 duration[constant] = np.median(pulses.cloud_fwhm_ns[pulses.valid])

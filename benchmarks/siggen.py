@@ -10,15 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import hit_signals
+from cpunet.simulation.simulator import Simulator
 
-PLAIN = SimulationSettings(
-    dt_ns=1, library_step_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0
-)
+PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
 CLOUD = PLAIN.model_copy(
     update={"diffusion": True, "diffusion_constant": "siggen", "cloud_fwhm_mm": 0.1}
 )
@@ -44,10 +41,12 @@ def stored_maps(folder: Path) -> FieldMaps:
 
 
 def compare(folder: Path, fields: FieldMaps) -> None:
+    plain_drift, with_cloud = (
+        Simulator(read_detector("icpc"), settings, fields=fields) for settings in (PLAIN, CLOUD)
+    )
     with np.load(folder / "waveforms_plain_A_outertaper_grid0.1.npz") as plain:
         expected = plain["wf1"]
-        x, y, z = plain["positions"].T
-        found = hit_signals(fields, x, y, z, 100.0, PLAIN).waveforms
+        found = plain_drift.signals(*plain["positions"].T, 100.0).waveforms
     worst = np.abs(found - expected).max(axis=1)
     rms = np.sqrt(np.mean((found - expected) ** 2, axis=1))
     late = np.subtract(*(np.argmax(w > 0.995, axis=1) for w in (found, expected)))
@@ -55,15 +54,13 @@ def compare(folder: Path, fields: FieldMaps) -> None:
     print(f", within 1e-3: {(worst < 1e-3).sum()}; RMS {rms.max():.1e} at most", end="")
     print(f"; collected {np.median(late):+.0f} ns later (median), {np.abs(late).max()} at most")
     with np.load(folder / "waveforms_diffusion_A_outertaper_grid0.1.npz") as cloud:
-        x, y, z = cloud["positions"].T
-        signals = hit_signals(fields, x, y, z, 100.0, CLOUD)
+        signals = with_cloud.signals(*cloud["positions"].T, 100.0)
         width = np.abs(signals.cloud_fwhm_ns / cloud["fwhm_steps"] - 1)
         rms = np.sqrt(np.mean((signals.waveforms - cloud["wf1"]) ** 2, axis=1))
     print(f"  cloud: width within 5 %: {(width < 0.05).sum()} of {len(width)}", end="")
     print(f", worst {width.max():.1%} (one step); RMS {rms.max():.1e} at most")
     with np.load(folder / "drift_paths_A_grid0.1.npz") as reference:
-        x, y, z = reference["positions"].T
-        _, paths = drift_paths(fields, x, y, z, PLAIN)
+        _, paths = plain_drift.paths(*reference["positions"].T)
         theirs = reference["paths"][:, : PLAIN.n_steps]
         holes = np.nanmax(np.linalg.norm(paths - theirs[..., 3:], axis=2))
     print(f"  paths of holes within {holes:.3f} mm")

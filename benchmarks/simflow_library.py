@@ -30,13 +30,11 @@ from reboost.hpge import psd, utils
 from cpunet.legend.currents import PEAK, currents_about_peak
 from cpunet.legend.translate_library import TemplateTranslator
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.events import simulate_events
-from cpunet.simulation.field_lookup import drift_maps, in_active_volume
-from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import Simulator
 from cpunet.translation.translator import REN
 
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
@@ -61,18 +59,16 @@ def events_of(path: Path, detector: str) -> Hits:
     """Events above 600 keV: their hits merged, those in the lithium left out."""
     hits = read_hits(path)
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
-    maps = drift_maps(compute_fields(read_detector(detector)), SETTINGS)
-    places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)
-    hits = hits.where(np.array([in_active_volume(maps, *place) for place in places]))
+    hits = hits.where(read_detector(detector).active(hits.r_mm, hits.z_mm))
     return hits[np.flatnonzero(np.diff(hits.offsets) > 0)]
 
 
 def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
     """A/E of exactly drifted events, translated as a whole."""
-    fields, found = compute_fields(read_detector(detector)), []
+    simulator, found = Simulator(read_detector(detector), SETTINGS), []
     translate = TemplateTranslator(REN.load(folder), 1.0)
     for first in range(0, hits.n_events, 500):
-        waveforms = simulate_events(fields, hits[first : first + 500], SETTINGS).waveforms
+        waveforms = simulator.events(hits[first : first + 500]).waveforms
         found.append(currents_about_peak(translate(waveforms))[0][..., PEAK] / mode)
     return np.concatenate(found)
 

@@ -23,7 +23,7 @@ from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import hit_signals
+from cpunet.simulation.simulator import Simulator
 from cpunet.training.closed_forms import StepResponse, learned_chain
 from cpunet.translation.translator import REN
 
@@ -76,7 +76,9 @@ def of_the_layer(chain: StepResponse, detector: Detector, fields: FieldMaps) -> 
     """Print a table by depth."""
     layer = LithiumLayer(1.0)
     r = detector.crystal_radius - detector.li_thickness - 0.1
-    pulse = hit_signals(fields, r, 0, 0.5 * detector.crystal_length, 1000.0, settings())
+    pulse = Simulator(detector, settings(), fields=fields).signals(
+        r, 0, 0.5 * detector.crystal_length, 1000.0
+    )
     assert pulse.valid.all()
     share = arrived(layer, DEPTHS_MM, np.arange(LENGTH, dtype=float))
     late = delayed(np.repeat(pulse.waveforms, len(DEPTHS_MM), axis=0), share)
@@ -94,14 +96,15 @@ def of_trapping(chain: StepResponse, detector: Detector, fields: FieldMaps) -> N
     z = detector.crystal_length * rng.random(4 * HITS)
     phi = rng.uniform(0, 2 * np.pi, 4 * HITS)
     places = (r * np.cos(phi), r * np.sin(phi), z)
-    without = hit_signals(fields, *places, 1000.0, settings())
+    without = Simulator(detector, settings(), fields=fields).signals(*places, 1000.0)
     chosen = np.flatnonzero(without.valid & without.collected)[:HITS]
     x, y, z = (axis[chosen] for axis in places)
     amplitude, charge = told(chain, without.waveforms[chosen])
     print("trapping         collected   A/E             late charge ns")
     for name in TRAPPING:
         for rate in (0.005, 0.02):
-            with_it = hit_signals(fields, x, y, z, 1000.0, settings(**{name: rate}))
+            again = Simulator(detector, settings(**{name: rate}), fields=fields)
+            with_it = again.signals(x, y, z, 1000.0)
             waveforms = with_it.waveforms
             a, lq = told(chain, waveforms / waveforms[:, -1:])
             lines = [

@@ -15,14 +15,12 @@ from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.events import simulate_events
-from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import hit_signals
+from cpunet.simulation.simulator import Simulator
 
 PICTURE = Path(__file__).parents[1] / "pictures" / "one-pulse.png"
 EVENT = 5  # one with several sites, of which pulses can be told apart
@@ -53,9 +51,8 @@ def draw_hits(panel: Axes, detector: Detector, hits: Hits) -> None:
     panel.set(xlabel="x [mm]", ylabel="z [mm]", aspect="equal")
 
 
-def draw_charge(panel: Axes, fields: FieldMaps, hits: Hits, charge: Pulses) -> None:
-    settings = SimulationSettings(dt_ns=1)
-    single = hit_signals(fields, hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev, settings)
+def draw_charge(panel: Axes, simulator: Simulator, hits: Hits, charge: Pulses) -> None:
+    single = simulator.signals(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
     for pulse, kev in zip(single.waveforms, hits.edep_kev, strict=True):
         panel.plot(pulse * kev / hits.energy_kev[0], color=SIM, lw=0.7, alpha=0.6)
     panel.plot(charge.waveforms[0], color="black")
@@ -126,8 +123,9 @@ def draw_parameters(panel: Axes, window: Pulses) -> None:
 
 def main() -> None:
     detector = read_detector("icpc")
-    fields, hits = compute_fields(detector), hits_of_an_event(detector)
-    charge = simulate_events(fields, hits, SimulationSettings(dt_ns=1)).pulses()
+    simulator = Simulator(detector, SimulationSettings(dt_ns=1))
+    hits = hits_of_an_event(detector)
+    charge = simulator.events(hits).pulses()
     traces = read_out(charge, read_electronics("ornl"), seed=3)
     raw = Pulses.of(traces.waveforms, dt_ns=traces.dt_ns, energy_kev=traces.energy_kev)
     window = prepare(raw, load_recipe("fast").preparation, "measured").pulses
@@ -136,7 +134,7 @@ def main() -> None:
     for number, (panel, title) in enumerate(zip(panels.flat, titles, strict=True), 1):
         panel.set_title(f"{number}. {title}", fontsize=11, loc="left")
     draw_hits(panels[0, 0], detector, hits)
-    draw_charge(panels[0, 1], fields, hits, charge)
+    draw_charge(panels[0, 1], simulator, hits, charge)
     draw_response(panels[0, 2], charge, traces)
     draw_trace(panels[1, 0], traces)
     draw_window(panels[1, 1], window)

@@ -13,7 +13,6 @@ import numpy.typing as npt
 import pytest
 
 from cpunet import load
-from cpunet.electronics import stand as stands
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand import make_stand
 from cpunet.errors import CpunetError
@@ -21,16 +20,13 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.simulation.again import SameHits, StoredSimulation
-from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.training.chain_fit import POOR
 from cpunet.training.train import train
 from synthetic import load_recipe, prepared_truth
 
-# a small crystal: its library is built in a second
+# a small crystal
 DETECTOR = read_detector(
     "ppc",
     [
@@ -44,26 +40,10 @@ DETECTOR = read_detector(
 )
 EVENTS = {"FEP": 10, "1000-2000": 30}
 SMALL = {"electronics": "ornl", "detector": DETECTOR, "events": EVENTS}
-LIMIT = "cpunet.electronics.stand._LIBRARY_FROM_EVENTS"
 FILES = (".cpunet.json", "data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
 
 
 pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-@pytest.fixture
-def libraries(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Let every stand use libraries; the temperatures (K) of those built."""
-    built: list[float] = []
-
-    def build(maps: FieldMaps, settings: SimulationSettings) -> PulseLibrary:
-        built.append(maps.temperature_K)
-        # few halvings: more places are left to the drift, the others are as good
-        return build_library(maps, settings.model_copy(update={"library_halvings": 3}))
-
-    monkeypatch.setattr(stands, "build_library", build)
-    monkeypatch.setattr(LIMIT, sum(EVENTS.values()))
-    return built
 
 
 def made(
@@ -174,38 +154,6 @@ def test_a_stand_of_any_period_is_the_same_stand(tmp_path: Path) -> None:
         expected = expected or these
         for values, same in zip(these, expected, strict=True):
             np.testing.assert_allclose(values, same, atol=1e-4)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("shift", "temperatures", "dt_ns"),
-    [((), [85.0], 16), (("default",), [85.0, 87.0], 16), ((), [85.0], 10)],
-)
-def test_pulses_of_a_library_are_those_drifted_one_by_one(
-    libraries: list[float],
-    tmp_path: Path,
-    shift: tuple[str, ...],
-    temperatures: list[float],
-    dt_ns: float,
-) -> None:
-    by_library = made(tmp_path / "library", shift=shift, dt_ns=dt_ns)
-    assert libraries == temperatures
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LIMIT, sum(EVENTS.values()) + 1)
-        drifted = made(tmp_path / "drifted", shift=shift, dt_ns=dt_ns)
-    assert len(libraries) == len(temperatures)
-    values = "waveform/values"
-    for name in ("truth.npz/response", f"sim.lh5/geds/sim/{values}"):
-        error = np.abs(by_library[name] - drifted[name]).max(axis=1)
-        assert 0 < error.max() < 0.005
-    # the noise is the same: only the pulses and their rounding differ, while pulses of the
-    # other side's library are wrong by many counts
-    gain = read_electronics("ornl").gain_adc_per_kev
-    name = f"data.lh5/geds/raw/{values}"
-    error = np.abs(by_library[name].astype(float) - drifted[name]).max(axis=1)
-    assert np.all(error < 1 + 0.005 * gain * drifted["data.lh5/geds/raw/energy"])
-    told = json.loads((tmp_path / "library" / "stand.json").read_text())
-    assert told == json.loads((tmp_path / "drifted" / "stand.json").read_text())
 
 
 @pytest.mark.parametrize("preset", ["ornl", "legend200", "mjd"])

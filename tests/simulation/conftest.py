@@ -21,7 +21,6 @@ class ToyMaps:
     e_z_V_per_cm: Array
     weighting_potential: Array
     region: npt.NDArray[np.int8]
-    temperature_K: float = 90.0
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.fields import FieldMaps
+from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import Simulator
 from cpunet.simulation.velocity import (
     ELECTRON,
     HOLE,
@@ -23,7 +24,11 @@ from cpunet.simulation.velocity import (
     velocity_table,
 )
 
-STEPS = SimulationSettings(dt_ns=1, library_step_ns=1, length_ns=3000)
+STEPS = SimulationSettings(dt_ns=1, length_ns=3000)
+
+
+def drift_paths(fields: FieldMaps, *places: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    return Simulator(read_detector("icpc"), STEPS, fields=fields).paths(*places)
 
 
 def drift_velocity(table: VelocityTable, fields: npt.ArrayLike, carrier: int) -> np.ndarray:
@@ -33,7 +38,7 @@ def drift_velocity(table: VelocityTable, fields: npt.ArrayLike, carrier: int) ->
 
 
 def test_uniform_field_moves_charges_at_constant_speed(planar: FieldMaps) -> None:
-    electrons, holes = drift_paths(planar, [5.0], [3.0], [8.0], STEPS)
+    electrons, holes = drift_paths(planar, [5.0], [3.0], [8.0])
     speed = -drift_velocity(velocity_table(90), [[0, 0, -1000.0]], HOLE)[0, 2]
     hole = holes[0]
     n = np.isfinite(hole[:, 2]).sum()
@@ -45,20 +50,20 @@ def test_uniform_field_moves_charges_at_constant_speed(planar: FieldMaps) -> Non
 
 @pytest.mark.parametrize("far", [99.0, np.nan, np.inf, -np.inf, 1e300])
 def test_nothing_drifts_from_a_contact_or_from_outside(planar: FieldMaps, far: float) -> None:
-    paths = drift_paths(planar, [5.0, 5.0, far, 0.0], 0.0, [1.0, 13.0, 8.0, far], STEPS)
+    paths = drift_paths(planar, [5.0, 5.0, far, 0.0], 0.0, [1.0, 13.0, 8.0, far])
     assert np.isnan(paths).all()
 
 
 def test_a_single_place_is_one_path(planar: FieldMaps) -> None:
-    _, holes = drift_paths(planar, 5.0, 3.0, 8.0, STEPS)
+    _, holes = drift_paths(planar, 5.0, 3.0, 8.0)
     assert holes.shape == (1, STEPS.n_steps, 3)
-    np.testing.assert_array_equal(holes, drift_paths(planar, [5], [3], [8], STEPS)[1])
+    np.testing.assert_array_equal(holes, drift_paths(planar, [5], [3], [8])[1])
 
 
 def test_reference_paths(reference_data: Path, reference_maps: FieldMaps) -> None:
     with np.load(reference_data / "siggen" / "drift_paths_A_grid0.1.npz") as data:
         start, expected = data["positions"], data["paths"][:, : STEPS.n_steps]
-    electrons, holes = drift_paths(reference_maps, *start.T, STEPS)
+    electrons, holes = drift_paths(reference_maps, *start.T)
     # the reference holds electrons first; it drifted in maps five times finer than these
     holes = np.linalg.norm(holes - expected[..., 3:], axis=2)
     electrons = np.linalg.norm(electrons - expected[..., :3], axis=2)

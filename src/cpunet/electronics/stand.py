@@ -18,25 +18,20 @@ from cpunet.electronics.exact_response import linear_response
 from cpunet.electronics.readout import SATURATED, of_energy, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
-from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.provenance import MADE_BY, SIDE, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, require_seed, words_and_files
-from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.events import simulate_events
-from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
 from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import build_library
-from cpunet.simulation.library_lookup import PulseLibrary
 from cpunet.simulation.settings import Shift, SimulationSettings, detector_and_settings
+from cpunet.simulation.simulator import Simulator
 from cpunet.tables import counted
 
 Labels = npt.NDArray[np.int64]
@@ -47,9 +42,6 @@ STAND = FolderKind(
     command="cpunet stand",
     own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
 )
-# Events per side from which building a library of pulses (20 s on two cores) takes less time
-# than drifting their hits, about 20 each.
-_LIBRARY_FROM_EVENTS = 20_000
 # Truth about each measured trace besides its line, in ``data_labels.npz``.
 OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 # What ``stand.json`` counts.
@@ -205,15 +197,10 @@ def make_stand(
     crystal, physics = detector_and_settings(detector, values, dt_ns=chain.dt_ns)
     wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
     sim, data, readout_seed = stand_sides(chain, crystal, wanted, moved, physics, seed)
-    mode, n_events = sim.settings.mode, sum(sim.source.events.values())
-    many = mode == "library" or (mode == "auto" and n_events >= _LIBRARY_FROM_EVENTS)
     stand = Stand(Path(out), chain)
     with folder_written_aside(stand.folder, STAND, force=force) as folder:
-        library = build_library(sim.fields(), sim.settings) if many else None
-        _write_sim(folder, sim, library, stand)
-        if many and shift:
-            library = build_library(data.fields(), data.settings)
-        _write_data(folder, data, readout_seed, library, stand)
+        _write_sim(folder, sim, stand)
+        _write_data(folder, data, readout_seed, stand)
         made = {
             "cpunet": cpunet.__version__,
             "shift": moved.model_dump(mode="json") if shift else None,
@@ -243,14 +230,7 @@ class Side:
             "hits": self.source.provenance(),
         }
 
-    def fields(self) -> FieldMaps:
-        """Fields of the detector."""
-        with stage(f"Fields of {self.detector.name}"):
-            return compute_fields(self.detector)
-
-    def blocks(
-        self, title: str, library: PulseLibrary | None
-    ) -> Iterator[tuple[Pulses, Labels, Hits]]:
+    def blocks(self, title: str) -> Iterator[tuple[Pulses, Labels, Hits]]:
         """Finely sampled pulses, their lines and their hits, block by block.
 
         Energies are calibrated as in a measurement: a factor, determined from the lines in the
@@ -261,23 +241,19 @@ class Side:
         CpunetError
             If no event gives a signal.
         """
-        fields = self.fields()
+        simulator = Simulator(self.detector, self.settings)
         opened = self.source.open(self.detector)
         gain = 0.0
-        with stage(title, opened.n_events) as bar:
-            for hits in opened.blocks:
-                merged = merge_hits(hits, self.detector, self.settings.cluster_mm)
-                events = simulate_events(fields, merged, self.settings, library)
-                kept = events.collected_kev > 0
-                pulses = events.pulses()
-                if len(pulses):
-                    untrapped = pulses.energy_kev + events.trapped_kev[kept]
-                    labels = labels_of(untrapped, self.source.events)
-                    share, lines = untrapped / pulses.energy_kev, labels != OTHER
-                    gain = gain or float(np.median(share[lines] if lines.any() else share))
-                    calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
-                    yield calibrated, labels, merged[kept]
-                bar.update(len(hits))
+        for _, events in simulator.blocks(opened, title):
+            kept = events.collected_kev > 0
+            pulses = events.pulses()
+            if len(pulses):
+                untrapped = pulses.energy_kev + events.trapped_kev[kept]
+                labels = labels_of(untrapped, self.source.events)
+                share, lines = untrapped / pulses.energy_kev, labels != OTHER
+                gain = gain or float(np.median(share[lines] if lines.any() else share))
+                calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
+                yield calibrated, labels, events.hits[kept]
         if not gain:
             raise CpunetError(
                 f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
@@ -367,7 +343,7 @@ def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindo
     return labels
 
 
-def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: Stand) -> None:
+def _write_sim(folder: Path, side: Side, stand: Stand) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
     electronics = stand.electronics
@@ -378,7 +354,7 @@ def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: St
         rows.open("wb") as truth,
         PulseWriter(folder / "sim.lh5", attrs=MADE | {SIDE: "simulated"}) as writer,
     ):
-        for fine, label, hits in side.blocks("Simulated events", library):
+        for fine, label, hits in side.blocks("Simulated events"):
             writer.append(_block_means(fine, per_sample))
             writer.append_rows(HIT_TABLE, hit_columns(hits))
             true = of_energy(linear_response(fine, electronics), fine.energy_kev, electronics)
@@ -399,15 +375,13 @@ def _write_sim(folder: Path, side: Side, library: PulseLibrary | None, stand: St
     stand.sim_lines = _by_line(label)
 
 
-def _write_data(
-    folder: Path, side: Side, seed: int, library: PulseLibrary | None, stand: Stand
-) -> None:
+def _write_data(folder: Path, side: Side, seed: int, stand: Stand) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = stand.electronics
     known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("label", *OF_DATA)}
     path, attrs = folder / "data.lh5", MADE | {SIDE: "measured"}
     with PulseWriter(path, table="geds/raw", waveform_units="ADC", attrs=attrs) as writer:
-        for fine, label, _ in side.blocks("Measured events", library):
+        for fine, label, _ in side.blocks("Measured events"):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(traces)

@@ -18,10 +18,9 @@ from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import Set
-from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.settings import detector_and_settings
-from cpunet.simulation.signals import hit_signals
+from cpunet.simulation.simulator import Simulator
 
 # Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
 DT_NS, LENGTH_NS = 1.0, 5000.0
@@ -114,8 +113,8 @@ def make_library(
     )
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
-    with stage(f"Fields of {detector.name or 'the detector'}"):
-        fields = compute_fields(detector)
+    simulator = Simulator(detector, wanted)
+    fields = simulator.fields
     r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
     counts = MadeLibrary(out)
     total = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
@@ -133,7 +132,7 @@ def make_library(
             phi = math.radians(angle_deg)
             for i, r in enumerate(r_mm):
                 x, y = r * math.cos(phi), r * math.sin(phi)
-                signals = hit_signals(fields, x, y, z_mm, ENERGY_KEV, wanted)
+                signals = simulator.signals(x, y, z_mm, ENERGY_KEV)
                 good = signals.valid & signals.collected
                 template = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
                 waveforms[i] = template

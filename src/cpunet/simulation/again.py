@@ -11,13 +11,13 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.simulation.events import EventPulses, simulate_events
 from cpunet.simulation.fields import NOT_IN_PARTS, Superposition, solve, superposed_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import EventPulses, Simulator
 
 _PULSES = "geds/sim"
 
@@ -142,10 +142,10 @@ class SameHits:
             If the detector is not depleted, or a hit is not finite.
         """
         fields = superposed_fields(self._solution(detector), detector, depletion=False)
-        hits = self._hits[:most]
         steps = settings.steps_per_sample if quick else 1
         stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
-        return simulate_events(fields, hits, settings, stride=stride)
+        simulator = Simulator(detector, settings, fields=fields, stride=stride)
+        return simulator.events(self._hits[:most])
 
     def _solution(self, detector: Detector) -> Superposition:
         """Potentials of a detector."""

@@ -13,11 +13,11 @@ from matplotlib.patches import Patch
 from scipy.ndimage import distance_transform_edt
 
 from cpunet.plotting import COLOURS, styled
-from cpunet.simulation.drift import drift_paths
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.outline import DITCH, LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import Simulator
 
 # Paths tolerate coarse steps, but must not end before the charge is collected.
 _SETTINGS = SimulationSettings(step_ns=2.0, dt_ns=16.0, length_ns=6000.0, diffusion=False)
@@ -103,7 +103,7 @@ def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
     margin = 0.05 * detector.crystal_radius
     inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
     r, z = r[inside], z[inside]
-    electrons, holes = drift_paths(fields, r, np.zeros_like(r), z, _SETTINGS)
+    electrons, holes = Simulator(detector, _SETTINGS, fields=fields).paths(r, 0.0, z)
     for carrier, colour in ((electrons, _ELECTRON), (holes, _HOLE)):
         for track in carrier:
             # a light outline keeps the line visible everywhere on the map

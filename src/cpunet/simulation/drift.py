@@ -10,13 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.field_lookup import DriftMaps, drift_maps, in_active_volume, look_up
-from cpunet.simulation.fields import FieldMaps
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray, carrier_velocity
+from cpunet.simulation.field_lookup import DriftMaps, look_up
+from cpunet.simulation.velocity import HOLE, FloatArray, carrier_velocity
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 # siggen's rounded value, used in its formulas
@@ -127,7 +124,7 @@ def cloud_after_step(
 
 @kernel(fastmath=True)
 def smear_and_sample(
-    signal: npt.NDArray[np.float64] | npt.NDArray[np.float32],
+    signal: FloatArray,
     per_sample: int,
     sigma: float,
     last: int,
@@ -299,46 +296,3 @@ def drift(
     for later in range(k + 1, n):
         signal[later] += induced
     return k, collected, size, speed, sign * (last - first) - induced
-
-
-def drift_paths(
-    fields: FieldMaps,
-    x_mm: npt.ArrayLike,
-    y_mm: npt.ArrayLike,
-    z_mm: npt.ArrayLike,
-    settings: SimulationSettings,
-) -> tuple[FloatArray, FloatArray]:
-    """Trajectories of both carriers from each starting point, one position per step.
-
-    Parameters
-    ----------
-    fields
-        Field maps of the detector.
-    x_mm, y_mm, z_mm
-        Starting points in mm.
-    settings
-        Simulation settings.
-
-    Returns
-    -------
-    electrons, holes
-        Positions (n, steps, 3) in mm at each step; NaN after collection.
-    """
-    start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
-    start = start.reshape(-1, 3)
-    maps = drift_maps(fields, settings)
-    paths = np.full((2, len(start), settings.n_steps, 3), np.nan)
-    _fill_paths(maps, start, settings.step_ns, paths)
-    return paths[ELECTRON], paths[HOLE]
-
-
-@kernel
-def _fill_paths(maps: DriftMaps, start: FloatArray, step_ns: float, paths: FloatArray) -> None:
-    signal = np.zeros(paths.shape[2])
-    for i in range(len(start)):
-        here = (start[i, 0], start[i, 1], start[i, 2])
-        if in_active_volume(maps, here[0], here[1], here[2]):
-            for carrier in range(2):
-                drift(
-                    maps, carrier, here, step_ns, 1, (0.0, 0.0, 0.0), signal, paths[carrier, i]
-                )

@@ -52,7 +52,9 @@ class DriftMaps(NamedTuple):
     trapping_per_ns: FloatArray
 
 
-def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
+def drift_maps(
+    fields: FieldMaps, temperature_K: float, settings: SimulationSettings
+) -> DriftMaps:
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
@@ -80,7 +82,7 @@ def drift_maps(fields: FieldMaps, settings: SimulationSettings) -> DriftMaps:
         cells = np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_))
         ditch = ~_all_corners(~np.pad(cells, 1))  # nodes at the corners of these cells
         usable = np.kron(usable, np.ones((parts, parts), np.bool_))
-    table = velocity_table(fields.temperature_K, settings.velocity_factors)
+    table = velocity_table(temperature_K, settings.velocity_factors)
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,

@@ -273,7 +273,6 @@ class FieldMaps:
     e_z_V_per_cm: FloatArray
     weighting_potential: FloatArray
     region: RegionArray
-    temperature_K: float
     capacitance_pF: float
     depletion_V: float
 
@@ -331,7 +330,6 @@ def superposed_fields(
         e_z_V_per_cm=e_z,
         weighting_potential=parts.point_contact,
         region=grid.region,
-        temperature_K=detector.temperature_K,
         capacitance_pF=parts.capacitance_pF,
         depletion_V=solution.depletion_V(*impurities) if depletion else np.nan,
     )

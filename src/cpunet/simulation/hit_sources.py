@@ -20,7 +20,7 @@ from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hits import LATE_NS, WINDOW_US, HitOptions, Hits
+from cpunet.simulation.hits import LATE_NS, WINDOW_US, HitOptions, Hits, OpenHits
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +154,8 @@ class HitFile:
         if not self.placed:
             self._require_inside(hits, detector)
         starts = range(0, len(hits), BLOCK_EVENTS)
-        return OpenHits(len(hits), (hits[i : i + BLOCK_EVENTS] for i in starts))
+        blocks = (hits[i : i + BLOCK_EVENTS] for i in starts)
+        return OpenHits(len(hits), blocks, merged=self.placed)
 
     def _require_inside(self, hits: Hits, detector: Detector) -> None:
         """Warn of hits outside the crystal, or raise an error if these are nearly all."""
@@ -257,14 +258,6 @@ class GammaSource:
             seed=seed,
             wanted=wanted,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class OpenHits:
-    """Number of events, and a single-use iterator over blocks of them."""
-
-    n_events: int
-    blocks: Iterator[Hits]
 
 
 HitSource = HitFile | GammaSource

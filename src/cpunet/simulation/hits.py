@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,3 +205,12 @@ class Hits:
             np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
             np.concatenate([s.event_number for s in sets]),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class OpenHits:
+    """Number of events, and a single-use iterator over blocks of them, `merged` or as read."""
+
+    n_events: int
+    blocks: Iterator[Hits]
+    merged: bool = False

@@ -1,4 +1,4 @@
-"""Settings of the simulation: source, hits, steps, cloud, library; shifts of its physics."""
+"""Settings of the simulation: source, hits, steps, cloud; shifts of its physics."""
 
 from __future__ import annotations
 
@@ -68,21 +68,6 @@ class SimulationSettings(Config):
         them.
     source_height_mm, source_radius_mm
         Height above the crystal and radius of the source of gammas, a disc.
-    mode
-        ``"exact"`` drifts every hit, ``"library"`` interpolates between pulses of a grid;
-        ``"auto"`` takes the library from 200,000 hits on.
-    library_grid_mm, library_halvings
-        Spacing in r and z of the coarsest pre-computed pulses in mm, and the maximum number of
-        times a cell is halved where the interpolation is not accurate enough.
-    library_angles
-        Number of azimuths from 0 to 45 degrees.
-    library_step_ns
-        Maximum sampling period of the pre-computed pulses in ns; that of the pulses if
-        shorter.
-    library_tolerance
-        Maximum deviation at the centre of a cell: of any sample relative to full scale, and of
-        the largest rise in one sample relative to itself. Hits in the smallest cells that
-        exceed it are drifted individually.
     """
 
     switches = ("self_repulsion",)
@@ -104,12 +89,6 @@ class SimulationSettings(Config):
     window_kev: Annotated[float, Field(gt=0, le=1e4)] = 0.5
     source_height_mm: Annotated[float, Field(gt=0, le=1e4)] = 20.0
     source_radius_mm: Annotated[float, Field(ge=0, le=1e4)] = 5.0
-    mode: Literal["auto", "exact", "library"] = "auto"
-    library_grid_mm: Annotated[float, Field(ge=0.1, le=100)] = 2.0
-    library_halvings: Annotated[int, Field(ge=0, le=6)] = 4
-    library_angles: Annotated[int, Field(ge=2, le=181)] = 6
-    library_step_ns: _Nanoseconds = 4.0
-    library_tolerance: Annotated[float, Field(gt=0, le=1)] = 0.005
 
     @property
     def n_steps(self) -> int:

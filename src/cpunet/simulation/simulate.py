@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +14,11 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
-from cpunet.progress import stage
 from cpunet.pulses.provenance import MADE_BY, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, require_seed
-from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.events import NOT_COLLECTED, EventPulses, simulate_events
-from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import hit_columns
@@ -36,16 +30,10 @@ from cpunet.simulation.hit_sources import (
     wanted_events,
 )
 from cpunet.simulation.hit_tables import HIT_TABLE
-from cpunet.simulation.hits import HitOptions, Hits
-from cpunet.simulation.library import build_library
+from cpunet.simulation.hits import HitOptions
 from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings, detector_and_settings
-
-log = logging.getLogger(__name__)
-
-# Building the library takes as long as drifting this many hits. For more hits it is faster,
-# but its pulses deviate by up to `library_tolerance`.
-LIBRARY_FROM_HITS = 200_000
+from cpunet.simulation.simulator import EventPulses, Simulator
 
 
 @dataclass(repr=False)
@@ -62,7 +50,6 @@ class Simulation:
     settings: SimulationSettings
     windows: list[EnergyWindow]
     seed: int = 0
-    mode: str = ""
     n_events: int = 0
     n_written: int = 0
     hits_before_merging: int = 0
@@ -86,19 +73,21 @@ class Simulation:
         """Number of events that were not written because none of their hits gives a signal."""
         return self.n_events - self.n_written
 
-    def count(self, hits: Hits, events: EventPulses) -> None:
-        """Count a block of events."""
+    def count(self, before_merging: int, events: EventPulses) -> None:
+        """Count a block of events, and its hits before they were merged."""
+        hits = events.hits
         place = hits.r_mm, hits.z_mm
         inside = self.detector.inside(*place)
         contacts = np.isin(self.detector.region(*place), (POINT_CONTACT, LI_CONTACT))
         collected = events.collected_kev
         self.n_events += len(hits)
+        self.hits_before_merging += before_merging
         self.n_written += int((collected > 0).sum())
         self.hits += len(hits.edep_kev)
         self.hits_outside += int((~inside).sum())
         self.hits_in_contacts += int((inside & contacts).sum())
-        self.not_collected += int((events.outcome == NOT_COLLECTED).sum())
-        self.energy_kev += float(events.energy_kev.sum())
+        self.not_collected += int((events.valid & ~events.collected).sum())
+        self.energy_kev += float(hits.energy_kev.sum())
         self.lost_kev += float(events.lost_kev.sum())
         self.trapped_kev += float(events.trapped_kev.sum())
         self.events_with_loss += int((events.lost_kev > 0).sum())
@@ -124,7 +113,6 @@ class Simulation:
             told.append(f"{self.not_collected} hits not collected in full; raise length_ns")
         if self.trapped_kev:
             told.append(f"{self.trapped_kev / self.energy_kev:.2%} of the energy trapped")
-        told.append(f"{self.mode} pulses")
         return "\n".join(f"{self.path}: {line}" for line in told)
 
 
@@ -213,37 +201,19 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
     """Write the pulses, and count them."""
     detector, settings = simulation.detector, simulation.settings
     opened = source.open(detector)
-    with stage(f"Fields of {detector.name}"):
-        fields = compute_fields(detector)
-    merged = isinstance(source, HitFile) and source.placed
-
-    def merged_blocks() -> Iterator[Hits]:
-        for block in opened.blocks:
-            simulation.hits_before_merging += len(block.edep_kev)
-            yield merge_hits(block, detector, 0.0 if merged else settings.cluster_mm)
-
-    blocks = merged_blocks()
-    first = next(blocks)
-    mode = settings.mode
-    if mode == "auto":
-        expected_hits = len(first.edep_kev) / len(first) * opened.n_events
-        mode = "library" if expected_hits >= LIBRARY_FROM_HITS else "exact"
-    simulation.mode = mode
-    library = build_library(fields, settings) if mode == "library" else None
-    with writer, stage(f"Simulating {detector.name}", opened.n_events) as bar:
-        for block in chain([first], blocks):
-            events = simulate_events(fields, block, settings, library)
-            simulation.count(block, events)
+    simulator = Simulator(detector, settings)
+    with writer:
+        for before_merging, events in simulator.blocks(opened, f"Simulating {detector.name}"):
+            simulation.count(before_merging, events)
             kept = events.collected_kev > 0
             columns: dict[str, tuple[Any, str]] = {
                 "lost_energy": (events.lost_kev[kept], "keV"),
-                "n_hits": (np.diff(block.offsets)[kept], ""),
+                "n_hits": (np.diff(events.hits.offsets)[kept], ""),
             }
             if any(settings.trapping_per_ns):
                 columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
             writer.append(events.pulses(), columns)
-            writer.append_rows(HIT_TABLE, hit_columns(block[kept]))
-            bar.update(len(block))
+            writer.append_rows(HIT_TABLE, hit_columns(events.hits[kept]))
         if not writer.n_pulses:
             raise CpunetError(
                 f"{simulation.path}: none of {simulation.n_events} events gives a signal: "
@@ -254,10 +224,9 @@ def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) ->
             "detector": detector.model_dump(mode="json"),
             "settings": settings.model_dump(mode="json"),
             "hits": source.provenance(),
-            "mode": mode,
             "seed": simulation.seed,
             "events": simulation.n_events,
             "events_without_signal": simulation.without_signal,
-            "depletion_V": fields.depletion_V,
+            "depletion_V": simulator.fields.depletion_V,
         }
         writer.annotate(SIMULATION, json.dumps(made))

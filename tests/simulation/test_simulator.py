@@ -11,25 +11,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.events import INTERPOLATED, simulate_events
-from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.library import build_library
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.signals import hit_signals
+from cpunet.simulation.simulator import Simulator
 from cpunet.simulation.velocity import ELECTRON, HOLE, carrier_velocity, velocity_table
 
-PLAIN = SimulationSettings(
-    dt_ns=1, library_step_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0
-)
+PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
 SIGGEN = PLAIN.model_copy(
     update={"diffusion": True, "diffusion_constant": "siggen", "cloud_fwhm_mm": 0.1}
 )
 
 
+ICPC = read_detector("icpc")  # at 90 K, as the reference pulses
+
+
+def of(fields: FieldMaps, settings: SimulationSettings) -> Simulator:
+    return Simulator(ICPC, settings, fields=fields)
+
+
 def test_planar_detector_has_straight_edges(planar: FieldMaps) -> None:
-    signals = hit_signals(planar, [0.0], [0.0], [8.0], [100.0], PLAIN)
+    signals = of(planar, PLAIN).signals([0.0], [0.0], [8.0], [100.0])
     field = [[0, 0, -1000.0]]
     table, field = velocity_table(90), (0.0, 0.0, -1000.0)
     speeds = [abs(carrier_velocity(*table, c, *field)[2]) for c in (HOLE, ELECTRON)]
@@ -48,35 +51,32 @@ def test_charge_is_conserved_and_quarter_turns_change_nothing(
 ) -> None:
     x, y = r * np.cos(phi), r * np.sin(phi)
     kind = SIGGEN.model_copy(update={"dt_ns": 16.0})
-    signals = hit_signals(planar, [x, -y, x], [y, x, -y], [z] * 3, 500.0, kind)
+    signals = of(planar, kind).signals([x, -y, x], [y, x, -y], [z] * 3, 500.0)
     assert np.allclose(signals.waveforms[:, -1], 1, atol=1e-4)
     assert np.all(np.diff(signals.waveforms, axis=1) > -1e-6)
     np.testing.assert_allclose(signals.waveforms[1:], signals.waveforms[[0, 0]], atol=1e-6)
 
 
 def test_samples_are_means_of_their_steps(planar: FieldMaps) -> None:
-    fine = hit_signals(planar, 1.0, 2.0, [7.0], 1.0, SIGGEN)
-    coarse = hit_signals(
-        planar, 1.0, 2.0, [7.0], 1.0, SIGGEN.model_copy(update={"dt_ns": 16.0})
-    )
+    fine = of(planar, SIGGEN).signals(1.0, 2.0, [7.0], 1.0)
+    coarse = of(planar, SIGGEN.model_copy(update={"dt_ns": 16.0})).signals(1.0, 2.0, [7.0], 1.0)
     means = fine.waveforms.reshape(-1, 16).mean(axis=1)
     np.testing.assert_allclose(coarse.waveforms[0], means, atol=1e-6)
 
 
 def test_self_repulsion_and_temperature_widen_the_cloud(planar: FieldMaps) -> None:
     repelling = SimulationSettings(self_repulsion=True)
-    low, high = hit_signals(
-        planar, 0.0, 0.0, [9.0, 9.0], [10.0, 2000.0], repelling
-    ).cloud_fwhm_ns
-    own = hit_signals(planar, 0.0, 0.0, [9.0], 10.0, SimulationSettings()).cloud_fwhm_ns[0]
-    siggen = hit_signals(planar, 0.0, 0.0, [9.0], 10.0, SIGGEN).cloud_fwhm_ns[0]
+    energies = [10.0, 2000.0]
+    low, high = of(planar, repelling).signals(0.0, 0.0, [9.0, 9.0], energies).cloud_fwhm_ns
+    own = of(planar, SimulationSettings()).signals(0.0, 0.0, [9.0], 10.0).cloud_fwhm_ns[0]
+    siggen = of(planar, SIGGEN).signals(0.0, 0.0, [9.0], 10.0).cloud_fwhm_ns[0]
     assert own <= low < high
     assert own < siggen
 
 
 def test_a_bad_hit_is_named(planar: FieldMaps) -> None:
     with pytest.raises(CpunetError, match="hit 1: no finite place"):
-        hit_signals(planar, [0, np.nan], 0.0, 5.0, 1.0, PLAIN)
+        of(planar, PLAIN).signals([0, np.nan], 0.0, 5.0, 1.0)
 
 
 def test_reference_pulses(reference_data: Path, reference_maps: FieldMaps) -> None:
@@ -84,7 +84,7 @@ def test_reference_pulses(reference_data: Path, reference_maps: FieldMaps) -> No
         reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
     ) as data:
         start, expected = data["positions"], data["wf1"]
-    signals = hit_signals(reference_maps, *start.T, 100.0, PLAIN)
+    signals = of(reference_maps, PLAIN).signals(*start.T, 100.0)
     assert signals.valid.all()
     assert signals.collected.all()
     worst = np.abs(signals.waveforms - expected).max(axis=1)
@@ -99,7 +99,7 @@ def test_pulses_in_own_fields_agree_with_the_reference(reference_data: Path) -> 
         reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
     ) as data:
         start, expected = data["positions"], data["wf1"]
-    signals = hit_signals(compute_fields(read_detector("icpc")), *start.T, 100.0, PLAIN)
+    signals = Simulator(ICPC, PLAIN).signals(*start.T, 100.0)
     collected = [np.argmax(w > 0.995, axis=1) for w in (signals.waveforms, expected)]
     assert np.abs(np.subtract(*collected)).max() <= 1
     assert np.sqrt(np.mean((signals.waveforms - expected) ** 2, axis=1)).max() < 2e-3
@@ -111,22 +111,20 @@ def test_reference_clouds(reference_data: Path, reference_maps: FieldMaps) -> No
     ) as data:
         start, expected = data["positions"], data["wf1"]
         steps, repelled = data["fwhm_steps"], data["fwhm_steps_ene2000"]
-    signals = hit_signals(reference_maps, *start.T, 100.0, SIGGEN)
+    signals = of(reference_maps, SIGGEN).signals(*start.T, 100.0)
     # whole steps: one off is rounding
     assert np.abs(signals.cloud_fwhm_ns - steps).max() <= 1
     assert (np.abs(signals.cloud_fwhm_ns / steps - 1) < 0.05).mean() > 0.9
     assert np.sqrt(np.mean((signals.waveforms - expected) ** 2, axis=1)).max() < 3e-3
     strong = SIGGEN.model_copy(update={"self_repulsion": True})
-    widths = hit_signals(reference_maps, *start.T, 2000.0, strong).cloud_fwhm_ns
+    widths = of(reference_maps, strong).signals(*start.T, 2000.0).cloud_fwhm_ns
     assert np.abs(widths - repelled).max() <= 1
 
 
 Array = npt.NDArray[np.float64]
 
 RATES = {"hole_trapping_per_us": 2.0, "electron_trapping_per_us": 5.0}
-TRAPPED = SimulationSettings(
-    dt_ns=1, library_step_ns=1, length_ns=2400, diffusion=False, cloud_fwhm_mm=0
-)
+TRAPPED = SimulationSettings(dt_ns=1, length_ns=2400, diffusion=False, cloud_fwhm_mm=0)
 
 
 def hecht(t_ns: Array, path_mm: float, carrier: int, rate_per_us: float) -> Array:
@@ -139,7 +137,7 @@ def hecht(t_ns: Array, path_mm: float, carrier: int, rate_per_us: float) -> Arra
 @pytest.mark.parametrize("z", [3.0, 8.0, 11.5])
 def test_a_uniform_field_follows_hecht(planar: FieldMaps, z: float) -> None:
     trapping = TRAPPED.model_copy(update=RATES)
-    signals = hit_signals(planar, [0.0], [0.0], [z], [100.0], trapping)
+    signals = of(planar, trapping).signals([0.0], [0.0], [z], [100.0])
     t = np.arange(TRAPPED.n_samples, dtype=float)
     expected = hecht(t, z - 2, HOLE, 2.0) + hecht(t, 12 - z, ELECTRON, 5.0)
     np.testing.assert_allclose(signals.waveforms[0], expected, atol=1e-3)
@@ -149,7 +147,7 @@ def test_a_uniform_field_follows_hecht(planar: FieldMaps, z: float) -> None:
 def test_trapped_charge_lowers_the_energy_and_not_the_pulse(planar: FieldMaps) -> None:
     places = [[0.0, 0.0, 4.0], [0.0, 0.0, 10.0], [0.0, 0.0, 0.5]]
     hits = Hits.of(places, [400.0, 600.0, 50.0], [0, 3])
-    events = simulate_events(planar, hits, TRAPPED.model_copy(update=RATES))
+    events = of(planar, TRAPPED.model_copy(update=RATES)).events(hits)
     t = np.array([1e5])
     kept = [hecht(t, z - 2, HOLE, 2.0) + hecht(t, 12 - z, ELECTRON, 5.0) for z in (4.0, 10.0)]
     collected = 400 * kept[0][0] + 600 * kept[1][0]
@@ -157,21 +155,29 @@ def test_trapped_charge_lowers_the_energy_and_not_the_pulse(planar: FieldMaps) -
     assert events.trapped_kev[0] == pytest.approx(1000 - collected, abs=0.2)
     assert events.pulses().energy_kev[0] == pytest.approx(collected, abs=0.2)
     assert events.waveforms[0, -1] == pytest.approx(1, abs=1e-4)
-    without = simulate_events(planar, hits, TRAPPED)
+    without = of(planar, TRAPPED).events(hits)
     assert without.trapped_kev[0] == 0
 
 
-def test_the_library_traps_as_much(planar: FieldMaps) -> None:
-    rng = np.random.default_rng(0)
-    place = rng.uniform([-14, -14, 2], [14, 14, 12], (300, 3))
-    hits = Hits.of(place, rng.uniform(50, 1000, 300), np.arange(0, 301, 3))
-    settings = SimulationSettings(
-        length_ns=2400, library_grid_mm=1, library_halvings=2, **RATES
+def test_an_event_is_the_weighted_sum_of_its_hits(planar: FieldMaps) -> None:
+    place = [[1.0, 2.0, 5.0], [6.0, 0.0, 9.0], [0.0, 0.0, 0.5]]
+    hits = Hits.of(place, [300.0, 100.0, 50.0], [0, 3, 3])
+    simulator = of(planar, SimulationSettings(length_ns=2400))
+    events = simulator.events(hits)
+    single = simulator.signals(*np.transpose(place), 1.0).waveforms
+    np.testing.assert_allclose(
+        events.waveforms[0], 0.75 * single[0] + 0.25 * single[1], atol=1e-6
     )
-    exact = simulate_events(planar, hits, settings)
-    quick = simulate_events(planar, hits, settings, build_library(planar, settings))
-    assert np.sum(quick.outcome == INTERPOLATED) > 100
-    share = exact.trapped_kev / exact.energy_kev
-    assert share.min() > 0.01
-    np.testing.assert_allclose(quick.trapped_kev / exact.energy_kev, share, atol=5e-4)
-    assert np.abs(quick.waveforms - exact.waveforms).max() < 0.006
+    assert events.lost_kev.tolist() == [50.0, 0.0]
+    assert events.collected_kev.tolist() == [400.0, 0.0]
+    assert events.valid.tolist() == events.collected.tolist() == [True, True, False]
+    assert len(events.pulses()) == 1
+    assert events.pulses().energy_kev.tolist() == [400.0]
+
+
+def test_charges_that_come_too_late_are_not_collected(planar: FieldMaps) -> None:
+    hits = Hits.of([[0, 0, 2.5], [0, 0, 7]], [100, 100], [0, 1, 2])
+    events = of(planar, SimulationSettings(length_ns=64)).events(hits)
+    assert events.valid.all()
+    assert events.collected.tolist() == [False, True]  # 9.5 mm to the lithium, 5 mm at most
+    assert events.waveforms[:, -1] == pytest.approx([0.65, 1], abs=0.1)

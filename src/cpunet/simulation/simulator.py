@@ -1,0 +1,417 @@
+"""Pulses of a detector: those of single charges, of whole events, and the paths of charges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from cpunet.errors import CpunetError
+from cpunet.kernels import kernel
+from cpunet.progress import stage
+from cpunet.pulses.container import Pulses
+from cpunet.simulation.clustering import merge_hits
+from cpunet.simulation.drift import (
+    FWHM_PER_SIGMA,
+    SMALLEST_FWHM_MM,
+    diffusion_constant,
+    drift,
+    repulsion_constant,
+    smear_and_sample,
+)
+from cpunet.simulation.field_lookup import DriftMaps, drift_maps, in_active_volume
+from cpunet.simulation.fields import FieldMaps, compute_fields
+from cpunet.simulation.geometry import Detector
+from cpunet.simulation.hits import FARTHEST_MM, Hits, OpenHits
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
+
+_CHUNK = 25  # events per task of a thread
+_POINT = (0.0, 0.0, 0.0)  # a cloud without a size
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Pulses of single hits, in units of the charge of the hit.
+
+    Parameters
+    ----------
+    waveforms
+        Float32 array of shape ``(n, samples)``; 0 where `valid` is false.
+    dt_ns
+        Sampling period in ns.
+    valid
+        Whether a hit gives a signal. Hits in a contact, outside the crystal or in germanium
+        without a field do not.
+    collected
+        Whether both carriers were collected within the record.
+    collection_time_ns
+        Time in ns at which the last carrier was collected or the record ended; NaN if not
+        valid.
+    cloud_fwhm_ns
+        FWHM in ns of the smearing by the charge cloud; NaN if not valid.
+    trapped
+        Fraction of the signal lost to trapping; NaN if not valid.
+    """
+
+    waveforms: npt.NDArray[np.float32]
+    dt_ns: float
+    valid: BoolArray
+    collected: BoolArray
+    collection_time_ns: FloatArray
+    cloud_fwhm_ns: FloatArray
+    trapped: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class EventPulses:
+    """Pulses of events, in units of the charge that gives a signal.
+
+    Parameters
+    ----------
+    waveforms
+        Float32 array (n_events, samples); zero for events without any signal.
+    dt_ns
+        Sampling period in ns.
+    hits
+        The events.
+    valid, collected
+        Of each hit, see `Signals`.
+    lost_kev
+        Energy in keV of the hits of each event without a signal: in a contact or its dead
+        layer, outside the crystal, or in germanium without a field.
+    trapped_kev
+        Energy in keV of each event whose signal is lost to trapping.
+    """
+
+    waveforms: npt.NDArray[np.float32]
+    dt_ns: float
+    hits: Hits
+    valid: BoolArray
+    collected: BoolArray
+    lost_kev: FloatArray
+    trapped_kev: FloatArray
+
+    @property
+    def collected_kev(self) -> FloatArray:
+        """Energy in keV that gives a signal, which is what a detector measures."""
+        return self.hits.energy_kev - self.lost_kev - self.trapped_kev
+
+    def pulses(self) -> Pulses:
+        """Events with a signal as `Pulses`, with their collected energies."""
+        energy_kev = self.collected_kev
+        kept = energy_kev > 0
+        return Pulses.of(
+            self.waveforms[kept],
+            dt_ns=self.dt_ns,
+            energy_kev=energy_kev[kept],
+            event_number=self.hits.event_number[kept],
+        )
+
+
+class Task(NamedTuple):
+    """Constants of the compiled loops: cloud, steps and samples.
+
+    The cloud starts with a FWHM of `cloud_fwhm_mm`; see `cpunet.simulation.drift` for
+    `diffusion` and `repulsion_per_kev`. Its duration is a number of `whole_steps` in siggen.
+    A step of the drift lasts `step_ns` and replaces `stride` time steps; `per_sample` is the
+    number of steps of the drift per sample.
+    """
+
+    cloud_fwhm_mm: float
+    diffusion: float
+    repulsion_per_kev: float
+    whole_steps: bool
+    step_ns: float
+    stride: int
+    per_sample: int
+    n_samples: int
+
+
+class Simulator:
+    r"""Simulates the pulses of a detector; its fields are prepared only once.
+
+    An electron and a hole drift from the same point in explicit steps. By the Shockley-Ramo
+    theorem the induced charge, in units of the charge of the hit, is the difference of the
+    weighting potential :math:`\phi_w` between hole and electron,
+
+    .. math:: S(t) = \phi_w(\mathbf{x}_h(t)) - \phi_w(\mathbf{x}_e(t)).
+
+    The pulse is convolved with a Gaussian as long as the charge cloud takes to enter the
+    contact, and averaged over each sample. Hits are simulated in parallel.
+
+    Parameters
+    ----------
+    detector
+        Detector, at its bias and temperature.
+    settings
+        Simulation settings.
+    fields
+        Field maps of the detector, where they are at hand.
+    stride
+        Number of time steps that a step of the drift replaces, a divisor of those per sample.
+
+    Raises
+    ------
+    CpunetError
+        If the detector is not fully depleted, or its grid is too fine.
+
+    References
+    ----------
+    Z. He, NIM A 463 (2001) 250 (Shockley-Ramo); D. C. Radford, siggen.
+
+    Examples
+    --------
+    In a planar detector of thickness :math:`d` the pulse rises by :math:`(v_e + v_h)/d`.
+
+    >>> from types import SimpleNamespace
+    >>> from cpunet.simulation.geometry_readers import read_detector
+    >>> from cpunet.simulation.velocity import carrier_velocity, velocity_table
+    >>> height = np.tile(np.arange(11.0), (11, 1))  # z in mm
+    >>> planar = SimpleNamespace(
+    ...     grid_mm=1.0, potential_V=100 * height, weighting_potential=1 - height / 10,
+    ...     e_r_V_per_cm=0 * height, e_z_V_per_cm=0 * height - 1000,
+    ...     region=np.full((11, 11), 2, np.int8))
+    >>> point = SimulationSettings(dt_ns=1, length_ns=200, diffusion=False, cloud_fwhm_mm=0)
+    >>> simulator = Simulator(read_detector("icpc"), point, fields=planar)  # at 90 K
+    >>> pulse = simulator.signals(0.0, 0.0, [5.0], 100.0).waveforms[0]
+    >>> v_e, v_h = (
+    ...     abs(carrier_velocity(*velocity_table(90), carrier, 0.0, 0.0, -1000.0)[2])
+    ...     for carrier in (ELECTRON, HOLE))
+    >>> bool(abs(pulse[20] - 20 * (v_e + v_h) / 10) < 1e-3), round(float(pulse[-1]), 3)
+    (True, 1.0)
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        settings: SimulationSettings,
+        *,
+        fields: FieldMaps | None = None,
+        stride: int = 1,
+    ) -> None:
+        if fields is None:
+            with stage(f"Fields of {detector.name or 'the detector'}"):
+                fields = compute_fields(detector)
+        self.detector, self.settings, self.fields = detector, settings, fields
+        self._maps = drift_maps(fields, detector.temperature_K, settings)
+        constant = diffusion_constant(settings.diffusion_constant, detector.temperature_K)
+        growing = settings.diffusion or settings.self_repulsion > 0
+        self._task = Task(
+            cloud_fwhm_mm=max(settings.cloud_fwhm_mm, SMALLEST_FWHM_MM if growing else 0.0),
+            diffusion=constant if settings.diffusion else 0.0,
+            repulsion_per_kev=repulsion_constant(1.0) * settings.self_repulsion,
+            whole_steps=settings.diffusion_constant == "siggen",
+            step_ns=stride * settings.step_ns,
+            stride=stride,
+            per_sample=settings.steps_per_sample // stride,
+            n_samples=settings.n_samples,
+        )
+
+    def signals(
+        self,
+        x_mm: npt.ArrayLike,
+        y_mm: npt.ArrayLike,
+        z_mm: npt.ArrayLike,
+        edep_kev: npt.ArrayLike,
+    ) -> Signals:
+        """Pulse of each hit.
+
+        Parameters
+        ----------
+        x_mm, y_mm, z_mm
+            Positions of the hits in mm in the frame of the crystal.
+        edep_kev
+            Energies of the hits in keV. They affect only the self-repulsion of the cloud.
+
+        Raises
+        ------
+        CpunetError
+            If a coordinate or an energy is not finite.
+        """
+        hits = _table(x_mm, y_mm, z_mm, edep_kev)
+        waveforms, facts = self._summed(hits, np.arange(len(hits) + 1), weighted=False)
+        return Signals(
+            waveforms=waveforms,
+            dt_ns=self.settings.dt_ns,
+            valid=np.isfinite(facts[:, 0]),
+            collected=facts[:, 1] == 1.0,
+            collection_time_ns=facts[:, 0] * self._task.step_ns,
+            cloud_fwhm_ns=facts[:, 2] * self._task.step_ns,
+            trapped=facts[:, 3],
+        )
+
+    def events(self, hits: Hits) -> EventPulses:
+        r"""Pulse of each event.
+
+        It is the energy-weighted mean of the pulses :math:`S_i` of its hits,
+
+        .. math:: S = \frac{\sum_i E_i S_i}{\sum_i E_i (1 - t_i)},
+
+        over all hits with a signal, with the trapped fractions :math:`t_i`.
+
+        Raises
+        ------
+        CpunetError
+            If the position or energy of a hit is not finite.
+        """
+        table = _table(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
+        waveforms, facts = self._summed(table, hits.offsets, weighted=True)
+        valid = np.isfinite(facts[:, 0])
+        lost_kev, trapped_kev = (
+            np.bincount(hits.event_of_hit, part, len(hits)).astype(float)
+            for part in (
+                np.where(valid, 0.0, hits.edep_kev),
+                np.where(valid, hits.edep_kev * facts[:, 3], 0.0),
+            )
+        )
+        return EventPulses(
+            waveforms=waveforms,
+            dt_ns=self.settings.dt_ns,
+            hits=hits,
+            valid=valid,
+            collected=facts[:, 1] == 1.0,
+            lost_kev=lost_kev,
+            trapped_kev=trapped_kev,
+        )
+
+    def blocks(self, source: OpenHits, title: str) -> Iterator[tuple[int, EventPulses]]:
+        """Pulses of the events of a source, block by block, shown under a `title`.
+
+        Hits are merged within `SimulationSettings.cluster_mm`; their number before comes with
+        each block.
+        """
+        with stage(title, source.n_events) as bar:
+            for hits in source.blocks:
+                distance = 0.0 if source.merged else self.settings.cluster_mm
+                yield len(hits.edep_kev), self.events(merge_hits(hits, self.detector, distance))
+                bar.update(len(hits))
+
+    def paths(
+        self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """Trajectories of both carriers from each starting point in mm.
+
+        Returns
+        -------
+        electrons, holes
+            Positions (n, steps, 3) in mm at each step; NaN after collection.
+        """
+        start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
+        start = start.reshape(-1, 3)
+        paths = np.full((2, len(start), self.settings.n_steps, 3), np.nan)
+        _fill_paths(self._maps, start, self.settings.step_ns, paths)
+        return paths[ELECTRON], paths[HOLE]
+
+    def _summed(
+        self, hits: FloatArray, offsets: npt.NDArray[np.int64], *, weighted: bool
+    ) -> tuple[npt.NDArray[np.float32], FloatArray]:
+        waveforms = np.zeros((len(offsets) - 1, self.settings.n_samples), np.float32)
+        facts = np.full((len(hits), 4), np.nan)
+        _sum_events(self._maps, hits, offsets, self._task, weighted, waveforms, facts)
+        return waveforms, facts
+
+
+def _table(
+    x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike, edep_kev: npt.ArrayLike
+) -> FloatArray:
+    """Hits as rows x, y, z (mm), energy (keV)."""
+    columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
+    table = np.ascontiguousarray(np.stack(columns, axis=-1), dtype=np.float64).reshape(-1, 4)
+    near = (np.abs(table[:, :3]) <= FARTHEST_MM).all(1)  # NaN is not
+    bad = np.flatnonzero(~(near & np.isfinite(table[:, 3])))
+    if len(bad):
+        raise CpunetError(f"hits: hit {bad[0]}: no finite place or energy; leave it out")
+    return table
+
+
+@kernel(parallel=True)
+def _sum_events(
+    maps: DriftMaps,
+    hits: FloatArray,
+    offsets: npt.NDArray[np.int64],
+    task: Task,
+    weighted: bool,
+    waveforms: npt.NDArray[np.float32],
+    facts: FloatArray,
+) -> None:
+    """Fill the pulses of events, and the facts of hits with a signal (see `_add_pulse`).
+
+    Pulses are means weighted by energy, or sums unless `weighted`.
+    """
+    n_events, n_samples = waveforms.shape
+    # work arrays are shared by a chunk of events
+    for chunk in prange((n_events + _CHUNK - 1) // _CHUNK):
+        out = np.empty(n_samples)
+        signal = np.empty(n_samples * task.per_sample)
+        for event in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n_events)):
+            out[:] = 0.0
+            collected = trapped = 0.0
+            for i in range(offsets[event], offsets[event + 1]):
+                hit = hits[i]
+                if in_active_volume(maps, hit[0], hit[1], hit[2]):
+                    _add_pulse(
+                        maps, hit, task, hit[3] if weighted else 1.0, signal, out, facts[i]
+                    )
+                    collected += hit[3]
+                    trapped += hit[3] * facts[i, 3]
+            scale = collected - trapped if weighted else 1.0
+            if scale > 0.0:
+                for j in range(n_samples):
+                    waveforms[event, j] = out[j] / scale
+
+
+@kernel
+def _add_pulse(
+    maps: DriftMaps,
+    hit: FloatArray,
+    task: Task,
+    weight: float,
+    signal: FloatArray,
+    out: FloatArray,
+    facts: FloatArray,
+) -> None:
+    """Add `weight` times the pulse of a hit to `out`; `signal` is an array to work in.
+
+    The facts are the last step, whether all charge is collected, the FWHM in steps of the
+    smearing by the cloud, and the fraction trapped.
+    """
+    signal[:] = 0.0
+    start, no_path = (hit[0], hit[1], hit[2]), np.empty((0, 3))
+    growing = (task.cloud_fwhm_mm, task.diffusion, task.repulsion_per_kev * hit[3])
+    steps_e, arrived_e, _, _, trapped_e = drift(
+        maps, ELECTRON, start, task.step_ns, task.stride, _POINT, signal, no_path
+    )
+    steps_h, arrived_h, size, speed, trapped_h = drift(
+        maps, HOLE, start, task.step_ns, task.stride, growing, signal, no_path
+    )
+    fwhm = 0.0
+    if size > 0.0 and speed > 0.0:
+        fwhm = size / (speed * task.step_ns)
+        if task.whole_steps:
+            fwhm = float(int(1.5 + fwhm))
+            fwhm = fwhm if fwhm > 1.0 else 0.0
+    if task.stride > 1:  # means over the time steps that a step of the drift replaces
+        later = (task.stride - 1) / (2 * task.stride)
+        for i in range(len(signal) - 1):
+            signal[i] += later * (signal[i + 1] - signal[i])
+    last = max(steps_e, steps_h)
+    smear_and_sample(signal, task.per_sample, fwhm / FWHM_PER_SIGMA, last, weight, out)
+    facts[0], facts[1] = last, 1.0 if arrived_e and arrived_h else 0.0
+    facts[2], facts[3] = fwhm, trapped_e + trapped_h
+
+
+@kernel
+def _fill_paths(maps: DriftMaps, start: FloatArray, step_ns: float, paths: FloatArray) -> None:
+    signal = np.zeros(paths.shape[2])
+    for i in range(len(start)):
+        here = (start[i, 0], start[i, 1], start[i, 2])
+        if in_active_volume(maps, here[0], here[1], here[2]):
+            for carrier in range(2):
+                drift(maps, carrier, here, step_ns, 1, _POINT, signal, paths[carrier, i])
