@@ -30,7 +30,7 @@ def main() -> None:
                 settings = SimulationSettings(
                     dt_ns=dt, length_ns=4000, diffusion_constant=constant
                 )
-                pulses = Simulator(detector, settings, fields=fields).signals(*places, 1592.0)
+                pulses = Simulator(detector, settings, fields=fields).signals(x, y, z, 1592.0)
                 rises = np.diff(pulses.waveforms[pulses.valid], prepend=0)
                 largest[constant] = rises.max(axis=1)
                 duration[constant] = np.median(pulses.cloud_fwhm_ns[pulses.valid])

@@ -14,7 +14,7 @@ where the measured spectrum does not exceed its statistical error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -125,15 +125,20 @@ def superpulses(spectra: Spectrum, steps: Values, groups: Groups) -> Superpulses
     groups
         Rows of each slice.
     """
-    half_times = crossing(steps, 0.5)
-    turn = 2j * np.pi * scipy.fft.rfftfreq(steps.shape[1])
     means = np.empty((len(groups), spectra.shape[1]), complex)
     error = np.empty(means.shape)
-    for k, rows in enumerate(groups):
-        moved = spectra[rows] * np.exp(half_times[rows, np.newaxis] * turn)
+    for k, moved in enumerate(_aligned(spectra, steps, groups)):
         means[k] = moved.mean(axis=0)
-        error[k] = moved.var(axis=0) / max(1, len(rows) - 1)
+        error[k] = moved.var(axis=0) / max(1, len(moved) - 1)
     return Superpulses(means, error)
+
+
+def _aligned(spectra: Spectrum, steps: Values, groups: Groups) -> Iterator[Spectrum]:
+    """Current spectra of each slice, with the half maximum of each pulse at sample 0."""
+    half_times = crossing(steps, 0.5)
+    turn = 2j * np.pi * scipy.fft.rfftfreq(steps.shape[1])
+    for rows in groups:
+        yield spectra[rows] * np.exp(half_times[rows, np.newaxis] * turn)
 
 
 # maximum number of pulses of either dataset in the fit of sigma and tau, and its iterations,
@@ -290,8 +295,8 @@ def _gauss_exp(length: int, dt_ns: float, values: Values) -> Spectrum:
 def _mean_currents(spectra: Spectrum, groups: Groups, length: int, edge: int) -> Values:
     """Superpulses of currents around the half maximum, shape ``(slices, 2 * edge)``."""
     steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
-    means = superpulses(spectra, steps, groups)
-    around = np.roll(scipy.fft.irfft(means.spectra, length, axis=1), edge, axis=1)
+    means = [moved.mean(axis=0) for moved in _aligned(spectra, steps, groups)]
+    around = np.roll(scipy.fft.irfft(np.array(means), length, axis=1), edge, axis=1)
     return np.asarray(around[:, : 2 * edge], float)
 
 

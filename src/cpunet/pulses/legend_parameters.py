@@ -6,6 +6,12 @@ a channel; pulses that do not decay are not corrected.  The height is that of a 
 
 from __future__ import annotations
 
+import sys
+from functools import cache
+from importlib.util import find_spec, module_from_spec
+from threading import Lock
+from typing import Any
+
 import numpy as np
 from scipy.signal import fftconvolve
 
@@ -14,6 +20,7 @@ from cpunet.pulses.parameters import Values
 # Rise and flat top of the trapezoid, and times over which charge is compared with that later.
 TRAP_NS, LATE_NS, EFFECTIVE_NS = 2000.0, 2000.0, 3000.0
 T0_RISE_NS, T0_FALL_NS = 128.0, 2000.0  # of the filter that finds the begin of a pulse
+_IMPORT = Lock()
 SILENT = 1e-4  # heights: noise of pulses without any
 FRACTIONS = {"tp_99": 0.99, "tp_90": 0.9, "tp_80": 0.8, "tp_50": 0.5, "tp_10": 0.1}
 
@@ -43,11 +50,8 @@ def legend_parameters(
     aligned
         Sample from which times count.
     """
-    # imported late: dspeed compiles them on first use
-    from dspeed.processors.pole_zero import pole_zero
-    from dspeed.processors.time_point_thresh import interpolated_time_point_thresh
-    from dspeed.processors.trap_filters import trap_norm, trap_pickoff
-
+    with _IMPORT:
+        pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff = _processors()
     corrected = np.asarray(waveforms, float)
     if np.isfinite(decay_ns):
         corrected = pole_zero(corrected, decay_ns / dt_ns)
@@ -83,3 +87,19 @@ def legend_parameters(
     times = {name: (time - aligned) * dt_ns for name, time in times.items()}
     times["rise_time"] = times["tp_90"] - times.pop("tp_10")
     return times | areas
+
+
+@cache
+def _processors() -> tuple[Any, ...]:
+    """Dspeed's processors, without its reading of files, which takes seconds to import."""
+    bare = "dspeed" not in sys.modules
+    if bare and (spec := find_spec("dspeed")) is not None:
+        sys.modules["dspeed"] = module_from_spec(spec)  # its folder alone, nothing is run
+    try:
+        from dspeed.processors.pole_zero import pole_zero
+        from dspeed.processors.time_point_thresh import interpolated_time_point_thresh
+        from dspeed.processors.trap_filters import trap_norm, trap_pickoff
+    finally:
+        for name in [m for m in sys.modules if bare and m.partition(".")[0] == "dspeed"]:
+            del sys.modules[name]
+    return pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff

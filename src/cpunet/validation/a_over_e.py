@@ -429,13 +429,16 @@ def null_spread(
     unit = [np.median(v) for v in sets[0]]
     pooled = [np.concatenate([v / u for v, u in zip(both, unit, strict=True)]) for both in sets]
     sizes = [both[0].size for both in sets]
-    found = np.empty((NULLS, 2))
-    for kept in found:
-        drawn = [np.split(rng.permutation(v), [n]) for v, n in zip(pooled, sizes, strict=True)]
-        for side, (single, some) in enumerate(zip(*drawn, strict=True)):
-            cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
-            kept[side] = 100 * (some >= cut).mean()
-    return float(np.diff(found, axis=1).std(ddof=1))
+    drawn = [[rng.permutation(v) for v in pooled] for _ in range(NULLS)]
+    divided = [
+        np.split(np.array(column), [n], axis=1)
+        for column, n in zip(zip(*drawn, strict=True), sizes, strict=True)
+    ]
+    survival = []
+    for single, some in zip(*divided, strict=True):
+        cut = np.quantile(single, 1 - ACCEPTANCE, axis=1, keepdims=True, method="weibull")
+        survival.append(100 * (some >= cut).mean(axis=1))
+    return float((survival[1] - survival[0]).std(ddof=1))
 
 
 def _against_data(
