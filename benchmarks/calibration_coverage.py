@@ -5,7 +5,7 @@
 
 Each stand has independent events of both sides, and the true values of a group of parameters,
 the free ones of its fit, drawn from their priors.  If priors and errors are right, the pulls
-(found - true) / error of every parameter have mean 0 and width 1, also where the prior knows
+(fitted - true) / error of every parameter have mean 0 and width 1, also where the prior knows
 more than the pulses.  Each result is appended to the file at once; a stand whose result it
 holds is not made again, so that the benchmark can be stopped, resumed and run in parts
 (``--groups 1 2``).
@@ -67,8 +67,8 @@ def main() -> None:
     parser.add_argument("--detector", default="ppc")
     parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
-    found = _stored(arguments.results)
-    done = {(one["group"], one["seed"]) for one in found}
+    results = _stored(arguments.results)
+    done = {(one["group"], one["seed"]) for one in results}
     for seed in range(1, arguments.stands + 1):
         for group in arguments.groups:
             if (group, seed) in done:
@@ -78,11 +78,11 @@ def main() -> None:
             )
             with arguments.results.open("a") as file:
                 file.write(json.dumps(result) + "\n")
-            found.append(result)
-            told = "  ".join(f"{n} {_pull(v):+.2f}" for n, v in result["parameters"].items())
+            results.append(result)
+            pulls = "  ".join(f"{n} {_pull(v):+.2f}" for n, v in result["parameters"].items())
             about = f"{result['chi_square']:.2f}  {result['seconds']:3.0f} s"
-            print(f"group {group}, stand {seed:2d}  {about}  {told}", flush=True)
-    _tell(found, arguments.figure)
+            print(f"group {group}, stand {seed:2d}  {about}  {pulls}", flush=True)
+    _print(results, arguments.figure)
 
 
 def experiment(
@@ -183,11 +183,11 @@ def _pull(one: dict[str, float]) -> float:
     return (one["found"] - one["true"]) / one["error"]
 
 
-def _tell(found: list[dict[str, Any]], figure: Path | None) -> None:
+def _print(results: list[dict[str, Any]], figure: Path | None) -> None:
     """Print mean and width of the pulls of each parameter."""
     pulls: dict[str, list[float]] = {}
     known: dict[str, list[float]] = {}
-    for one in found:
+    for one in results:
         for name, values in one["parameters"].items():
             pulls.setdefault(name, []).append(_pull(values))
             known.setdefault(name, []).append(values["error"] / values["prior"])

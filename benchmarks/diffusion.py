@@ -34,8 +34,8 @@ def main() -> None:
                 rises = np.diff(pulses.waveforms[pulses.valid], prepend=0)
                 largest[constant] = rises.max(axis=1)
                 duration[constant] = np.median(pulses.cloud_fwhm_ns[pulses.valid])
-            told = ", ".join(f"{c} {duration[c]:.1f} ns" for c in CONSTANTS)
-            print(f"{name}, samples of {dt} ns: median duration of the cloud: {told}")
+            durations = ", ".join(f"{c} {duration[c]:.1f} ns" for c in CONSTANTS)
+            print(f"{name}, samples of {dt} ns: median duration of the cloud: {durations}")
             for constant in CONSTANTS[::2]:
                 change = largest[constant] / largest[0.12] - 1
                 low, middle, high = np.quantile(change, [0.05, 0.5, 0.95])

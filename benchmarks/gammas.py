@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def compare(height_mm: float, expected: tuple[float, ...]) -> None:
-    found, gammas, hit = np.zeros(len(LINES_KEV)), 0, 0
+    counts, gammas, hit = np.zeros(len(LINES_KEV)), 0, 0
     for seed in range(4):
         hits, n_primaries = simulate_gammas(
             CRYSTAL,
@@ -75,10 +75,10 @@ def compare(height_mm: float, expected: tuple[float, ...]) -> None:
         gammas += n_primaries
         hit += len(hits)
         kev = hits.energy_kev
-        found += [(np.abs(kev - line) < 1).sum() for line in LINES_KEV]
+        counts += [(np.abs(kev - line) < 1).sum() for line in LINES_KEV]
     print(f"source {height_mm:.0f} mm above, of Geant4's: hit", end=" ")
     print(f"{hit / gammas / expected[0]:.3f}", end="")
-    for line, n, share in zip(LINES_KEV, found, expected[1:], strict=True):
+    for line, n, share in zip(LINES_KEV, counts, expected[1:], strict=True):
         ratio = n / gammas / share
         print(f", {line:.0f} keV {ratio:.3f} ± {ratio / n**0.5:.3f}", end="")
     print()

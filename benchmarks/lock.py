@@ -27,9 +27,9 @@ def main() -> None:
         words = ["install", "--quiet", "--dry-run", "--ignore-installed", "--report", report]
         words += ["-c", "constraints.txt", "."]
         subprocess.run([sys.executable, "-m", "pip", *map(str, words)], check=True)
-        found = json.loads(report.read_text())["install"]
+        packages = json.loads(report.read_text())["install"]
     lines = []
-    for item in found:
+    for item in packages:
         digest = item["download_info"].get("archive_info", {}).get("hashes", {}).get("sha256")
         if digest is not None:  # this package itself has none
             name, version = item["metadata"]["name"], item["metadata"]["version"]

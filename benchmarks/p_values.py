@@ -26,7 +26,7 @@ ALARM = 0.0027
 
 def p_values(folder: Path, stands: int) -> dict[str, dict[str, list[float]]]:
     """P-values by method and quantity; those of finished stands are read."""
-    found: dict[str, dict[str, list[float]]] = {}
+    collected: dict[str, dict[str, list[float]]] = {}
     for seed in range(stands):
         file = folder / f"{seed}.json"
         if not file.exists():
@@ -45,8 +45,10 @@ def p_values(folder: Path, stands: int) -> dict[str, dict[str, list[float]]]:
                 for name, verdict in method_verdicts(metrics, peak, method).items():
                     if verdict.p is not None:
                         of_peak = f"{peak} {name.replace('_', ' ')}"
-                        found.setdefault(method, {}).setdefault(of_peak, []).append(verdict.p)
-    return found
+                        collected.setdefault(method, {}).setdefault(of_peak, []).append(
+                            verdict.p
+                        )
+    return collected
 
 
 def main() -> None:

@@ -76,10 +76,10 @@ def main() -> None:
             )
             change.append(moments(events.waveforms[kept], 4) - first[mode])
         exact, error = change[0], change[1] / change[0] - 1
-        told = ", ".join(
+        changes = ", ".join(
             f"{e:+.2e} ({100 * d:+.1f} %)" for e, d in zip(exact, error, strict=True)
         )
-        print(f"{next(iter(values))} {next(iter(values.values())):g}: {told}")
+        print(f"{next(iter(values))} {next(iter(values.values())):g}: {changes}")
 
 
 if __name__ == "__main__":

@@ -51,8 +51,8 @@ def one_seed(
             evaluate(run, *files, truth=known, baselines=False, seed=seed + FAR * draw).metrics
             for draw in range(draws)
         ]
-    found = [numbers(metrics) for metrics in drawn]
-    means = {name: float(np.mean([one[name] for one in found])) for name in found[0]}
+    draws_of = [numbers(metrics) for metrics in drawn]
+    means = {name: float(np.mean([of[name] for of in draws_of])) for name in draws_of[0]}
     width = getattr(run.recipe.generator, "width", None)
     about = dict(zip(ABOUT, (recipe, run.data.used, width, seed), strict=True))
     return about | {"seconds": run.seconds, "cpu": cpu} | means
@@ -60,21 +60,21 @@ def one_seed(
 
 def numbers(metrics: dict[str, Any]) -> dict[str, float]:
     """Scores by peak and name."""
-    found = {}
+    values = {}
     for peak in PEAKS:
         scores = metrics["peaks"][peak]
         for name, compared in scores["parameters"].items():
             iou = compared["iou"]
-            found[f"{peak} {name}"] = iou["ren"]
-            found |= {
-                f"{peak} {name} / ceiling{told}": iou[method] / iou["ceiling"]
-                for method, told in (("ren", ""), ("truth", " of truth"))
+            values[f"{peak} {name}"] = iou["ren"]
+            values |= {
+                f"{peak} {name} / ceiling{of}": iou[method] / iou["ceiling"]
+                for method, of in (("ren", ""), ("truth", " of truth"))
                 if method in iou
             }
-        found[f"{peak} AUC"] = scores["two_sample"]["ren"]["auc"]
+        values[f"{peak} AUC"] = scores["two_sample"]["ren"]["auc"]
         if "paired" in scores:
-            found[f"{peak} edge RMSE"] = scores["paired"]["ren"]["edge_rmse"]
-    return found
+            values[f"{peak} edge RMSE"] = scores["paired"]["ren"]["edge_rmse"]
+    return values
 
 
 def summary(runs: list[dict[str, Any]]) -> str:
@@ -107,10 +107,10 @@ def main() -> None:
         if file.exists():
             continue
         sim = given.sim or given.stand
-        found = one_seed(sim, given.stand, given.recipe, given.overrides, seed, given.draws)
+        values = one_seed(sim, given.stand, given.recipe, given.overrides, seed, given.draws)
         with written_aside(file) as aside:
-            aside.write_text(json.dumps(found, indent=1) + "\n")
-        print(f"seed {seed}: {found['seconds']:.0f} s", flush=True)
+            aside.write_text(json.dumps(values, indent=1) + "\n")
+        print(f"seed {seed}: {values['seconds']:.0f} s", flush=True)
     print(f"{given.recipe} on {given.stand.name}, {given.seeds} seeds")
     print(summary([json.loads(file.read_text()) for file in files]))
 

@@ -50,18 +50,18 @@ class Slopes:
     def of(cls, raw: Pulses, tails: PileUpTails) -> Slopes:
         """Slopes of the raw traces whose tails can be estimated."""
         kev = tails.measure(raw)
-        told = np.isfinite(kev)
+        determined = np.isfinite(kev)
         flat = _subtracted(raw, tails)
         before, after = (
             read_baselines(
-                traces.waveforms[told, : tails.samples].astype(float),
+                traces.waveforms[determined, : tails.samples].astype(float),
                 tails.dt_ns,
                 tails.decay_us,
             )[1]
             / tails.adc_per_kev
             for traces in (raw, flat)
         )
-        return cls(before, after, np.abs(kev[told]) < EMPTY * tails.error_kev)
+        return cls(before, after, np.abs(kev[determined]) < EMPTY * tails.error_kev)
 
     @property
     def spreads(self) -> tuple[float, float]:

@@ -85,10 +85,10 @@ def main() -> None:
                 [*command, "--recipe", recipe, *files, "--out", str(out), *words], check=True
             )
             seconds = time.perf_counter() - begin
-            told = json.loads((out / "run.json").read_text())
+            run = json.loads((out / "run.json").read_text())
             print(
-                f"{recipe}: {told['sim']['used']:,} simulated pulses, "
-                f"peak {told['peak_memory_mb']['host'] / 1024:.1f} GB, {seconds:.0f} s",
+                f"{recipe}: {run['sim']['used']:,} simulated pulses, "
+                f"peak {run['peak_memory_mb']['host'] / 1024:.1f} GB, {seconds:.0f} s",
                 flush=True,
             )
 

@@ -96,12 +96,12 @@ def main() -> None:
     metrics = evaluate(run, *files, truth=truth, baselines=False).metrics
     print(f"width {given.width}, dropout {given.dropout}, {given.steps} steps")
     for name, scores in metrics["peaks"].items():
-        told = [
+        overlaps = [
             f"{parameter} {compared['iou']['ren']:.1f}"
             for parameter, compared in scores["parameters"].items()
         ]
         auc, edge = scores["two_sample"]["ren"]["auc"], scores["paired"]["ren"]["edge_rmse"]
-        print(f"{name}: {', '.join(told)}, AUC {auc:.2f}, edge RMSE {1e3 * edge:.2f}e-3")
+        print(f"{name}: {', '.join(overlaps)}, AUC {auc:.2f}, edge RMSE {1e3 * edge:.2f}e-3")
 
 
 if __name__ == "__main__":

@@ -160,11 +160,11 @@ def test_a_dry_run_of_seeds(place):
     assert jobs["train_seed"] == jobs["validate_seed"] == 2 * 2
     assert jobs["compare_seeds"] == 2  # one for each detector
     assert "train" not in jobs
-    told = " ".join(done.stdout.split())
+    printed = " ".join(done.stdout.split())
     seeds = "'all results/V01/p03/seeds/"
-    assert re.search(rf"--seed=7 [^|]*--out {seeds}7/run'", told)
-    assert f"cpunet validate {seeds}7/run'" in told
-    assert f"cpunet compare {seeds}0/report' {seeds}7/report' --out" in told
+    assert re.search(rf"--seed=7 [^|]*--out {seeds}7/run'", printed)
+    assert f"cpunet validate {seeds}7/run'" in printed
+    assert f"cpunet compare {seeds}0/report' {seeds}7/report' --out" in printed
 
 
 def whole_chain() -> dict[str, Any]:
@@ -205,16 +205,16 @@ def test_a_dry_run_of_libraries_and_events(place):
     assert jobs["event_pulses"] == 2 * 2
     assert jobs["event_raw"] == jobs["event_parameters"] == 3 * 2
     assert "calibrate" not in jobs
-    told = " ".join(done.stdout.split())
+    printed = " ".join(done.stdout.split())
     made = "'all results/V01/events/pulses/two.lh5'"
     assert (
         "cpunet simulate --detector=icpc --hits stp/two.lh5 --hits-detector det001 --out "
-        f"{made}" in told
+        f"{made}" in printed
     )
-    assert "--adc --length=2000 --out-table V01/raw --seed 1 --out" in told
-    assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in told
-    assert "library make --detector=icpc --grid-mm 2 --set=dt_ns=2 --out" in told
-    assert "'all results/V01/library/ideal.lh5' --detector=V01 --out" in told
+    assert "--adc --length=2000 --out-table V01/raw --seed 1 --out" in printed
+    assert "--table V01/raw --run 'all results/V01/p03/run' --tau-us=400" in printed
+    assert "library make --detector=icpc --grid-mm 2 --set=dt_ns=2 --out" in printed
+    assert "'all results/V01/library/ideal.lh5' --detector=V01 --out" in printed
 
 
 @pytest.mark.thorough
@@ -233,13 +233,13 @@ def test_a_dry_run_with_calibrations(place):
     assert "train" not in jobs
     assert jobs["calibrate"] == jobs["ideal_library"] == 3  # physics are those of a period
     assert jobs["event_pulses"] == 3 * 2
-    told = " ".join(done.stdout.split())
+    printed = " ".join(done.stdout.split())
     words = "--free=temperature '--prior=depletion_voltage=2100±50' --events=500"
-    assert words in told.replace("--prior='depletion", "'--prior=depletion")
+    assert words in printed.replace("--prior='depletion", "'--prior=depletion")
     run = "'all results/V01/p03/run/"
-    assert f"--detector={run}detector.yaml' --set={run}settings.yaml' --hits" in told
-    assert f"library make --detector={run}detector.yaml' --grid-mm 2" in told
-    assert "--data-table=ch1/raw" in told
+    assert f"--detector={run}detector.yaml' --set={run}settings.yaml' --hits" in printed
+    assert f"library make --detector={run}detector.yaml' --grid-mm 2" in printed
+    assert "--data-table=ch1/raw" in printed
 
 
 def words_of(calls: list[list[str]], command: str, detector: str) -> list[str]:
@@ -519,10 +519,10 @@ ORIGIN_M = {"V99000A": (0.1, 0.0, -0.2), "B99000A": (0.0, -0.1, 0.3)}
 
 def write_steps(path: Path, sims: dict[str, Path], events: slice) -> dict[str, Any]:
     """Hits of simulations as remage writes steps, each detector at a place of its own."""
-    kept: dict[str, Any] = {}
+    by_detector: dict[str, Any] = {}
     for name, sim in sims.items():
         hits = read_hits(sim)[events]
-        kept[name] = hits
+        by_detector[name] = hits
         origin = ORIGIN_M[name]
         steps = {
             "xloc": (1e-3 * hits.x_mm + origin[0], "m"),
@@ -543,7 +543,7 @@ def write_steps(path: Path, sims: dict[str, Path], events: slice) -> dict[str, A
             for axis, value in zip("xyz", origin, strict=True)
         }
         lh5.write(Struct(places), name, str(path), group="detector_origins", wo_mode="append")
-    return kept
+    return by_detector
 
 
 def snakemake(folder: Path, *words: str) -> str:
@@ -596,8 +596,8 @@ def test_two_detectors_end_to_end(reference_data, tmp_path):
     for name in DETECTORS:
         folder = results / name / "p03"
         assert f'href="{name}/p03/report/report.html"' in page
-        told = json.loads((folder / "run" / "calibration.json").read_text())
-        assert "temperature_K" in {**told["parameters"], **told["fixed"]}
+        calibration = json.loads((folder / "run" / "calibration.json").read_text())
+        assert "temperature_K" in {**calibration["parameters"], **calibration["fixed"]}
         require_library(folder / "library" / "current.lh5", name)
         for part, hits in given.items():
             require_parameters(folder / "events", name, part, hits[name])
@@ -609,29 +609,29 @@ def require_library(file: Path, name: str) -> None:
     """As reboost reads it."""
     utils = pytest.importorskip("reboost.hpge.utils")
     for angle in (0, 45):
-        found = utils.load_hpge_pulse_shape_library(
+        library = utils.load_hpge_pulse_shape_library(
             str(file), name, f"waveform_{angle:03d}_deg"
         )
-        there = np.isfinite(found.waveforms).all(axis=2)
-        assert there.any()
-        highest = found.t[found.waveforms[there].argmax(axis=1)]
+        inside = np.isfinite(library.waveforms).all(axis=2)
+        assert inside.any()
+        highest = library.t[library.waveforms[inside].argmax(axis=1)]
         assert (highest == 0).all()  # currents, aligned
 
 
 def require_parameters(folder: Path, name: str, part: str, hits: Any) -> None:
     """One row for each event that gave a signal, energies in proportion to the deposits."""
     raw = lh5.read(f"{name}/raw", str(folder / "raw" / f"{part}.lh5"))
-    found = lh5.read(f"{name}/dsp", str(folder / "dsp" / f"{part}.lh5"))
-    numbers = found["event_number"].nda
+    table = lh5.read(f"{name}/dsp", str(folder / "dsp" / f"{part}.lh5"))
+    numbers = table["event_number"].nda
     assert numbers.tolist() == raw["event_number"].nda.tolist()
     assert set(numbers) <= set(hits.event_number)
     assert len(numbers) > 0.7 * hits.n_events
-    good = (found["rejection"].nda == 0) & (found["energy"].nda > 300)
+    good = (table["rejection"].nda == 0) & (table["energy"].nda > 300)
     assert good.sum() > 0.5 * hits.n_events
-    gain = found["trapEmax"].nda[good] / found["energy"].nda[good]
+    gain = table["trapEmax"].nda[good] / table["energy"].nda[good]
     assert np.std(gain) < 0.01 * np.mean(gain)
-    assert np.isfinite(found["AoE"].nda[good]).all()
-    rise = found["tp_99"].nda[good] - found["tp_01"].nda[good]
+    assert np.isfinite(table["AoE"].nda[good]).all()
+    rise = table["tp_99"].nda[good] - table["tp_01"].nda[good]
     assert (rise > 0).all()
 
 
@@ -639,8 +639,8 @@ def require_resumed(folder: Path, results: Path) -> None:
     """What was lost is made again, and nothing else."""
     (results / "V99000A" / "p03" / "events" / "raw" / "two.lh5").unlink()
     (results / "V99000A" / "p03" / "events" / "dsp" / "two.lh5").unlink()
-    told = snakemake(folder, "parameters")
-    made = re.findall(r"^(?:local)?rule (\w+):", told, re.MULTILINE)
+    printed = snakemake(folder, "parameters")
+    made = re.findall(r"^(?:local)?rule (\w+):", printed, re.MULTILINE)
     assert sorted({*made} - {"parameters"}) == ["event_parameters", "event_raw"]
     assert len(made) <= 3
 

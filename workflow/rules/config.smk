@@ -65,8 +65,8 @@ def periods_of(config, detector):
     return config["detectors"][detector].get("periods", list(config["periods"]))
 
 
-def found(pattern, place, **names):
-    """Files of a pattern in the order of their names."""
+def matching(pattern, place, **names):
+    """Files that match a pattern, in the order of their names."""
     for name, value in names.items():
         pattern = pattern.replace(f"{{{name}}}", value)
     files = sorted(glob(pattern, recursive=True))
@@ -93,7 +93,7 @@ def simulations(detector):
     """Files of simulated pulses by name, whether given or to be made."""
     entry, place = DETECTORS[detector], f"detectors.{detector}"
     if "simulations" in entry:
-        files = found(entry["simulations"], f"{place}.simulations", detector=detector)
+        files = matching(entry["simulations"], f"{place}.simulations", detector=detector)
         return by_stem(files, f"{place}.simulations")
     if "hits" in entry["simulate"]:
         names = HITS[detector]
@@ -104,7 +104,7 @@ def simulations(detector):
 
 HITS = {
     name: by_stem(
-        found(entry["simulate"]["hits"], f"detectors.{name}.simulate.hits", detector=name),
+        matching(entry["simulate"]["hits"], f"detectors.{name}.simulate.hits", detector=name),
         f"detectors.{name}.simulate.hits",
     )
     for name, entry in DETECTORS.items()
@@ -112,11 +112,11 @@ HITS = {
 }
 SIMULATIONS = {name: simulations(name) for name in DETECTORS}
 DATA = {
-    (d, p): found(config["periods"][p]["data"], f"periods.{p}.data", detector=d, period=p)
+    (d, p): matching(config["periods"][p]["data"], f"periods.{p}.data", detector=d, period=p)
     for d, p in PAIRS
 }
 ENERGIES = {
-    (d, p): found(
+    (d, p): matching(
         config["periods"][p]["energies"], f"periods.{p}.energies", detector=d, period=p
     )
     for d, p in PAIRS
@@ -137,7 +137,7 @@ if "events" in config:
             "dspeed, or leave it out"
         )
     EVENTS = {
-        name: by_stem(found(config["events"]["hits"], "events.hits", detector=name), "events.hits")
+        name: by_stem(matching(config["events"]["hits"], "events.hits", detector=name), "events.hits")
         for name in DETECTORS
     }
 for (d, p), files in ENERGIES.items():
@@ -159,7 +159,7 @@ wildcard_constraints:
     seed="[0-9]+",
 
 
-# numba takes all cores of a node unless told
+# by itself numba takes all cores of a node
 environment = 'set -euo pipefail; export NUMBA_NUM_THREADS="$OMP_NUM_THREADS"; '
 if config["device"] == "cpu":  # for commands that take a GPU if there is one
     environment += "export CUDA_VISIBLE_DEVICES=; "
@@ -179,6 +179,6 @@ def options(**words):
             continue
         option = "--" + name.replace("_", "-")
         values = value if isinstance(value, list) else [value]
-        for one in values:
-            line.append(option if one is True else f"{option}={shlex.quote(str(one))}")
+        for value in values:
+            line.append(option if value is True else f"{option}={shlex.quote(str(value))}")
     return " ".join(line)
