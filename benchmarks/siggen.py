@@ -34,7 +34,6 @@ def stored_maps(folder: Path) -> FieldMaps:
             e_z_V_per_cm=maps["Ez_01"],
             weighting_potential=maps["WP_01"],
             region=maps["point_type"],
-            temperature_K=90.0,
             capacitance_pF=np.nan,
             depletion_V=np.nan,
         )
@@ -45,8 +44,8 @@ def compare(folder: Path, fields: FieldMaps) -> None:
         Simulator(read_detector("icpc"), settings, fields=fields) for settings in (PLAIN, CLOUD)
     )
     with np.load(folder / "waveforms_plain_A_outertaper_grid0.1.npz") as plain:
-        expected = plain["wf1"]
-        found = plain_drift.signals(*plain["positions"].T, 100.0).waveforms
+        expected, (x, y, z) = plain["wf1"], plain["positions"].T
+        found = plain_drift.signals(x, y, z, 100.0).waveforms
     worst = np.abs(found - expected).max(axis=1)
     rms = np.sqrt(np.mean((found - expected) ** 2, axis=1))
     late = np.subtract(*(np.argmax(w > 0.995, axis=1) for w in (found, expected)))
@@ -54,7 +53,8 @@ def compare(folder: Path, fields: FieldMaps) -> None:
     print(f", within 1e-3: {(worst < 1e-3).sum()}; RMS {rms.max():.1e} at most", end="")
     print(f"; collected {np.median(late):+.0f} ns later (median), {np.abs(late).max()} at most")
     with np.load(folder / "waveforms_diffusion_A_outertaper_grid0.1.npz") as cloud:
-        signals = with_cloud.signals(*cloud["positions"].T, 100.0)
+        x, y, z = cloud["positions"].T
+        signals = with_cloud.signals(x, y, z, 100.0)
         width = np.abs(signals.cloud_fwhm_ns / cloud["fwhm_steps"] - 1)
         rms = np.sqrt(np.mean((signals.waveforms - cloud["wf1"]) ** 2, axis=1))
     print(f"  cloud: width within 5 %: {(width < 0.05).sum()} of {len(width)}", end="")
