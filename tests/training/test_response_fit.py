@@ -15,8 +15,8 @@ from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
-from cpunet.training.chain_fit import POOR, Fitter, differences
-from cpunet.training.chain_parameters import STRETCH, SmoothParameters
+from cpunet.training.chain_fit import POOR, WIDE, Fitter, chi_square, differences, fit_chain
+from cpunet.training.chain_parameters import STRETCH, SmoothParameters, with_decay
 from cpunet.training.comparison import Difference
 from cpunet.training.joint import SEGMENTS, Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
@@ -230,6 +230,25 @@ def test_a_known_response_is_where_a_fit_starts(problem: Problem, near: Told) ->
     assert np.exp(known.log_decay_us[0]) == pytest.approx(300.0)
     assert found.describe()["decay_us"] == pytest.approx(80, rel=0.01)
     assert fit.steps < near.fit.steps
+
+
+def test_where_no_chain_is_near_a_fit_leads_no_farther_away(problem: Problem) -> None:
+    """Behind a wave of 1 MHz the joint comparison saturates, and its minimum is anywhere."""
+    time_ns = DT_NS * (np.arange(problem.data.waveforms.shape[1]) - 400)
+    wave = np.where((time_ns > 0) & (time_ns < 3000), np.sin(2e-3 * np.pi * time_ns), 0)
+    waveforms = problem.data.waveforms + np.float32(0.02) * wave.astype(np.float32)
+    sets = PulseSets(
+        problem.sim,
+        problem.data.with_waveforms(waveforms),
+        problem.noise,
+        RECIPE,
+        np.random.default_rng(0),
+    )
+    bands, start = sets.sides(), ElectronicsResponse(RECIPE.matching[0], DT_NS)
+    with_decay(start, sets.tail_slope)
+    before, _ = chi_square(start, bands, WIDE)
+    assert fit_chain(start, bands, Fitter(RECIPE.matching.training)).poor
+    assert chi_square(start, bands, WIDE)[0] < 1.01 * before
 
 
 def test_the_peak_of_single_sites_does_not_depend_on_the_mixture() -> None:

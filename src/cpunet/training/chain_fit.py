@@ -30,7 +30,7 @@ from cpunet.training.comparison import Comparison, Difference, Sides
 from cpunet.training.joint import Joint, SingleSites
 
 WIDER = (16.0, 4.0)  # functions with which the valley is searched
-WIDTH = 1.5  # of bounded functions in robust standard deviations
+WIDTH, WIDE = 1.5, 6.0  # of bounded functions in robust standard deviations, near and far
 # Expected fall of chi-square below which search and fit end.
 FALL, CONVERGED = 20.0, 0.1
 # A step that leads up is damped by this much of the information's diagonal, then by so many
@@ -129,6 +129,7 @@ def fit_chain(
         If no chi-square is finite.
     """
     parameters = SmoothParameters(response)
+    first = parameters.vector()
 
     def fitted(compared: list[Joint], fall: float) -> Fitted:
         evaluate = partial(_parabola, parameters, compared)
@@ -142,16 +143,26 @@ def fit_chain(
     for wider in WIDER if search else ():
         fitted([Joint(sides, wider, products=products) for sides in few], FALL)
     whole = [Joint(sides, products=products) for sides in bands]
-    return fitted([*whole, *map(SingleSites, single)], CONVERGED)
+    end = fitted([*whole, *map(SingleSites, single)], CONVERGED)
+    if search and end.poor:  # no chain is near, and what goes with the amplitude leads astray
+        reached, costs = parameters.vector(), []
+        for place in (first, reached):
+            parameters.set(place)
+            costs.append(chi_square(response, few, WIDE)[0])
+        if costs[0] < costs[1]:
+            parameters.set(first)
+    return end
 
 
-def chi_square(response: ElectronicsResponse, bands: Sequence[Sides]) -> tuple[float, float]:
+def chi_square(
+    response: ElectronicsResponse, bands: Sequence[Sides], width: float = WIDTH
+) -> tuple[float, float]:
     """Of `Comparison` for a response, and number of functions; both kinds of slices are of the
     same pulses, and each counts half.
     """
     compared = []
     for sides in bands:
-        comparison = Comparison(sides.entering(response), WIDTH)
+        comparison = Comparison(sides.entering(response), width)
         compared += comparison.differences(response.transfer(sides.padded))
     shares = [(0.5 if d.sliced else 1.0) * len(d.values) for d in compared]
     return sum(n * d.chi_square for n, d in zip(shares, compared, strict=True)), sum(shares)
