@@ -37,9 +37,9 @@ class DriftMaps(NamedTuple):
     """Field maps and velocities in the form the compiled loops take.
 
     ``values`` is (nr, nz, 4): field in r and z (V/cm), weighting potential, potential (V).
-    ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, ``ditch``
-    (nr, nz) the nodes that stop it. ``trapping_per_ns`` holds the trapping rates of electrons
-    and holes.
+    ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, ``ditch`` the
+    nodes of the ditch (nr, those up to its top). ``trapping_per_ns`` holds the trapping rates
+    of electrons and holes.
     """
 
     values: FloatArray
@@ -86,7 +86,7 @@ def drift_maps(
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,
-        ditch=ditch,
+        ditch=np.ascontiguousarray(ditch[:, : ditch.any(0).argmin()]),
         per_mm=parts / fields.grid_mm,
         bias_V=bias,
         coefficients=table.coefficients,
@@ -165,7 +165,7 @@ def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, f
         return 0.0, 0.0, 0.0, 0.0, False
     i, j = int(p), int(q)
     u, v = p - i, q - j
-    if not maps.usable[i, j] or maps.ditch[int(p + 0.5), int(q + 0.5)]:
+    if not maps.usable[i, j]:
         return 0.0, 0.0, 0.0, 0.0, False
     w00, w10, w01, w11 = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
     m00, m10 = maps.values[i, j], maps.values[i + 1, j]
@@ -177,8 +177,18 @@ def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, f
     return er, ez, min(max(wp, 0.0), 1.0), volts, True
 
 
+@kernel(inline="always")
+def in_ditch(maps: DriftMaps, x: float, y: float, z: float) -> bool:
+    """Whether a place within the maps is nearest to a node of the ditch."""
+    row = int(z * maps.per_mm + 0.5)
+    if row >= maps.ditch.shape[1]:
+        return False
+    column = int(math.sqrt(x * x + y * y) * maps.per_mm + 0.5)
+    return bool(column < len(maps.ditch) and maps.ditch[column, row])
+
+
 @kernel
 def in_active_volume(maps: DriftMaps, x: float, y: float, z: float) -> bool:
     """Whether a charge released here drifts: germanium with a field, outside contacts."""
     _, _, _, potential, usable = look_up(maps, math.hypot(x, y), z)
-    return usable and 0.0 < potential < maps.bias_V
+    return usable and 0.0 < potential < maps.bias_V and not in_ditch(maps, x, y, z)
