@@ -51,28 +51,38 @@ class Outline(NamedTuple):
         return cls(*(getattr(detector, name) for name in cls._fields))
 
 
-@kernel(error_model="numpy")
-def regions(outline: Outline, r: Array, z: Array) -> npt.NDArray[np.int8]:
+def regions(detector: Any, r: npt.ArrayLike, z: npt.ArrayLike) -> npt.NDArray[np.int8]:
     """See `Detector.region`."""
-    found = np.empty(len(r), np.int8)
+    r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
+    region = np.empty(r.shape, np.int8)
+    _fill_regions(Outline.of(detector), r.flatten(), z.flatten(), region.reshape(-1))
+    return region
+
+
+def insides(detector: Any, r: npt.ArrayLike, z: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """See `Detector.inside`."""
+    r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
+    inside = np.empty(r.shape, np.bool_)
+    _fill_insides(Outline.of(detector), r.flatten(), z.flatten(), inside.reshape(-1))
+    return inside
+
+
+@kernel(error_model="numpy")
+def _fill_regions(outline: Outline, r: Array, z: Array, region: npt.NDArray[np.int8]) -> None:
     radius, length = outline.point_contact_radius, outline.point_contact_length
     for i in range(len(r)):
         if r[i] <= radius + _TOLERANCE and z[i] <= length + _TOLERANCE:
-            found[i] = POINT_CONTACT
+            region[i] = POINT_CONTACT
         elif not _within(outline, r[i], z[i], outline.li_thickness + _TOLERANCE, -_TOLERANCE):
-            found[i] = LI_CONTACT
+            region[i] = LI_CONTACT
         else:
-            found[i] = DITCH if _in_ditch(outline, r[i], z[i], _TOLERANCE) else GERMANIUM
-    return found
+            region[i] = DITCH if _in_ditch(outline, r[i], z[i], _TOLERANCE) else GERMANIUM
 
 
 @kernel(error_model="numpy")
-def insides(outline: Outline, r: Array, z: Array) -> npt.NDArray[np.bool_]:
-    """See `Detector.inside`."""
-    found = np.empty(len(r), np.bool_)
+def _fill_insides(outline: Outline, r: Array, z: Array, inside: npt.NDArray[np.bool_]) -> None:
     for i in range(len(r)):
-        found[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
-    return found
+        inside[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
 
 
 @kernel(error_model="numpy")
