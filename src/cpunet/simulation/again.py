@@ -141,18 +141,14 @@ class SameHits:
         CpunetError
             If the detector is not depleted, or a hit is not finite.
         """
-        fields = superposed_fields(self._solution(detector), detector, depletion=False)
-        steps = settings.steps_per_sample if quick else 1
-        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
-        simulator = Simulator(detector, settings, fields=fields, stride=stride)
-        return simulator.events(self._hits[:most])
-
-    def _solution(self, detector: Detector) -> Superposition:
-        """Potentials of a detector."""
         key = detector.fingerprint(exclude=NOT_IN_PARTS)
         if key not in self._solutions:
             if len(self._solutions) == _MAX_SHAPES:
                 # keep the first, with which all others are compared
                 del self._solutions[list(self._solutions)[1]]
             self._solutions[key] = solve(detector)
-        return self._solutions[key]
+        fields = superposed_fields(self._solutions[key], detector, depletion=False)
+        steps = settings.steps_per_sample if quick else 1
+        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
+        simulator = Simulator(detector, settings, fields=fields, stride=stride)
+        return simulator.events(self._hits[:most])

@@ -131,7 +131,6 @@ class Task(NamedTuple):
     step_ns: float
     stride: int
     per_sample: int
-    n_samples: int
 
 
 class Simulator:
@@ -211,7 +210,6 @@ class Simulator:
             step_ns=stride * settings.step_ns,
             stride=stride,
             per_sample=settings.steps_per_sample // stride,
-            n_samples=settings.n_samples,
         )
 
     def signals(
