@@ -249,7 +249,8 @@ def drift(
         r = math.sqrt(x * x + y * y)  # math.hypot takes a sixth of the loop
         er, ez, wp, potential, usable = look_up(maps, r, z)
         if not usable:
-            # beyond the surface of a contact: the remaining signal is induced in this step
+            # beyond the surface of a contact: the remaining signal is induced in this step;
+            # electrons at the ditch end as in siggen, as if at the lithium about it
             wp = 1.0 if last > 0.3 else 0.0
         if k == 0:
             first = wp
@@ -282,7 +283,7 @@ def drift(
         if k > 0:
             vx, vy, vz = vx + ahead * (vx - ux), vy + ahead * (vy - uy), vz + ahead * (vz - uz)
         ux, uy, uz = wx, wy, wz
-        x, y, z = _moved(maps, (x, y, z), (vx * step_ns, vy * step_ns, vz * step_ns))
+        x, y, z = _moved(maps, carrier, (x, y, z), (vx * step_ns, vy * step_ns, vz * step_ns))
         k += 1
     for later in range(k + 1, n):
         signal[later] += induced
@@ -300,12 +301,16 @@ def _arrived(carrier: int, wp: float, rise: float, potential: float, bias_V: flo
 
 @kernel(inline="always")
 def _moved(
-    maps: DriftMaps, place: tuple[float, float, float], step: tuple[float, float, float]
+    maps: DriftMaps,
+    carrier: int,
+    here: tuple[float, float, float],
+    step: tuple[float, float, float],
 ) -> tuple[float, float, float]:
-    """Place after a step. Charges slide along passivated surfaces: z = 0 and the ditch's."""
-    x, y, z = place[0] + step[0], place[1] + step[1], max(place[2] + step[2], 0.0)
-    if not in_ditch(maps, x, y, z):
+    """Place after a step. Charges slide along the passivated face, holes along the ditch."""
+    x, y, z = here[0] + step[0], here[1] + step[1], max(here[2] + step[2], 0.0)
+    p = math.sqrt(x * x + y * y) * maps.per_mm
+    if carrier != HOLE or not in_ditch(maps, p, z * maps.per_mm):
         return x, y, z
-    if not in_ditch(maps, x, y, place[2]):  # along its floor
-        return x, y, place[2]
-    return place[0], place[1], z
+    if not in_ditch(maps, p, here[2] * maps.per_mm):  # along its floor
+        return x, y, here[2]
+    return here[0], here[1], z
