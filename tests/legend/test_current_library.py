@@ -228,7 +228,7 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
     [
         ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns (dt in 'ns')"),
         ({"dt": Scalar(1.0, attrs={"units": "furlong"})}, "dt in 'furlong'"),
-        ({"dt": None}, "no dt beside the waveforms"),
+        ({"dt": None}, "no dt with the waveforms"),
         ({"z": Array(np.empty((0, 2)))}, "z is no column of numbers"),
         (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
         (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),

@@ -55,7 +55,7 @@ class StoredSimulation:
             text = content[_PULSES].attrs.get("simulation") if _PULSES in content else None
             if text is None or HIT_TABLE not in content:
                 raise CpunetError(
-                    f"{file}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
+                    f"{file}: no {_PULSES} with its simulation, or no {HIT_TABLE}; give "
                     "an output of cpunet simulate or of a test stand"
                 )
             numbers = np.asarray(content[f"{_PULSES}/event_number"][()])
@@ -83,7 +83,7 @@ class StoredSimulation:
 
 # Maximum number of time steps that a drift step of quick pulses replaces.
 _QUICK_STRIDE = 5
-# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are kept.
+# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are held.
 _MAX_SHAPES = 4
 
 

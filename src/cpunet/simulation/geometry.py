@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import Annotated
 
 import numpy as np
@@ -107,103 +108,87 @@ class Detector(Config):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Detector:
-        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
-        outer, inner, bottom = self.taper_slopes
-        steps, contact = self.steps, self.point_contact_radius
-        wrap, ditch, bore = self.wrap_around_radius, self.ditch_depth, self.bore_length
-        groove = self.top_groove_radius if self.top_groove_depth else 0.0
-        mouth = max(self.bore_radius + self.inner_taper_length * inner, groove)
-        top = radius - self.outer_taper_length * outer - steps[0]
-        base = radius - self.bottom_taper_length * bottom - steps[1]
-        edge = max(li, self.bottom_bullet_radius)
-        ends = self.top_cylinder_length, self.bottom_cylinder_length
-        rounded = self.top_bullet_radius, self.bottom_bullet_radius
-        tapers = self.outer_taper_length, self.bottom_taper_length
-        deep = "bore_length (with li_thickness)" if bore else "li_thickness"
-        z = np.linspace(0, length, 101)
-        with np.errstate(over="ignore", invalid="ignore"):
-            impurity = self.impurity_1e10_per_cm3(np.array([[0.0], [radius]]), z)
-        rivals = (
+        for problem in chain(self._missing(), self._overlaps(), self._reaches()):
+            raise ValueError(problem)
+        return self
+
+    def _missing(self) -> Iterator[str]:
+        """Values that are missing, that exclude each other, or impurities of another kind."""
+        for names in (
             ("top_bullet_radius", "top_cylinder_length"),
             ("bottom_bullet_radius", "bottom_cylinder_length"),
             ("bottom_bullet_radius", "bottom_transition_length"),
             ("top_bullet_radius", "outer_taper_length"),
             ("bottom_bullet_radius", "bottom_taper_length"),
-        )
-        pairs = (
+        ):
+            if all(getattr(self, name) for name in names):
+                yield f"{' and '.join(names)} cannot both be given"
+        for names in (
             ("bore_length", "bore_radius"),
             ("ditch_depth", "ditch_thickness"),
             ("impurity_exponential_1e10_per_cm3", "impurity_exponential_length_mm"),
-        )
-        problems = {
-            f"{a} and {b} cannot both be given": getattr(self, a) and getattr(self, b)
-            for a, b in rivals
-        }
-        problems |= {
-            f"{a} and {b} must both be given, or both be 0": (
-                bool(getattr(self, a)) != bool(getattr(self, b))
-            )
-            for a, b in pairs
-        }
-        problems |= {
-            f"{end}_cylinder_radius must be above 0 and at most crystal_radius": not (
-                0 <= step < radius
-            )
-            for end, step in zip(("top", "bottom"), steps, strict=True)
-        }
-        problems |= {
-            "top_groove_depth needs a top_groove_radius": bool(
-                self.top_groove_depth and not groove
-            ),
-            "li_thickness leaves nothing of the crystal": 2 * li >= min(length, radius),
-            "outer_taper_length and bottom_taper_length exceed crystal_length": (
-                sum(tapers) > length
-            ),
-            "crystal_radius ends, with bottom_taper_length, inside a contact on z = 0": (
-                base <= max(wrap, contact)
-            ),
-            f"{deep} reaches the point contact (point_contact_length)": (
-                bore + 2 * li + self.point_contact_length >= length
-            ),
-            "inner_taper_length exceeds bore_length": self.inner_taper_length > bore,
-            "bore_bullet_radius exceeds bore_radius or bore_length": (
-                self.bore_bullet_radius > min(self.bore_radius, bore)
-            ),
-            "outer_taper_length or inner_taper_length leaves no germanium at the top": (
-                top - mouth <= 2 * li
-            ),
-            "top_bullet_radius and bottom_bullet_radius exceed the crystal": (
-                sum(rounded) > min(length, radius)
-            ),
-            "point_contact_radius meets the ditch (wrap_around_radius - ditch_thickness)": (
-                0 < wrap < contact + self.ditch_thickness
-            ),
-            "ditch_depth needs a wrap_around_radius, its outer radius": wrap == 0 < ditch,
-            "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)": (
-                wrap >= radius - edge
-            ),
-            "point_contact_radius reaches the lithium of the outer wall (li_thickness)": (
-                contact >= base - edge
-            ),
-            "ditch_depth reaches the bore (bore_length) or the top": (
-                ditch + max(bore, self.top_groove_depth) + li >= length
-            ),
-            "bottom_cylinder_length and top_cylinder_length exceed crystal_length": (
-                sum(ends) + self.bottom_transition_length > length
-            ),
-            "grid_mm does not resolve point_contact_radius; at most half of it": (
-                self.grid_mm > contact / 2
-            ),
-            "impurity_… is not finite; correct impurity_exponential_length_mm": (
-                not np.isfinite(impurity).all()
-            ),
-            "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative": (
-                impurity.max() > 0
-            ),
-        }
-        if problem := next((text for text, wrong in problems.items() if wrong), ""):
-            raise ValueError(problem)
-        return self
+        ):
+            if len({getattr(self, name) != 0 for name in names}) > 1:
+                yield f"{' and '.join(names)} must both be given, or both be 0"
+        for end, step in zip(("top", "bottom"), self.steps, strict=True):
+            if not 0 <= step < self.crystal_radius:
+                yield f"{end}_cylinder_radius must be above 0 and at most crystal_radius"
+        if self.top_groove_depth and not self.top_groove_radius:
+            yield "top_groove_depth and top_groove_radius must both be given"
+        if self.ditch_depth and not self.wrap_around_radius:
+            yield "ditch_depth needs a wrap_around_radius, its outer radius"
+        z = np.linspace(0, self.crystal_length, 101)
+        with np.errstate(over="ignore", invalid="ignore"):
+            impurity = self.impurity_1e10_per_cm3(np.array([[0.0], [self.crystal_radius]]), z)
+        if not np.isfinite(impurity).all():
+            yield "impurity_… is not finite; correct impurity_exponential_length_mm"
+        if impurity.max() > 0:
+            yield "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative"
+
+    def _overlaps(self) -> Iterator[str]:
+        """Parts that do not fit into each other."""
+        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
+        if 2 * li >= min(length, radius):
+            yield "li_thickness leaves nothing of the crystal"
+        if self.outer_taper_length + self.bottom_taper_length > length:
+            yield "outer_taper_length and bottom_taper_length exceed crystal_length"
+        if self.inner_taper_length > self.bore_length:
+            yield "inner_taper_length exceeds bore_length"
+        if self.bore_bullet_radius > min(self.bore_radius, self.bore_length):
+            yield "bore_bullet_radius exceeds bore_radius or bore_length"
+        if self.top_bullet_radius + self.bottom_bullet_radius > min(length, radius):
+            yield "top_bullet_radius and bottom_bullet_radius exceed the crystal"
+        ends = self.top_cylinder_length, self.bottom_cylinder_length
+        if sum(ends) + self.bottom_transition_length > length:
+            yield "bottom_cylinder_length and top_cylinder_length exceed crystal_length"
+        if self.grid_mm > self.point_contact_radius / 2:
+            yield "grid_mm does not resolve point_contact_radius; at most half of it"
+
+    def _reaches(self) -> Iterator[str]:
+        """Contacts, bore and ditch that reach each other or a surface."""
+        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
+        outer, inner, bottom = self.taper_slopes
+        groove = self.top_groove_radius if self.top_groove_depth else 0.0
+        mouth = max(self.bore_radius + self.inner_taper_length * inner, groove)
+        top_radius = radius - self.outer_taper_length * outer - self.steps[0]
+        bottom_radius = radius - self.bottom_taper_length * bottom - self.steps[1]
+        wrap, contact = self.wrap_around_radius, self.point_contact_radius
+        edge = max(li, self.bottom_bullet_radius)
+        if bottom_radius <= max(wrap, contact):
+            yield "crystal_radius ends, with bottom_taper_length, inside a contact on z = 0"
+        if self.bore_length + 2 * li + self.point_contact_length >= length:
+            which = "bore_length (with li_thickness)" if self.bore_length else "li_thickness"
+            yield f"{which} reaches the point contact (point_contact_length)"
+        if top_radius - mouth <= 2 * li:
+            yield "outer_taper_length or inner_taper_length leaves no germanium at the top"
+        if wrap and wrap - self.ditch_thickness < contact:
+            yield "point_contact_radius meets the ditch (wrap_around_radius - ditch_thickness)"
+        if wrap >= radius - edge:
+            yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
+        if contact >= bottom_radius - edge:
+            yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
+        if self.ditch_depth + max(self.bore_length, self.top_groove_depth) + li >= length:
+            yield "ditch_depth reaches the bore (bore_length) or the top"
 
     @property
     def taper_slopes(self) -> tuple[float, float, float]:
@@ -271,7 +256,7 @@ class Detector(Config):
         """
         from cpunet.simulation import outline  # compiled, which few users of a detector need
 
-        return outline.insides(self, r, z)
+        return outline.at(outline.fill_insides, np.bool_, self, r, z)
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
@@ -282,9 +267,9 @@ class Detector(Config):
         >>> read_detector("icpc").active([0, 0, 12, 40], [10, 1, 1, 50])
         array([ True, False, False, False])
         """
-        from cpunet.simulation import outline
+        from cpunet.simulation.outline import GERMANIUM
 
-        return np.asarray(outline.regions(self, r, z) == outline.GERMANIUM)
+        return np.asarray(self.region(r, z) == GERMANIUM)
 
     def region(self, r: npt.ArrayLike, z: npt.ArrayLike) -> RegionArray:
         """Region at `r`, `z` (mm): 0 point contact, 1 lithium or outside, 2 germanium, 5 ditch.
@@ -293,7 +278,7 @@ class Detector(Config):
         """
         from cpunet.simulation import outline
 
-        return outline.regions(self, r, z)
+        return outline.at(outline.fill_regions, np.int8, self, r, z)
 
     def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
         """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""

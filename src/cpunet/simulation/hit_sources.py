@@ -46,14 +46,14 @@ def energy_windows(
     text
         Names and ranges, separated by commas.
     peaks
-        Known gamma lines.
+        Gamma lines.
     half_width_kev
         Half-width of the windows around the lines.
 
     Raises
     ------
     CpunetError
-        If a part is neither a known line nor a range.
+        If a part is neither a line of `peaks` nor a range.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def wanted_events(
 class HitFile:
     """Hits of a file, see `cpunet.simulation.hit_files.read_hits`.
 
-    With `windows`, only events with a deposited energy in one of them are used.  `placed` hits
+    With `windows`, only events with a deposited energy within them are used.  `placed` hits
     are those of a simulation: they have been checked against the crystal and merged.
     """
 

@@ -29,7 +29,7 @@ NTUPLES, STEPS = "default_ntuples", "stp"
 _G4SIMPLE, _G4SIMPLE_TITLE = "g4sntuple", "steps data"
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
-# what a column is, and its names in small letters: the first that is there is read
+# what a column is, and its names in small letters: the first of these is read
 _NAMES = {
     "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
     "x": ("xloc", "x"),
@@ -41,7 +41,7 @@ _NAMES = {
 _NEEDED = ("event", "x", "y", "z", "edep")
 _VECTORS = ("cumulative_length", "flattened_data")
 _WITH_UNIT = re.compile(r"(.+?)\s*(?:\[(.*)\]|_in_(.+))$")
-# arrays of an NPZ beside the offsets, and the columns that they are
+# arrays of an NPZ, and the columns that they are
 _ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep_in_keV"}
 
 
@@ -49,9 +49,9 @@ _ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep
 class StepTable:
     """A table of steps: its columns by name, arrays or items of an open HDF5 file.
 
-    Those of HDF5 are arrays with a value per row, or vectors with one per step of the row; the
-    vectors of deposits tell the steps of each row. The `name` is that of the detector, empty if
-    there is none. Units that neither column nor options tell are those of g4simple, MeV and
+    Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
+    the vectors of deposits give the steps of each row. The `name` is that of the detector,
+    empty without any. Units that neither column nor options tell are those of g4simple, MeV and
     mm, if the table is `g4simple`'s. A `file` of remage tells where its detectors are.
     """
 
@@ -63,7 +63,7 @@ class StepTable:
 
     @cached_property
     def roles(self) -> dict[str, tuple[str, str]]:
-        """What there is, see `roles`."""
+        """Roles of the columns, see `roles`."""
         return roles(self.columns)
 
     def steps(
@@ -89,7 +89,7 @@ class StepTable:
                 f"{self.path}: no column for {missing[0]}; "
                 f"the file holds {', '.join(self.columns)}"
             )
-        kept = slice(None) if label is None else self._labels == label
+        chosen = slice(None) if label is None else self._labels == label
         steps: dict[str, npt.NDArray[Any]] = {}
         for role, (name, in_name) in self.roles.items():
             values, unit = self._read(name)
@@ -104,7 +104,7 @@ class StepTable:
                 if role == "event"
                 else values * _unit_factor(options, role, where, unit or in_name)
             )
-            steps[role] = values[kept]
+            steps[role] = values[chosen]
         return steps
 
     def detectors(self) -> list[str]:
@@ -210,7 +210,7 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
 
 
 def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
-    """Format of a file of hits by its content; `stored` are hits beside their pulses."""
+    """Format of a file of hits by its content; `stored` are hits with their pulses."""
     try:
         with path.open("rb") as stream:
             start = stream.read(len(_CSV_MAGIC))
@@ -268,7 +268,7 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
             yield tables
     else:
         raise CpunetError(
-            f"{path}: no known format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
+            f"{path}: no format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
             f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
         )
 
@@ -305,9 +305,9 @@ def _csv_table(path: Path) -> StepTable:
 
     with path.open(encoding="utf-8", errors="replace") as lines:
         head = list(takewhile(lambda line: line.startswith("#"), lines))
-    told = [line[1:].strip().partition(" ")[::2] for line in head]
-    names = [value.partition(" ")[2] for key, value in told if key == "column"]
-    about = {"title": "", "separator": str(ord(","))} | dict(told)
+    header = [line[1:].strip().partition(" ")[::2] for line in head]
+    names = [value.partition(" ")[2] for key, value in header if key == "column"]
+    about = {"title": "", "separator": str(ord(","))} | dict(header)
     separator = chr(int(about["separator"]))
     try:
         # the columns of one file can be numbers, text or both

@@ -51,24 +51,19 @@ class Outline(NamedTuple):
         return cls(*(getattr(detector, name) for name in cls._fields))
 
 
-def regions(detector: Any, r: npt.ArrayLike, z: npt.ArrayLike) -> npt.NDArray[np.int8]:
-    """See `Detector.region`."""
+def at(
+    loop: Any, kind: type, detector: Any, r: npt.ArrayLike, z: npt.ArrayLike
+) -> npt.NDArray[Any]:
+    """What `fill_regions` or `fill_insides` gives at places of a `Detector`."""
     r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
-    region = np.empty(r.shape, np.int8)
-    _fill_regions(Outline.of(detector), r.flatten(), z.flatten(), region.reshape(-1))
-    return region
-
-
-def insides(detector: Any, r: npt.ArrayLike, z: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """See `Detector.inside`."""
-    r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
-    inside = np.empty(r.shape, np.bool_)
-    _fill_insides(Outline.of(detector), r.flatten(), z.flatten(), inside.reshape(-1))
-    return inside
+    values: npt.NDArray[Any] = np.empty(r.shape, kind)
+    loop(Outline.of(detector), r.flatten(), z.flatten(), values.reshape(-1))
+    return values
 
 
 @kernel(error_model="numpy")
-def _fill_regions(outline: Outline, r: Array, z: Array, region: npt.NDArray[np.int8]) -> None:
+def fill_regions(outline: Outline, r: Array, z: Array, region: npt.NDArray[np.int8]) -> None:
+    """See `Detector.region`."""
     radius, length = outline.point_contact_radius, outline.point_contact_length
     for i in range(len(r)):
         if r[i] <= radius + _TOLERANCE and z[i] <= length + _TOLERANCE:
@@ -80,7 +75,8 @@ def _fill_regions(outline: Outline, r: Array, z: Array, region: npt.NDArray[np.i
 
 
 @kernel(error_model="numpy")
-def _fill_insides(outline: Outline, r: Array, z: Array, inside: npt.NDArray[np.bool_]) -> None:
+def fill_insides(outline: Outline, r: Array, z: Array, inside: npt.NDArray[np.bool_]) -> None:
+    """See `Detector.inside`."""
     for i in range(len(r)):
         inside[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
 

@@ -110,9 +110,8 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
                 continue
             place, chance = (x, y, z), rng.random()
             if chance < photons.photoelectric[node]:
-                bound = min(energy, K_BINDING)
-                record(event, x, y, z, bound)
-                kinetic = energy - bound
+                kinetic = energy - min(energy, K_BINDING)
+                record(event, x, y, z, min(energy, K_BINDING))
                 away = forward(direction, kinetic, rng)
                 slow_down(outline, electrons, event, place, away, kinetic, electron, rng)
                 break
