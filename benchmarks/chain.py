@@ -6,7 +6,6 @@ the workflow, each stage runs in a process of its own, with one thread.  The tim
 time, which other load on the machine hardly changes; the memory is the maximum of the process.
 Steps are those of gammas in the crystal from the built-in Monte Carlo, in the format of remage.
 The run is an untrained readout chain: neither rate nor memory depends on its parameters.
-Pulses are simulated by exact drift of each hit (a tenth of the events) and from a library.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ POOL = 500  # different events; the file repeats them
 DSP = ROOT / "workflow" / "scripts" / "dsp.py"
 CONFIG = ROOT / "workflow" / "config" / "dsp.yaml"
 MILLION = 1_000_000
-TENTH = 10  # the exact mode simulates one event in ten
 
 
 class Cost(NamedTuple):
@@ -107,20 +105,15 @@ def measured(*words: object) -> Cost:
     return Cost(usage.ru_utime + usage.ru_stime, kilobytes / 1024)
 
 
-def simulated(folder: Path, steps: Path, mode: str) -> Cost:
-    """Simulate pulses from steps, by exact drift or from a library."""
-    words = ["--detector", "icpc", "--hits", steps, "--hits-detector", "V01", mode]
-    return measured("cpunet", "simulate", *words, "--out", folder / "pulses.lh5", "--force")
-
-
 def chain(folder: Path, steps: Path) -> dict[str, Cost]:
     """Run each stage of the chain on one file."""
     pulses, raw, dsp = (folder / f"{name}.lh5" for name in ("pulses", "raw", "dsp"))
+    simulate = ["simulate", "--detector", "icpc", "--hits", steps, "--hits-detector", "V01"]
     translate = ["translate", folder / "run", pulses, "--adc"]
     translate += ["--adc-per-kev", 10, "--baseline", 10000, "--out-table", "V01/raw"]
     parameters = [DSP, raw, dsp, "--config", CONFIG, "--table", "V01/raw"]
     return {
-        "pulses, library": simulated(folder, steps, "--library"),
+        "pulses": measured("cpunet", *simulate, "--out", pulses, "--force"),
         "raw traces": measured("cpunet", *translate, "--out", raw, "--force"),
         "parameters": measured(*parameters, "--run", folder / "run", "--tau-us", 400),
     }
@@ -149,16 +142,12 @@ def main() -> None:
         pool, steps = some_hits(given.seed), folder / "stp.lh5"
         write_steps(steps, pool, 200)
         chain(folder, steps)  # compiles
-        simulated(folder, steps, "--exact")
-        exact, costs = [], []
+        costs = []
         for n in (few, many):
-            write_steps(steps, pool, n // TENTH)
-            exact.append(simulated(folder, steps, "--exact"))
             n_steps = write_steps(steps, pool, n)
             costs.append(chain(folder, steps))
             print(f"{n} events, {n_steps} steps: {costs[-1]}", flush=True)
         print("| step | events/s | once (s) | memory (MB) at events | 1M events (h) |")
-        print(told("pulses, exact", few // TENTH, many // TENTH, *exact))
         for step in costs[0]:
             print(told(step, few, many, costs[0][step], costs[1][step]))
 

@@ -74,11 +74,7 @@ order in which data flow.
 
 ::: cpunet.merge_libraries
 
-::: cpunet.lithium_table
-
 ::: cpunet.LegendParameters
-
-::: cpunet.LithiumLayer
 
 ::: cpunet.Adc
 

@@ -30,14 +30,13 @@ from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
+from cpunet.simulation import simulator
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.events import simulate_events
-from cpunet.simulation.field_lookup import drift_maps, in_active_volume
-from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import Simulator
 from cpunet.training.run import Run
 from cpunet.translation.translator import REN
 from synthetic import after_pole_and_decay, sampled, write_chain, write_pulses
@@ -229,7 +228,7 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
     [
         ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns (dt in 'ns')"),
         ({"dt": Scalar(1.0, attrs={"units": "furlong"})}, "dt in 'furlong'"),
-        ({"dt": None}, "no dt beside the waveforms"),
+        ({"dt": None}, "no dt with the waveforms"),
         ({"z": Array(np.empty((0, 2)))}, "z is no column of numbers"),
         (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
         (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),
@@ -303,16 +302,28 @@ def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
 
 
 def test_a_library_is_made(tmp_path: Path) -> None:
-    short = {"grid_mm": 12, "settings": {"dt_ns": 8, "length_ns": 2400}}
-    done = make_library("ppc", tmp_path / "psl.lh5", **short)
+    short = {"grid_mm": 12, "settings": {"length_ns": 2400}}
+    maps, made_maps = simulator.drift_maps, []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            simulator,
+            "drift_maps",
+            lambda *given: made_maps.append(maps(*given)) or made_maps[0],
+        )
+        done = make_library("ppc", tmp_path / "psl.lh5", **short)
+    assert len(made_maps) == 1  # whatever the number of places
     assert "places have a template" in str(done)
     (name,) = lh5.ls(str(tmp_path / "psl.lh5"))
     made = lh5.read(name, str(tmp_path / "psl.lh5"))
     assert {"waveform_000_deg", "drift_time_045_deg"} <= set(made)
-    assert made["dt"].value == 8
-    assert made["waveform_000_deg"].nda.shape[2] == 300
-    with pytest.raises(CpunetError, match=r"^[^\n]+$"):
-        make_library("ppc", tmp_path / "other.lh5", **(short | {"grid_mm": 0}))
+    assert made["dt"].value == 1
+    assert made["waveform_000_deg"].nda.shape[2] == 2400
+    for change, words in (
+        ({"grid_mm": 0}, "`grid_mm` is 0"),
+        ({"settings": {"dt_ns": 2}}, "dt_ns = 2: templates are sampled every nanosecond"),
+    ):
+        with pytest.raises(CpunetError, match=rf"^[^\n]*{words}[^\n]+$"):
+            make_library("ppc", tmp_path / "other.lh5", **(short | change))
     assert not (tmp_path / "other.lh5").exists()
 
 
@@ -321,18 +332,23 @@ def geant4_events(reference_data: Path, n_events: int | None) -> tuple[Any, Hits
     detector = read_detector(str(reference_data / "siggen" / "geometry_A.yaml"))
     hits = read_hits(reference_data / "geant4" / "g4_h20mm.npz")
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)[:n_events]], 0.05)
-    maps = drift_maps(compute_fields(detector), SETTINGS)
-    places = zip(hits.x_mm, hits.y_mm, hits.z_mm, strict=True)
-    hits = hits.where(np.array([in_active_volume(maps, *place) for place in places]))
+    places = hits.x_mm, hits.y_mm, hits.z_mm
+    brief = SETTINGS.model_copy(update={"length_ns": 1.0})
+    hits = hits.where(Simulator(detector, brief).signals(*places, 1.0).valid)
     return detector, hits[np.flatnonzero(np.diff(hits.offsets) > 0)]
+
+
+def at(hits: Hits, r_mm: Any, z_mm: Any) -> Hits:
+    """The same deposits at other places of azimuth 0."""
+    return replace(hits, position_mm=np.stack([r_mm, 0 * r_mm, z_mm], axis=1))
 
 
 def full_a_over_e(run: Path, detector: Any, hits: Hits, mode: float) -> Any:
     """A/E of charges drifted one by one, summed, and translated as a whole."""
     translate = TemplateTranslator(REN.load(run), 1.0)
-    fields, found = compute_fields(detector), []
+    drifted, found = Simulator(detector, SETTINGS), []
     for first in range(0, hits.n_events, 500):
-        events = simulate_events(fields, hits[first : first + 500], SETTINGS)
+        events = drifted.events(hits[first : first + 500])
         currents, _ = currents_about_peak(translate(events.waveforms))
         found.append(currents[..., PEAK].astype(float) / mode)
     return np.concatenate(found)
@@ -383,9 +399,7 @@ def test_a_over_e_of_geant4_events_at_the_nodes(
         hits.z_mm[:, None] - z_mm[j]
     )
     nearest = away.argmin(axis=1)
-    at_nodes = replace(
-        hits, x_mm=r_mm[i][nearest], y_mm=np.zeros(len(nearest)), z_mm=z_mm[j][nearest]
-    )
+    at_nodes = at(hits, r_mm[i][nearest], z_mm[j][nearest])
     mode = told[name].mode_per_ns
     full = full_a_over_e(chain, detector, at_nodes, mode)
     found = a_over_e_of_reboost(tmp_path / "psl.lh5", at_nodes, 0.0)
@@ -406,7 +420,7 @@ def test_a_over_e_of_all_geant4_events(
     ((_, numbers),) = told.items()
     assert hits.n_events > 8000
     r, phi = np.hypot(hits.x_mm, hits.y_mm), np.arctan2(hits.y_mm, hits.x_mm)
-    turned = replace(hits, x_mm=r, y_mm=np.zeros(len(r)))
+    turned = at(hits, r, hits.z_mm)
     for these, azimuth, within, median in ((turned, 0.0, 0.99, 0.01), (hits, phi, 0.8, 0.12)):
         full = full_a_over_e(chain, detector, these, numbers.mode_per_ns)
         found = a_over_e_of_reboost(tmp_path / "psl.lh5", these, azimuth)

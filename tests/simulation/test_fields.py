@@ -97,7 +97,6 @@ def test_solved_once(caplog: pytest.LogCaptureFixture) -> None:
     warmer = detector.model_copy(update={"temperature_K": 100.0, "name": "warm"})
     second = compute_fields(warmer)
     assert not caplog.messages
-    assert second.temperature_K == 100
     np.testing.assert_array_equal(first.potential_V, second.potential_V)
     assert same(first, compute_fields(detector))
     thicker = detector.model_copy(update={"li_thickness": 1.1})
@@ -149,7 +148,6 @@ def test_any_bias_and_impurity_from_one_solution(
         changed = {"impurity_z0_1e10_per_cm3": -0.8, "impurity_gradient_1e10_per_cm4": 0.08}
         changed = {key: scale * value for key, value in changed.items()} | {"bias_V": bias}
         alone = compute_fields(detector.model_copy(update=changed), cache=False)
-        assert fields.temperature_K == 80
         for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm", "weighting_potential"):
             np.testing.assert_allclose(getattr(fields, name), getattr(alone, name), atol=1e-6)
         assert fields.depletion_V == pytest.approx(alone.depletion_V, abs=1)

@@ -11,11 +11,20 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas.electrons import compton_energy
+from cpunet.simulation.gammas.electrons import (
+    HITS,
+    LOST,
+    Event,
+    UnitVector,
+    compton_energy,
+    put_photon,
+)
 from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.sample import (
     TL208_KEV,
     EnergyWindow,
+    Medium,
+    follow_photons,
     simulate_gammas,
 )
 from cpunet.simulation.geometry import Detector
@@ -186,3 +195,16 @@ def test_compton_mean_energy_is_that_of_klein_and_nishina() -> None:
     share = 1 / (1 + k * (1 - cosine))
     weight = share**2 * (share + 1 / share - 1 + cosine**2)
     assert drawn == pytest.approx(np.sum(weight * share) / weight.sum(), rel=0.01)
+
+
+def test_deposits_for_which_there_is_no_room_are_counted() -> None:
+    medium, counts = Medium.of(crystal()), []
+    for room in (3, 2000):
+        event = Event(np.empty((room, 4)), np.empty((256, 7)), np.zeros(3, np.int64))
+        put_photon(event, 20.0, 0.0, 50.0, UnitVector(0.0, 0.0, -1.0), 2.6145)
+        follow_photons(medium, event, np.random.default_rng(1))
+        counts.append(event.counts)
+    few, all_of_them = counts
+    assert few[HITS] == 3 < all_of_them[HITS]
+    assert few[LOST] == all_of_them[HITS] - 3
+    assert all_of_them[LOST] == 0

@@ -161,6 +161,12 @@ def test_the_ditch_is_no_germanium() -> None:
     assert ICPC.inside(10.9, 1)
 
 
+def test_the_ditch_does_not_depend_on_the_grid() -> None:
+    r, z = np.meshgrid(np.linspace(10, 15, 501), np.linspace(0, 3, 301))
+    fine, coarse = changed(grid_mm=0.05), changed(grid_mm=0.5)
+    np.testing.assert_array_equal(fine.region(r, z), coarse.region(r, z))
+
+
 def test_impurities_follow_their_terms() -> None:
     assert ICPC.impurity_1e10_per_cm3(0, 50) == pytest.approx(-1.3)
     quadratic = changed(impurity_quadratic_1e10_per_cm3=-0.2)

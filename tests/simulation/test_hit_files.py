@@ -188,6 +188,16 @@ def test_joined_jobs_number_their_events_anew(tmp_path: Path, layout: str) -> No
     assert hits.event_number.tolist() == [3, 8, 9, 2, 10, 11]
 
 
+def test_joined_csv_files_are_read_as_jobs(tmp_path: Path) -> None:
+    columns, rows = ["event", "Edep", "x", "y", "z"], [f"{i},{i + 1},1,2,3" for i in range(4)]
+    alone = csv_file(tmp_path, columns, rows, title="steps data").read_text()
+    joined = tmp_path / "joined.csv"
+    joined.write_text(f"{alone}\n{alone}\n{alone}")
+    hits = read_hits(joined)
+    assert hits.energy_kev.tolist() == [1000, 2000, 3000, 4000] * 3
+    assert len(set(hits.event_number)) == 12
+
+
 def test_events_that_threads_wrote_in_blocks_stay_whole(tmp_path: Path) -> None:
     # two threads with even and odd events; the blocks end within 4 and 5
     numbers = np.repeat([0, 2, 4, 1, 3, 5, 4, 6, 5, 7, 8, 9], 3)

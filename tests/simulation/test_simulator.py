@@ -181,3 +181,17 @@ def test_charges_that_come_too_late_are_not_collected(planar: FieldMaps) -> None
     assert events.valid.all()
     assert events.collected.tolist() == [False, True]  # 9.5 mm to the lithium, 5 mm at most
     assert events.waveforms[:, -1] == pytest.approx([0.65, 1], abs=0.1)
+
+
+def test_holes_slide_along_the_ditch() -> None:
+    """Holes that meet its walls or its floor go on to the point contact."""
+    ditch = read_detector("icpc", ["grid_mm=0.25"])
+    r, z = np.meshgrid(np.arange(8.0, 17.0, 0.5), np.arange(0.5, 4.0, 0.25))
+    inside = ditch.active(r, z)
+    simulator = Simulator(ditch, SimulationSettings(length_ns=4000))
+    signals = simulator.signals(r[inside], 0.0, z[inside], 100.0)
+    assert signals.collected.all()
+    np.testing.assert_allclose(signals.waveforms[:, -1], 1, atol=1e-3)
+    _, holes = simulator.paths([11.5, 12.5, 13.5], 0.0, 2.6)
+    radius, height = np.hypot(holes[..., 0], holes[..., 1]), holes[..., 2]
+    assert not ((radius > 11.25) & (radius < 13.75) & (height < 1.75)).any()

@@ -159,17 +159,17 @@ def with_rings(templates: Floats, rings: int = RINGS) -> Floats:
     >>> with_rings(line, 1)[0, :, 0].tolist()
     [1.0, 3.0, 3.0, nan]
     """
-    there = ~np.isnan(templates[:, :, 0])
+    filled = ~np.isnan(templates[:, :, 0])
     for _ in range(rings):
-        held = np.pad(there, 1)
+        held = np.pad(filled, 1)
         around = np.sum([_seen(held, 1, *step) for step in _NEIGHBOURS], axis=0)
-        new_r, new_z = np.nonzero(~there & (around > 0))
+        new_r, new_z = np.nonzero(~filled & (around > 0))
         total = np.zeros((len(new_r), templates.shape[2]), np.float64)
         for i, j in _NEIGHBOURS:
-            known = held[new_r + 1 + i, new_z + 1 + j]
-            total[known] += templates[new_r[known] + i, new_z[known] + j]
+            near = held[new_r + 1 + i, new_z + 1 + j]
+            total[near] += templates[new_r[near] + i, new_z[near] + j]
         templates[new_r, new_z] = total / around[new_r, new_z][:, np.newaxis]
-        there[new_r, new_z] = True
+        filled[new_r, new_z] = True
     return templates
 
 
@@ -228,7 +228,7 @@ def _seen(padded: npt.NDArray[Any], pad: int, i: int, j: int) -> npt.NDArray[Any
 
 def _mean(values: Values) -> Values:
     """Mean of the finite values along the first axis; NaN if there is none."""
-    known = np.isfinite(values)
-    n = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0)
+    finite = np.isfinite(values)
+    n = finite.sum(axis=0)
+    total = np.where(finite, values, 0.0).sum(axis=0)
     return np.where(n > 0, total / np.maximum(n, 1), np.nan)

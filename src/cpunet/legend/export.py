@@ -82,9 +82,9 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
     Examples
     --------
     >>> from cpunet.electronics.exponentials import Exponentials
-    >>> two = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
-    >>> found = equivalent_kernel(two)
-    >>> 10 < found.sigma_ns < 30, 60 < found.tau_ns < 90
+    >>> chain = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
+    >>> nearest = equivalent_kernel(chain)
+    >>> 10 < nearest.sigma_ns < 30, 60 < nearest.tau_ns < 90
     (True, True)
     """
     time = np.arange(LENGTH, dtype=float) - BEGIN
@@ -92,18 +92,18 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
     wanted = _about_peak(_averaged(step))
 
     def scaled(parameters: Values) -> tuple[Values, float]:
-        found = _about_peak(_averaged(kernel_step(time, *parameters)))
+        current = _about_peak(_averaged(kernel_step(time, *parameters)))
         weight = wanted**2
-        return found, float((weight * found * wanted).sum() / (weight * found**2).sum())
+        return current, float((weight * current * wanted).sum() / (weight * current**2).sum())
 
     def residual(parameters: Values) -> Values:
-        found, height = scaled(parameters)
-        return np.asarray(wanted * (height * found - wanted) / wanted.max() ** 2)
+        current, height = scaled(parameters)
+        return np.asarray(wanted * (height * current - wanted) / wanted.max() ** 2)
 
     sigma, tau = scipy.optimize.least_squares(
         residual, START_NS, bounds=(0.5, LONGEST_NS), diff_step=1e-4
     ).x
-    found, height = scaled(np.array([sigma, tau]))
+    current, height = scaled(np.array([sigma, tau]))
     peak = BEGIN + int(_averaged(step)[BEGIN:].argmax()) - (WINDOW - 1) * WINDOWS // 2
     kernel = kernel_step(time, sigma, tau)
     # A of the kernel over A of the chain for constant currents
@@ -114,7 +114,9 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
         sigma_ns=float(sigma),
         tau_ns=float(tau),
         prompt_share=height,
-        current_error_percent=float(100 * np.abs(height * found - wanted).max() / wanted.max()),
+        current_error_percent=float(
+            100 * np.abs(height * current - wanted).max() / wanted.max()
+        ),
         late_charge_percent=float(
             100 * ((1 - step[peak + AROUND_NS]) - (1 - kernel[peak + AROUND_NS]))
         ),
@@ -195,8 +197,8 @@ class LegendParameters:
             f"{two['current_error_percent']:.1f} % of its height off, A/E "
             f"± {two['ae_error_percent']:.1f} % between currents of 1 and 300 ns"
         ]
-        for method, one in self.content["ae_against_energy"].items():
-            line = one["mean"]
+        for method, numbers in self.content["ae_against_energy"].items():
+            line = numbers["mean"]
             lines.append(
                 f"A/E against energy, {method}: {line['per_mev_percent']:+.3f} ± "
                 f"{line['per_mev_error_percent']:.3f} % per MeV"
@@ -254,13 +256,13 @@ def export_legend(
     report, run = None if report is None else Path(report), as_run(run)
     given = (run.folder, report)
     refuse_existing(out, *given, force=force)
-    told = describe_chain(run)
-    for doubt in told.doubts:
+    described = describe_chain(run)
+    for doubt in described.doubts:
         log.warning(doubt)
     trained = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed}
     name = detector or known_detector(run) or EVERY_DETECTOR
     methods, ae_pars = ({}, {}) if report is None else _against_energy(report, trained)
-    undecayed = told.chain.undecayed
+    undecayed = described.chain.undecayed
     with stage("Two numbers for the chain"):
         nearest = equivalent_kernel(undecayed)
     whole = {
@@ -272,9 +274,9 @@ def export_legend(
         },
         "electronics": {
             "equivalent": asdict(nearest),
-            "chain": told.parameters,
-            "chain_errors": told.parameter_errors,
-            "numbers": told.values,
+            "chain": described.parameters,
+            "chain_errors": described.parameter_errors,
+            "numbers": described.values,
         },
         "drift_time": {
             "current_maximum_delay_ns": current_delay_ns(undecayed),
@@ -287,8 +289,8 @@ def export_legend(
         for kind, content in (pars | {"cpunet": whole}).items():
             text = yaml_text(plain({name: content}))
             (folder / f"{kind}.yaml").write_text(text, encoding="utf-8")
-        (folder / "response.yaml").write_text(as_yaml({name: told}), encoding="utf-8")
-        (folder / "response.csv").write_text(as_csv({name: told}), encoding="utf-8")
+        (folder / "response.yaml").write_text(as_yaml({name: described}), encoding="utf-8")
+        (folder / "response.csv").write_text(as_csv({name: described}), encoding="utf-8")
     return LegendParameters(out, name, whole)
 
 
@@ -299,10 +301,10 @@ def _against_energy(
     path = report / "metrics.json"
     metrics = read_json(path, "give the folder that `cpunet validate` made")
     try:
-        training, found = metrics["training"], metrics["ae_energy"]
+        training, scores = metrics["training"], metrics["ae_energy"]
         other = [key for key in SAME if training[key] != trained[key]]
-        missing = found.get("missing")
-        methods = {} if missing else dict(found["methods"])
+        missing = scores.get("missing")
+        methods = {} if missing else dict(scores["methods"])
         pars: dict[str, Any] = {}
         if not missing:
             # the mean of the translation, and the width of the data

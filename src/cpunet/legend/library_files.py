@@ -1,4 +1,4 @@
-"""Pulse-shape libraries in files: ideal ones found and checked, those of currents merged."""
+"""Pulse-shape libraries in files: those of charge checked, those of currents merged."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class IdealLibrary:
         group = file[path]
         if missing := sorted({"r", "z", "dt"} - set(group)):
             raise CpunetError(
-                f"{where}: no {missing[0]} beside the waveforms; complete the library"
+                f"{where}: no {missing[0]} with the waveforms; complete the library"
             )
         r_mm, z_mm = (_axis(group[name], where, name) for name in ("r", "z"))
         dt, units = group["dt"], units_of(group["dt"])
@@ -84,7 +84,7 @@ class IdealLibrary:
             shape: tuple[int, ...] = values.shape if numbers else ()
             if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 2:
                 raise CpunetError(
-                    f"{where}/{name}: shape {shape} beside r and z of {len(r_mm)} and "
+                    f"{where}/{name}: shape {shape} with r and z of {len(r_mm)} and "
                     f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
                 )
         angles = tuple(name.removeprefix("waveform_") for name in names)
@@ -129,7 +129,7 @@ def chosen_libraries(
     wanted
         Names given by the user, or an empty sequence.
     known
-        Detector that the run was trained with, if known.
+        Detector that the run was trained with; None if unknown.
 
     Raises
     ------
@@ -137,24 +137,24 @@ def chosen_libraries(
         If there is no library, a named one is missing, or none belongs to the detector of the
         run.
     """
-    there = _libraries(file)
-    if not there:
+    names = _libraries(file)
+    if not names:
         raise CpunetError(
             f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
             "struct{r, z, dt, t0, waveform_000_deg}"
         )
-    held = ", ".join(path or "/" for path in there)
+    held = ", ".join(path or "/" for path in names)
     for name in wanted:
-        if name not in there:
+        if name not in names:
             raise CpunetError(f"{source}: no library of {name}; the file has {held}")
     if wanted:
         return list(dict.fromkeys(wanted))
     if known is None:
-        return there
-    if known not in there:
+        return names
+    if known not in names:
         raise CpunetError(
             f"{source}: a library of {held}, but the run was trained with a simulation of "
-            f"{known}; give the library of {known}, or `detector` {there[0]} to use this one "
+            f"{known}; give the library of {known}, or `detector` {names[0]} to use this one "
             "all the same"
         )
     return [known]
@@ -162,26 +162,21 @@ def chosen_libraries(
 
 def _libraries(file: h5py.File) -> list[str]:
     """Paths of the groups that hold templates."""
-    found: set[str] = set()
+    groups: set[str] = set()
 
     def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
         group, _, last = name.rpartition("/")
         if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
-            found.add(group)
+            groups.add(group)
 
     file.visititems(visit)
-    return sorted(found)
-
-
-def _is_current(library: h5py.Group) -> bool:
-    """Whether times are relative to the maxima, as those of currents are."""
-    return {"r", "z", "dt", "t0"} <= library.keys() and bool(library["t0"][()] < 0)
+    return sorted(groups)
 
 
 def known_detector(run: Run) -> str | None:
     """Name of the detector whose simulation a run was trained with; None if unknown."""
     if run.folder is not None:
-        with suppress(CpunetError):  # there for a calibrated run
+        with suppress(CpunetError):  # only a calibrated run has it
             if name := read_values(run.folder / "detector.yaml").get("name"):
                 return str(name)
     return run.sim.detector
@@ -259,7 +254,7 @@ def merge_libraries(
     Parameters
     ----------
     sources
-        Files that `cpunet library translate` made, each of one detector or more.
+        Files that `cpunet library translate` made, each of some detectors.
     out
         File to write.
     force
@@ -281,7 +276,13 @@ def merge_libraries(
     with written_hdf5(out) as (made, _):
         for path in paths:
             with opened(path) as file:
-                names = [name for name in _libraries(file) if name and _is_current(file[name])]
+                names = [
+                    name  # times of currents are relative to their maxima
+                    for name in _libraries(file)
+                    if name
+                    and {"r", "z", "dt", "t0"} <= file[name].keys()
+                    and file[name]["t0"][()] < 0
+                ]
                 if not names:
                     raise CpunetError(
                         f"{path}: no current library; make it with `cpunet library translate`"

@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.legend.library_files import put_array, put_column
+from cpunet.legend.library_files import PERIOD_NS, put_array, put_column
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.writing import written_hdf5
 from cpunet.settings import Set
-from cpunet.simulation.geometry import Detector, FloatArray
+from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import detector_and_settings
 from cpunet.simulation.simulator import Simulator
 
-# Sampling of SolidStateDetectors.jl's libraries; reboost's surface model needs 1 ns.
-DT_NS, LENGTH_NS = 1.0, 5000.0
+LENGTH_NS = 5000.0  # as in libraries of SolidStateDetectors.jl
 ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
 ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
@@ -83,7 +82,8 @@ def make_library(
         Spacing of the places in r and z.
     settings
         Override a value of the detector or the simulation, bias_V=3500, or all those in a YAML
-        file (repeatable); templates have dt_ns=1 and length_ns=5000 without.
+        file (repeatable); templates have length_ns=5000 without. Their period is 1 ns, as
+        production reads them.
     force
         Replace an existing file.
 
@@ -102,20 +102,27 @@ def make_library(
     --------
     cpunet library make --detector icpc --out psl.lh5
 
-    cpunet library make --detector icpc --out psl.lh5 --grid-mm 0.5 --set dt_ns=2
+    cpunet library make --detector icpc --out psl.lh5 --grid-mm 0.5 --set length_ns=3000
     """
     out = Path(out)
     words = () if isinstance(settings, Mapping) else settings
     inputs = [given for given in (detector, *words) if isinstance(given, str | Path)]
     refuse_existing(out, *inputs, force=force)
     detector, wanted = detector_and_settings(
-        detector, settings, dt_ns=DT_NS, length_ns=LENGTH_NS
+        detector, settings, dt_ns=PERIOD_NS, length_ns=LENGTH_NS
     )
+    if wanted.dt_ns != PERIOD_NS:
+        raise CpunetError(
+            f"settings: dt_ns = {wanted.dt_ns:g}: templates are sampled every nanosecond, as "
+            "production reads them; leave dt_ns out"
+        )
     if not (math.isfinite(grid_mm) and grid_mm > 0):
         raise CpunetError(f"`grid_mm` is {grid_mm}; expected more than 0")
     simulator = Simulator(detector, wanted)
-    fields = simulator.fields
-    r_mm, z_mm = (_places(fields.r_mm, grid_mm), _places(fields.z_mm, grid_mm))
+    r_mm, z_mm = (
+        np.arange(int(axis[-1] / grid_mm + 1e-6) + 1) * grid_mm
+        for axis in (simulator.fields.r_mm, simulator.fields.z_mm)
+    )
     counts = MadeLibrary(out)
     total = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
     shape = (len(r_mm), len(z_mm))
@@ -146,8 +153,3 @@ def make_library(
         if not counts.written:
             raise CpunetError(f"{counts}; give a finer grid or longer records")
     return counts
-
-
-def _places(axis_mm: FloatArray, grid_mm: float) -> FloatArray:
-    """Multiples of the grid spacing within the axis."""
-    return np.asarray(np.arange(int(axis_mm[-1] / grid_mm + 1e-6) + 1) * grid_mm)

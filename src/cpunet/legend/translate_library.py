@@ -154,7 +154,7 @@ class TranslatedLibrary:
     numbers: dict[str, LibraryNumbers]
 
     def __str__(self) -> str:
-        return "\n".join(f"{self.path}: {name}: {one}" for name, one in self.numbers.items())
+        return "\n".join(f"{self.path}: {name}: {of}" for name, of in self.numbers.items())
 
 
 def translate_library(
@@ -183,7 +183,7 @@ def translate_library(
     run
         A trained run with a readout chain, or its folder.
     library
-        LH5 file of one library or more.
+        LH5 file of libraries.
     out
         LH5 file to write.
     detector
@@ -216,13 +216,13 @@ def translate_library(
         ideal = [IdealLibrary.of(given, name, source) for name in names]
         made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
         with written_hdf5(out) as (made, _):
-            for one in ideal:
-                group = made.require_group(one.path)
-                found = _write(translate, one, given[one.path], group, source)
+            for charge in ideal:
+                group = made.require_group(charge.path)
+                counted = _write(translate, charge, given[charge.path], group, source)
                 content = {"cpunet": cpunet.__version__, "rings": RINGS, **made_from}
-                group.attrs["cpunet"] = json.dumps(content | asdict(found))
+                group.attrs["cpunet"] = json.dumps(content | asdict(counted))
                 describe(group)
-                numbers[one.path] = found
+                numbers[charge.path] = counted
     return TranslatedLibrary(out, numbers)
 
 
@@ -233,7 +233,7 @@ def _write(
     group: h5py.Group,
     source: Path,
 ) -> LibraryNumbers:
-    """Write currents, and drift times within the crystal and beside it."""
+    """Write currents, and drift times within the crystal and about it."""
     step = np.zeros((1, STEP_LENGTH), np.float32)
     step[:, STEP_SAMPLE:] = 1
     delay_ns = float(currents_about_peak(translate(step))[1][0]) - STEP_SAMPLE
@@ -246,18 +246,29 @@ def _write(
         for angle in library.angles:
             currents[angle] = np.full((*shape, LENGTH), np.nan, np.float32)
             times[angle] = np.full(shape, np.nan)
-            there = currents[angle][inner], times[angle][inner]
+            within = currents[angle][inner], times[angle][inner]
             for rows, charge in _blocks(given[f"waveform_{angle}"], library, source):
                 held = ~np.isnan(charge[:, :, 0])
                 templates = charge[held]
-                there[0][rows][held], when = currents_about_peak(translate(templates))
-                there[1][rows][held] = when - delay_ns
+                within[0][rows][held], when = currents_about_peak(translate(templates))
+                within[1][rows][held] = when - delay_ns
                 ends, heights = templates[:, -1], np.abs(templates).max(axis=1)
                 not_ending += int((np.isfinite(when) & (ends < MIN_END * heights)).sum())
                 bar.update(held.size)
-    inside = {angle: np.isfinite(found[inner]) for angle, found in times.items()}
+    inside = {angle: np.isfinite(when[inner]) for angle, when in times.items()}
     translated = sum(int(mask.sum()) for mask in inside.values())
-    _require_charge(f"{source}: {library.path}", library.n_templates, translated, not_ending)
+    where = f"{source}: {library.path}"
+    if not translated:
+        raise CpunetError(
+            f"{where}: none of {library.n_templates} templates can be translated; are they "
+            "charge pulses?"
+        )
+    if 2 * not_ending > translated:
+        raise CpunetError(
+            f"{where}: {not_ending} of {translated} templates end below half of their maximum: "
+            "these are currents, of negative sign, or behind electronics already; give the "
+            "library of charge pulses"
+        )
     require_complete(inside, library, source)
     amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
     mode = most_frequent(np.concatenate(amplitudes).astype(float))
@@ -302,17 +313,3 @@ def _blocks(
             )
         charge[~charge.any(axis=2)] = np.nan
         yield slice(first, first + len(charge)), charge
-
-
-def _require_charge(where: str, n: int, translated: int, not_ending: int) -> None:
-    """Raise an error if none of `n` templates has a signal, or most end below their height."""
-    if not translated:
-        raise CpunetError(
-            f"{where}: none of {n} templates can be translated; are they charge pulses?"
-        )
-    if 2 * not_ending > translated:
-        raise CpunetError(
-            f"{where}: {not_ending} of {translated} templates end below half of their maximum: "
-            "these are currents, of negative sign, or behind electronics already; give the "
-            "library of charge pulses"
-        )

@@ -55,7 +55,7 @@ class StoredSimulation:
             text = content[_PULSES].attrs.get("simulation") if _PULSES in content else None
             if text is None or HIT_TABLE not in content:
                 raise CpunetError(
-                    f"{file}: no {_PULSES} with its simulation and {HIT_TABLE} beside it; give "
+                    f"{file}: no {_PULSES} with its simulation, or no {HIT_TABLE}; give "
                     "an output of cpunet simulate or of a test stand"
                 )
             numbers = np.asarray(content[f"{_PULSES}/event_number"][()])
@@ -83,7 +83,7 @@ class StoredSimulation:
 
 # Maximum number of time steps that a drift step of quick pulses replaces.
 _QUICK_STRIDE = 5
-# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are kept.
+# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are held.
 _MAX_SHAPES = 4
 
 
@@ -141,18 +141,14 @@ class SameHits:
         CpunetError
             If the detector is not depleted, or a hit is not finite.
         """
-        fields = superposed_fields(self._solution(detector), detector, depletion=False)
-        steps = settings.steps_per_sample if quick else 1
-        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
-        simulator = Simulator(detector, settings, fields=fields, stride=stride)
-        return simulator.events(self._hits[:most])
-
-    def _solution(self, detector: Detector) -> Superposition:
-        """Potentials of a detector."""
         key = detector.fingerprint(exclude=NOT_IN_PARTS)
         if key not in self._solutions:
             if len(self._solutions) == _MAX_SHAPES:
                 # keep the first, with which all others are compared
                 del self._solutions[list(self._solutions)[1]]
             self._solutions[key] = solve(detector)
-        return self._solutions[key]
+        fields = superposed_fields(self._solutions[key], detector, depletion=False)
+        steps = settings.steps_per_sample if quick else 1
+        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
+        simulator = Simulator(detector, settings, fields=fields, stride=stride)
+        return simulator.events(self._hits[:most])

@@ -100,20 +100,16 @@ def _merge(
                         label[other] = n
                         queue[waiting] = other
                         waiting += 1
-            _average(position, energy, queue[:waiting], merged[n])
+            row = merged[n]
+            for member in queue[:waiting]:
+                row[3] += energy[member]
+            for axis in range(3):
+                # relative to the first, so that equal positions are preserved exactly
+                origin = position[first, axis]
+                shift = 0.0
+                for member in queue[:waiting]:
+                    shift += energy[member] * (position[member, axis] - origin)
+                row[axis] = origin + (shift / row[3] if row[3] > 0.0 else 0.0)
             n += 1
         new_offsets[event + 1] = n
     return merged[:n], new_offsets
-
-
-@kernel
-def _average(position: Array, energy: Array, members: Integers, row: Array) -> None:
-    for member in members:
-        row[3] += energy[member]
-    for axis in range(3):
-        # relative to the first, so that equal positions are preserved exactly
-        origin = position[members[0], axis]
-        shift = 0.0
-        for member in members:
-            shift += energy[member] * (position[member, axis] - origin)
-        row[axis] = origin + (shift / row[3] if row[3] > 0.0 else 0.0)

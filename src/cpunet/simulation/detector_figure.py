@@ -53,9 +53,40 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     bar = f"Weighting potential, lines at {low} to {lines[1][-1]}"
     how = {"cmap": "cividis", "norm": LogNorm(low / 10, 1)}
     _map(panels[1], fields, weighting, lines[1], bar, how)
-    _paths(panels[0], detector, fields)
+    r, z = np.meshgrid(
+        np.array([0.35, 0.75]) * detector.crystal_radius,
+        np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
+    )
+    # well away from the surfaces of the active germanium
+    margin = 0.05 * detector.crystal_radius
+    inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
+    r, z = r[inside], z[inside]
+    electrons, holes = Simulator(detector, _SETTINGS, fields=fields).paths(r, 0.0, z)
+    for carrier, colour in ((electrons, _ELECTRON), (holes, _HOLE)):
+        for track in carrier:
+            # a light outline keeps the line visible everywhere on the map
+            radius, height = np.hypot(track[:, 0], track[:, 1]), track[:, 2]
+            panels[0].plot(radius, height, color="white", linewidth=2.2, alpha=0.75)
+            panels[0].plot(radius, height, color=colour, linewidth=1.2)
+    panels[0].plot(r, z, "o", color="white", markeredgecolor="black", markersize=4)
+    # contacts and lithium layer filled, the outside and the ditch blank
+    step = max(detector.crystal_length, detector.crystal_radius) / _OUTLINE_POINTS
+    at_r = np.arange(0, 1.05 * detector.crystal_radius, step)
+    at_z = np.arange(0, 1.05 * detector.crystal_length, step)
+    rr, zz = np.meshgrid(at_r, at_z)
+    inside, region = detector.inside(rr, zz), detector.region(rr, zz)
+    covers = [(~inside, "white")]
+    covers += [(inside & (region == n), c) for n, _, c in _REGIONS]
     for axes in panels:
-        _outline(axes, detector)
+        for where, colour in covers:
+            # slightly too wide, so that no gap shows between two patches
+            cover = where.astype(float)
+            axes.contourf(at_r, at_z, cover, [0.3, 1.5], colors=[colour], zorder=2.2)
+        edge = inside.astype(float)
+        axes.contour(at_r, at_z, edge, [0.5], colors="black", linewidths=1.0, zorder=2.3)
+        # contours do not run along the edge of the axes
+        bottom = np.where(inside[0], 0.0, np.nan)
+        axes.plot(at_r, bottom, color="black", linewidth=1.0, zorder=2.3)
         axes.set(xlabel="r [mm]", aspect="equal")
         axes.grid(visible=False)
         axes.set_xlim(0, detector.crystal_radius * 1.02)
@@ -92,40 +123,3 @@ def _map(
     axes.figure.colorbar(
         image, ax=axes, label=bar, location="bottom", shrink=0.95, pad=0.02, aspect=25
     )
-
-
-def _paths(axes: Axes, detector: Detector, fields: FieldMaps) -> None:
-    r, z = np.meshgrid(
-        np.array([0.35, 0.75]) * detector.crystal_radius,
-        np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
-    )
-    # well away from the surfaces of the active germanium
-    margin = 0.05 * detector.crystal_radius
-    inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
-    r, z = r[inside], z[inside]
-    electrons, holes = Simulator(detector, _SETTINGS, fields=fields).paths(r, 0.0, z)
-    for carrier, colour in ((electrons, _ELECTRON), (holes, _HOLE)):
-        for track in carrier:
-            # a light outline keeps the line visible everywhere on the map
-            radius, height = np.hypot(track[:, 0], track[:, 1]), track[:, 2]
-            axes.plot(radius, height, color="white", linewidth=2.2, alpha=0.75)
-            axes.plot(radius, height, color=colour, linewidth=1.2)
-    axes.plot(r, z, "o", color="white", markeredgecolor="black", markersize=4)
-
-
-def _outline(axes: Axes, detector: Detector) -> None:
-    """Fill contacts and lithium layer, blank the outside and the ditch, draw the outline."""
-    step = max(detector.crystal_length, detector.crystal_radius) / _OUTLINE_POINTS
-    r = np.arange(0, 1.05 * detector.crystal_radius, step)
-    z = np.arange(0, 1.05 * detector.crystal_length, step)
-    rr, zz = np.meshgrid(r, z)
-    inside, region = detector.inside(rr, zz), detector.region(rr, zz)
-    covers = [(~inside, "white")]
-    covers += [(inside & (region == n), c) for n, _, c in _REGIONS]
-    for where, colour in covers:
-        # slightly too wide, so that no gap shows between two patches
-        axes.contourf(r, z, where.astype(float), [0.3, 1.5], colors=[colour], zorder=2.2)
-    axes.contour(r, z, inside.astype(float), [0.5], colors="black", linewidths=1.0, zorder=2.3)
-    # contours do not run along the edge of the axes
-    bottom = np.where(inside[0], 0.0, np.nan)
-    axes.plot(r, bottom, color="black", linewidth=1.0, zorder=2.3)

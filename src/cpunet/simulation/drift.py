@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from cpunet.kernels import kernel
-from cpunet.simulation.field_lookup import DriftMaps, look_up
+from cpunet.simulation.field_lookup import DriftMaps, in_ditch, look_up
 from cpunet.simulation.velocity import HOLE, FloatArray, carrier_velocity
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
@@ -236,23 +236,22 @@ def drift(
         the signal lost to trapping.
     """
     x, y, z = start
-    ahead = (stride - 1) / (2 * stride)
     ux = uy = uz = 0.0
+    ahead = (stride - 1) / (2 * stride)
     sign = 1.0 if carrier == HOLE else -1.0
     size, diffusion, repulsion = cloud
     first = last = speed = induced = 0.0
     rate = maps.trapping_per_ns[carrier]
     # surviving charge, half a step earlier
     left, survival = math.exp(0.5 * rate * step_ns), math.exp(-rate * step_ns)
-    n = len(signal)
-    k, collected = 0, False
+    k, n, collected = 0, len(signal), False
     while k < n:
         r = math.sqrt(x * x + y * y)  # math.hypot takes a sixth of the loop
         er, ez, wp, potential, usable = look_up(maps, r, z)
         if not usable:
-            # beyond the surface of a contact: the remaining signal is induced in this step
+            # beyond the surface of a contact: the remaining signal is induced in this step;
+            # electrons at the ditch end as in siggen, as if at the lithium about it
             wp = 1.0 if last > 0.3 else 0.0
-            collected = True
         if k == 0:
             first = wp
         if rate == 0.0:
@@ -263,11 +262,8 @@ def drift(
         signal[k] += induced
         if len(path) > 0:
             path[k, 0], path[k, 1], path[k, 2] = x, y, z
-        if carrier == HOLE:
-            at_edge = k > 0 and wp >= _AT_CONTACT and wp - last < _CREEPING
-            collected |= 1.0 - wp < _COLLECTED or at_edge or (potential <= 0.0 and usable)
-        else:
-            collected |= wp < _COLLECTED or potential >= maps.bias_V
+        rise = wp - last if k > 0 else 1.0
+        collected = not usable or _arrived(carrier, wp, rise, potential, maps.bias_V)
         last = wp
         if collected:
             break
@@ -283,16 +279,38 @@ def drift(
         speed = now
         if k == n - 1:
             break
-        if stride > 1:
-            wx, wy, wz = vx, vy, vz
-            if k > 0:
-                vx += ahead * (vx - ux)
-                vy += ahead * (vy - uy)
-                vz += ahead * (vz - uz)
-            ux, uy, uz = wx, wy, wz
-        # no charge leaves through the passivated face: it slides along the face
-        x, y, z = x + vx * step_ns, y + vy * step_ns, max(z + vz * step_ns, 0.0)
+        wx, wy, wz = vx, vy, vz
+        if k > 0:
+            vx, vy, vz = vx + ahead * (vx - ux), vy + ahead * (vy - uy), vz + ahead * (vz - uz)
+        ux, uy, uz = wx, wy, wz
+        x, y, z = _moved(maps, carrier, (x, y, z), (vx * step_ns, vy * step_ns, vz * step_ns))
         k += 1
     for later in range(k + 1, n):
         signal[later] += induced
     return k, collected, size, speed, sign * (last - first) - induced
+
+
+@kernel(inline="always")
+def _arrived(carrier: int, wp: float, rise: float, potential: float, bias_V: float) -> bool:
+    """Whether a carrier is collected at a weighting potential, after its `rise` in a step."""
+    if carrier == HOLE:
+        at_edge = wp >= _AT_CONTACT and rise < _CREEPING
+        return 1.0 - wp < _COLLECTED or at_edge or potential <= 0.0
+    return wp < _COLLECTED or potential >= bias_V
+
+
+@kernel(inline="always")
+def _moved(
+    maps: DriftMaps,
+    carrier: int,
+    here: tuple[float, float, float],
+    step: tuple[float, float, float],
+) -> tuple[float, float, float]:
+    """Place after a step. Charges slide along the passivated face, holes along the ditch."""
+    x, y, z = here[0] + step[0], here[1] + step[1], max(here[2] + step[2], 0.0)
+    p = math.sqrt(x * x + y * y) * maps.per_mm
+    if carrier != HOLE or not in_ditch(maps, p, z * maps.per_mm):
+        return x, y, z
+    if not in_ditch(maps, p, here[2] * maps.per_mm):  # along its floor
+        return x, y, here[2]
+    return here[0], here[1], z

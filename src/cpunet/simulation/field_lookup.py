@@ -37,9 +37,9 @@ class DriftMaps(NamedTuple):
     """Field maps and velocities in the form the compiled loops take.
 
     ``values`` is (nr, nz, 4): field in r and z (V/cm), weighting potential, potential (V).
-    ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, ``ditch``
-    (nr, nz) the nodes that stop it. ``trapping_per_ns`` holds the trapping rates of electrons
-    and holes.
+    ``usable`` (nr - 1, nz - 1) marks the cells in which a charge can drift, ``ditch`` the
+    nodes of the ditch (nr, those up to its top). ``trapping_per_ns`` holds the trapping rates
+    of electrons and holes.
     """
 
     values: FloatArray
@@ -72,12 +72,12 @@ def drift_maps(
     if not with_field.any():
         raise CpunetError("the field maps hold no field; compute them again")
     bias = float(np.nanmax(stacked[..., VOLTS]))
-    values, known = with_ghost_nodes(np.where(with_field[..., None], stacked, 0.0), with_field)
-    usable = _all_corners(known) & ~_all_corners(~with_field)
+    values, filled = with_ghost_nodes(np.where(with_field[..., None], stacked, 0.0), with_field)
+    usable = _all_corners(filled) & ~_all_corners(~with_field)
     parts = math.ceil(fields.grid_mm / _FINE_MM - 1e-6)
     if parts > 1:
         for _ in range(_SPLINE_GHOSTS):
-            values, known = with_ghost_nodes(values, known)
+            values, filled = with_ghost_nodes(values, filled)
         values = _refined(values, parts, mirror=not stacked[:, 0, E_Z].any())
         cells = np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_))
         ditch = ~_all_corners(~np.pad(cells, 1))  # nodes at the corners of these cells
@@ -86,7 +86,7 @@ def drift_maps(
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,
-        ditch=ditch,
+        ditch=np.ascontiguousarray(ditch[:, : ditch.any(0).argmin()]),
         per_mm=parts / fields.grid_mm,
         bias_V=bias,
         coefficients=table.coefficients,
@@ -119,40 +119,47 @@ def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
     return np.stack([spline(fine_r, fine_z) for spline in splines], axis=-1)
 
 
-def with_ghost_nodes(values: FloatArray, known: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Extrapolate linearly by one node along r and z, then around the corners.
+def with_ghost_nodes(values: FloatArray, given: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Extrapolate linearly by a node along r and z, then around the corners.
 
-    A node next to two known ones in line becomes twice the nearer value minus the farther.
+    A node next to two given nodes in line becomes twice the nearer value minus the farther.
 
     Parameters
     ----------
     values
         Array of shape ``(nr, nz, ...)``.
-    known
+    given
         Boolean array (nr, nz): nodes with a value.
 
     Examples
     --------
-    >>> values, known = np.array([[1.0], [2.0], [0.0]]), np.array([[True], [True], [False]])
-    >>> with_ghost_nodes(values, known)[0].ravel().tolist()
+    >>> values, given = np.array([[1.0], [2.0], [0.0]]), np.array([[True], [True], [False]])
+    >>> with_ghost_nodes(values, given)[0].ravel().tolist()
     [1.0, 2.0, 3.0]
     """
-    nr, nz = known.shape
+    nr, nz = given.shape
     for _ in range(2):
-        total, ways, padded = np.zeros_like(values), np.zeros(known.shape), np.pad(known, 2)
+        total, ways, padded = np.zeros_like(values), np.zeros(given.shape), np.pad(given, 2)
         for dr, dz in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            one, two = (
+            nearer, farther = (
                 padded[2 + n * dr : 2 + n * dr + nr, 2 + n * dz : 2 + n * dz + nz]
                 for n in (1, 2)
             )
-            i, j = np.nonzero(one & two & ~known)
+            i, j = np.nonzero(nearer & farther & ~given)
             total[i, j] += 2 * values[i + dr, j + dz] - values[i + 2 * dr, j + 2 * dz]
             ways[i, j] += 1
-        found = np.nonzero(ways)
+        new = np.nonzero(ways)
         filled = values.copy()
-        filled[found] = (total[found].T / ways[found]).T
-        values, known = filled, known | (ways > 0)
-    return values, known
+        filled[new] = (total[new].T / ways[new]).T
+        values, given = filled, given | (ways > 0)
+    return values, given
+
+
+@kernel(inline="always")
+def in_ditch(maps: DriftMaps, p: float, q: float) -> bool:
+    """Whether a place, at r and z in steps of the maps, is nearest to a node of the ditch."""
+    column, row = int(p + 0.5), int(q + 0.5)
+    return row < maps.ditch.shape[1] and column < len(maps.ditch) and maps.ditch[column, row]
 
 
 @kernel(inline="always")
@@ -165,7 +172,7 @@ def look_up(maps: DriftMaps, r: float, z: float) -> tuple[float, float, float, f
         return 0.0, 0.0, 0.0, 0.0, False
     i, j = int(p), int(q)
     u, v = p - i, q - j
-    if not maps.usable[i, j] or maps.ditch[int(p + 0.5), int(q + 0.5)]:
+    if not maps.usable[i, j] or in_ditch(maps, p, q):
         return 0.0, 0.0, 0.0, 0.0, False
     w00, w10, w01, w11 = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
     m00, m10 = maps.values[i, j], maps.values[i + 1, j]

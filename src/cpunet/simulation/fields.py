@@ -7,10 +7,10 @@ With space charge everywhere the potential is linear in its sources,
 with the bias :math:`b`, the scale :math:`s` and the tilt :math:`t` of the impurities. The parts
 are :math:`w` (1 on the lithium contact), :math:`u` (impurities as given), :math:`v` (unit
 tilt) and :math:`q` (surface charge). Bias, scale and tilt therefore need no new solution; the
-parts are kept on disk, so that each detector is solved only once.
+parts are stored on disk, so that each detector is solved only once.
 
 This is the true potential if it has no pocket in which holes would collect: no local minimum
-apart from the electrodes. At such a minimum, or wherever the potential is below 0, germanium
+except the electrodes. At such a minimum, or wherever the potential is below 0, germanium
 is not depleted, and the potential is refused.
 """
 
@@ -19,7 +19,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -92,21 +91,15 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
     minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
         region == GERMANIUM
     )
-    # deepest first: a true pocket is found early
     where = np.argwhere(minima)
-    order = np.argsort(potential[minima])
-    return any(_holds(potential, region, *map(int, where[k])) for k in order)
-
-
-def _holds(potential: FloatArray, region: RegionArray, row: int, column: int) -> bool:
-    """Whether leaving a minimum requires a climb of more than `POCKET_DEPTH_V`.
-
-    Otherwise a lower node or a contact can be reached from it below that level.
-    """
-    start = potential[row, column]
-    basins, _ = label(potential <= start + POCKET_DEPTH_V, np.ones((3, 3)))
-    basin = basins == basins[row, column]
-    return bool((region[basin] >= GERMANIUM).all() and (potential[basin] >= start).all())
+    for row, column in where[np.argsort(potential[minima])]:  # a true pocket is deep
+        start = potential[row, column]
+        basins, _ = label(potential <= start + POCKET_DEPTH_V, np.ones((3, 3)))
+        basin = basins == basins[row, column]
+        # below that level it leads neither to a contact nor to a lower node
+        if (region[basin] >= GERMANIUM).all() and (potential[basin] >= start).all():
+            return True
+    return False
 
 
 # part of the file name, so that results of an older solver are not used
@@ -117,21 +110,6 @@ def cache_file(key: str) -> Path:
     """Cache file of the potentials of a detector with the fingerprint `key`."""
     folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
     return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
-
-
-def kept_parts(key: str) -> tuple[Grid, Potentials, float] | None:
-    """Load grid, potentials and depletion voltage (V) of `key` from the cache.
-
-    Returns None if they are missing or damaged.
-    """
-    try:
-        arrays = read_arrays(cache_file(key))
-        kept: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
-        grid = Grid(**{field.name: kept[field.name] for field in fields(Grid)})
-        parts = Potentials(**{field.name: kept[field.name] for field in fields(Potentials)})
-        return grid, parts, kept["depletion_V"]
-    except (CpunetError, LookupError):
-        return None  # solved again and overwritten
 
 
 # fields that do not affect the parts of the potential
@@ -238,8 +216,13 @@ def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     unit = detector.model_copy(
         update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
     )
-    if cache and (kept := kept_parts(key)) is not None:
-        return Superposition(unit, *kept)
+    if cache:
+        with suppress(CpunetError, LookupError):  # if damaged, solved again and overwritten
+            arrays = read_arrays(cache_file(key))
+            stored: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
+            grid = Grid(**{field.name: stored[field.name] for field in fields(Grid)})
+            parts = {field.name: stored[field.name] for field in fields(Potentials)}
+            return Superposition(unit, grid, Potentials(**parts), stored["depletion_V"])
     grid = make_grid(unit)
     log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
     potentials = solve_potentials(unit, grid)
@@ -248,8 +231,8 @@ def solve(detector: Detector, *, cache: bool = True) -> Superposition:
     if cache:
         # atomically; a cache that cannot be written is ignored
         with suppress(CpunetError), written_aside(cache_file(key)) as aside:
-            arrays = vars(grid) | vars(potentials) | {"depletion_V": depletion}
-            np.savez(aside, allow_pickle=False, **arrays)
+            content = vars(grid) | vars(potentials) | {"depletion_V": depletion}
+            np.savez(aside, allow_pickle=False, **content)
     return Superposition(unit, grid, potentials, depletion)
 
 
@@ -318,7 +301,7 @@ def superposed_fields(
     grid, parts = solution.grid, solution.potentials
     impurities = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
     potential = solution.potential_V(detector.bias_V, *impurities)
-    # without a charge or a plane there, the field has no component normal to the face z = 0
+    # without a charge or a plane below it, the field has no component normal to the face z = 0
     mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
     e_r, e_z = electric_field(potential, grid, mirror=mirror)
     return FieldMaps(
@@ -339,7 +322,7 @@ def scaled_to_depletion(detector: Detector) -> Detector:
     """Detector with its impurities scaled so that it depletes at the measured voltage.
 
     Manufacturers measure impurity densities to about 10 %, while the depletion voltage is
-    known to a few volts.
+    measured to a few volts.
 
     Raises
     ------
@@ -423,7 +406,7 @@ def electric_field(
 
 def _slope(potential: FloatArray, steps: FloatArray, region: RegionArray) -> FloatArray:
     """Derivative along the first axis of the parabola through a node and its neighbours."""
-    # across a wall of the ditch the slope jumps: only the germanium side counts there
+    # across a wall of the ditch the slope jumps: only the germanium side counts
     ditch = region == DITCH
     vacuum = ditch[:-1] & ditch[1:]
     rise = np.diff(potential, axis=0) / steps
@@ -450,15 +433,12 @@ def fields_in_words(detector: Detector, fields: FieldMaps) -> list[tuple[str, st
         ("measured depletion", f"{measured:g} V" if measured else ""),
         ("impurity_scale", f"{scale:.6g}" if scale != 1 else ""),
         ("bias", f"{detector.bias_V:g} V"),
-        ("lowest field", _at(fields, np.where(bulk, strength, np.inf), np.argmin)),
-        ("highest field", _at(fields, np.where(bulk, strength, -np.inf), np.argmax)),
     ]
+    for name, node in (
+        ("lowest field", np.where(bulk, strength, np.inf).argmin()),
+        ("highest field", np.where(bulk, strength, -np.inf).argmax()),
+    ):
+        i, j = np.unravel_index(node, strength.shape)
+        place = f"r {fields.r_mm[i]:.1f}, z {fields.z_mm[j]:.1f} mm"
+        lines.append((name, f"{strength[i, j]:.0f} V/cm at {place}"))
     return [(name, text) for name, text in lines if text]
-
-
-def _at(
-    fields: FieldMaps, strength: FloatArray, extreme: Callable[[FloatArray], np.intp]
-) -> str:
-    i, j = np.unravel_index(extreme(strength), strength.shape)
-    place = f"r {fields.r_mm[i]:.1f}, z {fields.z_mm[j]:.1f} mm"
-    return f"{strength[i, j]:.0f} V/cm at {place}"

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import chain
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ Angle = Annotated[float, Field(ge=0, lt=90)]
 _Size = Annotated[float, Field(gt=0, le=1000)]  # mm
 _Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # mm; of an exponential, either sign
 _Density = Annotated[float, Field(ge=-1e4, le=1e4)]
+
+FIELDGEN_HALF_STEP_MM = 0.05
+"""fieldgen's ditch includes the nodes on its walls: half a step more of its usual grid."""
 
 
 class Detector(Config):
@@ -51,11 +54,11 @@ class Detector(Config):
     The tilt :math:`t` adds to the gradient but not to the mean. Gradient and tilt are per cm
     of :math:`z`. ``measured_depletion_V`` (0 if unknown) can be used to determine the scale.
 
-    ``siggen_conventions`` places the lithium boundary on tapers, the walls of the ditch (half
-    a grid step wider) and the charge in the ditch as fieldgen does, so that pulses agree with
-    siggen's. Without it the geometry is exact. docs/simulation.md gives the difference.
-    The surface charge lies on the germanium of z = 0; without the conventions also on the walls
-    and the floor of the ditch.
+    ``siggen_conventions`` places the lithium boundary on tapers, the walls of the ditch
+    (0.05 mm wider) and the charge in the ditch as fieldgen does on its grid of 0.1 mm, so that
+    pulses agree with siggen's. Without it the geometry is exact; docs/simulation.md gives the
+    difference. The surface charge lies on the germanium of z = 0; without the conventions also
+    on the walls and the floor of the ditch.
     """
 
     name: str = ""
@@ -105,74 +108,35 @@ class Detector(Config):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Detector:
-        for problem in chain(self._problems_of_shape(), self._problems_of_impurities()):
+        for problem in chain(self._missing(), self._overlaps(), self._reaches()):
             raise ValueError(problem)
         return self
 
-    def _problems_of_shape(self) -> Iterable[str]:
-        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
-        outer, inner, bottom = self.taper_slopes
-        top_step, bottom_step = self.steps
-        top_radius = radius - self.outer_taper_length * outer - top_step
-        bore_mouth = self.bore_radius + self.inner_taper_length * inner
-        if self.top_groove_depth:
-            bore_mouth = max(bore_mouth, self.top_groove_radius)
-        bottom_radius = radius - self.bottom_taper_length * bottom - bottom_step
-        ditch_inner = self.wrap_around_radius - self.ditch_thickness
-        ends = ("top", "outer", top_step), ("bottom", "bottom", bottom_step)
-        for side, which, depth in ends:
-            bullet = getattr(self, f"{side}_bullet_radius")
-            if depth and bullet:
-                yield f"{side}_bullet_radius and {side}_cylinder_radius cannot both be given"
-            if not 0 <= depth < radius:
-                yield f"{side}_cylinder_radius must be above 0 and at most crystal_radius"
-            if bullet and getattr(self, f"{which}_taper_length"):
-                yield f"{side}_bullet_radius and {which}_taper_length cannot both be given"
-        for one, other in (("bore_length", "bore_radius"), ("ditch_depth", "ditch_thickness")):
-            if (getattr(self, one) > 0) != (getattr(self, other) > 0):
-                yield f"{one} and {other} must both be given, or both be 0"
+    def _missing(self) -> Iterator[str]:
+        """Values that are missing, that exclude each other, or impurities of another kind."""
+        for names in (
+            ("top_bullet_radius", "top_cylinder_length"),
+            ("bottom_bullet_radius", "bottom_cylinder_length"),
+            ("bottom_bullet_radius", "bottom_transition_length"),
+            ("top_bullet_radius", "outer_taper_length"),
+            ("bottom_bullet_radius", "bottom_taper_length"),
+        ):
+            if all(getattr(self, name) for name in names):
+                yield f"{' and '.join(names)} cannot both be given"
+        for names in (
+            ("bore_length", "bore_radius"),
+            ("ditch_depth", "ditch_thickness"),
+            ("impurity_exponential_1e10_per_cm3", "impurity_exponential_length_mm"),
+        ):
+            if len({getattr(self, name) != 0 for name in names}) > 1:
+                yield f"{' and '.join(names)} must both be given, or both be 0"
+        for end, step in zip(("top", "bottom"), self.steps, strict=True):
+            if not 0 <= step < self.crystal_radius:
+                yield f"{end}_cylinder_radius must be above 0 and at most crystal_radius"
         if self.top_groove_depth and not self.top_groove_radius:
             yield "top_groove_depth and top_groove_radius must both be given"
-        if 2 * li >= min(length, radius):
-            yield "li_thickness leaves nothing of the crystal"
-        if self.outer_taper_length + self.bottom_taper_length > length:
-            yield "outer_taper_length and bottom_taper_length exceed crystal_length"
-        if bottom_radius <= max(self.wrap_around_radius, self.point_contact_radius):
-            yield "crystal_radius ends, with bottom_taper_length, inside a contact on z = 0"
-        if self.bore_length + 2 * li + self.point_contact_length >= length:
-            which = "bore_length (with li_thickness)" if self.bore_length else "li_thickness"
-            yield f"{which} reaches the point contact (point_contact_length)"
-        if self.inner_taper_length > self.bore_length:
-            yield "inner_taper_length exceeds bore_length"
-        if self.bore_bullet_radius > min(self.bore_radius, self.bore_length):
-            yield "bore_bullet_radius exceeds bore_radius or bore_length"
-        if top_radius - bore_mouth <= 2 * li:
-            yield "outer_taper_length or inner_taper_length leaves no germanium at the top"
-        if self.top_bullet_radius + self.bottom_bullet_radius > min(length, radius):
-            yield "top_bullet_radius and bottom_bullet_radius exceed the crystal"
-        if self.wrap_around_radius and ditch_inner < self.point_contact_radius:
-            yield "point_contact_radius meets the ditch (wrap_around_radius - ditch_thickness)"
         if self.ditch_depth and not self.wrap_around_radius:
-            yield "ditch_depth needs a wrap_around_radius, the ditch's outer radius"
-        if self.wrap_around_radius >= radius - max(li, self.bottom_bullet_radius):
-            yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
-        if self.point_contact_radius >= bottom_radius - max(li, self.bottom_bullet_radius):
-            yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
-        if self.ditch_depth + max(self.bore_length, self.top_groove_depth) + li >= length:
-            yield "ditch_depth reaches the bore (bore_length) or the top"
-        narrow = self.bottom_cylinder_length + self.bottom_transition_length
-        if narrow + self.top_cylinder_length > length:
-            yield "bottom_cylinder_length and top_cylinder_length exceed crystal_length"
-        if self.grid_mm > self.point_contact_radius / 2:
-            yield "grid_mm does not resolve point_contact_radius; at most half of it"
-
-    def _problems_of_impurities(self) -> Iterable[str]:
-        exponential = self.impurity_exponential_1e10_per_cm3
-        if (exponential != 0) != (self.impurity_exponential_length_mm != 0):
-            yield (
-                "impurity_exponential_1e10_per_cm3 and impurity_exponential_length_mm must "
-                "both be given, or both be 0"
-            )
+            yield "ditch_depth needs a wrap_around_radius, its outer radius"
         z = np.linspace(0, self.crystal_length, 101)
         with np.errstate(over="ignore", invalid="ignore"):
             impurity = self.impurity_1e10_per_cm3(np.array([[0.0], [self.crystal_radius]]), z)
@@ -180,6 +144,51 @@ class Detector(Config):
             yield "impurity_… is not finite; correct impurity_exponential_length_mm"
         if impurity.max() > 0:
             yield "impurity_… is positive (n-type) somewhere in the crystal; p-type is negative"
+
+    def _overlaps(self) -> Iterator[str]:
+        """Parts that do not fit into each other."""
+        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
+        if 2 * li >= min(length, radius):
+            yield "li_thickness leaves nothing of the crystal"
+        if self.outer_taper_length + self.bottom_taper_length > length:
+            yield "outer_taper_length and bottom_taper_length exceed crystal_length"
+        if self.inner_taper_length > self.bore_length:
+            yield "inner_taper_length exceeds bore_length"
+        if self.bore_bullet_radius > min(self.bore_radius, self.bore_length):
+            yield "bore_bullet_radius exceeds bore_radius or bore_length"
+        if self.top_bullet_radius + self.bottom_bullet_radius > min(length, radius):
+            yield "top_bullet_radius and bottom_bullet_radius exceed the crystal"
+        ends = self.top_cylinder_length, self.bottom_cylinder_length
+        if sum(ends) + self.bottom_transition_length > length:
+            yield "bottom_cylinder_length and top_cylinder_length exceed crystal_length"
+        if self.grid_mm > self.point_contact_radius / 2:
+            yield "grid_mm does not resolve point_contact_radius; at most half of it"
+
+    def _reaches(self) -> Iterator[str]:
+        """Contacts, bore and ditch that reach each other or a surface."""
+        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
+        outer, inner, bottom = self.taper_slopes
+        groove = self.top_groove_radius if self.top_groove_depth else 0.0
+        mouth = max(self.bore_radius + self.inner_taper_length * inner, groove)
+        top_radius = radius - self.outer_taper_length * outer - self.steps[0]
+        bottom_radius = radius - self.bottom_taper_length * bottom - self.steps[1]
+        wrap, contact = self.wrap_around_radius, self.point_contact_radius
+        edge = max(li, self.bottom_bullet_radius)
+        if bottom_radius <= max(wrap, contact):
+            yield "crystal_radius ends, with bottom_taper_length, inside a contact on z = 0"
+        if self.bore_length + 2 * li + self.point_contact_length >= length:
+            which = "bore_length (with li_thickness)" if self.bore_length else "li_thickness"
+            yield f"{which} reaches the point contact (point_contact_length)"
+        if top_radius - mouth <= 2 * li:
+            yield "outer_taper_length or inner_taper_length leaves no germanium at the top"
+        if wrap and wrap - self.ditch_thickness < contact:
+            yield "point_contact_radius meets the ditch (wrap_around_radius - ditch_thickness)"
+        if wrap >= radius - edge:
+            yield "wrap_around_radius reaches the outer wall (crystal_radius, li_thickness)"
+        if contact >= bottom_radius - edge:
+            yield "point_contact_radius reaches the lithium of the outer wall (li_thickness)"
+        if self.ditch_depth + max(self.bore_length, self.top_groove_depth) + li >= length:
+            yield "ditch_depth reaches the bore (bore_length) or the top"
 
     @property
     def taper_slopes(self) -> tuple[float, float, float]:
@@ -200,8 +209,7 @@ class Detector(Config):
     @property
     def ditch_walls(self) -> tuple[float, float, float]:
         """Inner and outer radius and depth of the ditch in mm."""
-        # fieldgen's ditch includes the nodes on its walls: half a step more on each side
-        extra = self.grid_mm / 2 if self.siggen_conventions and self.ditch_depth else 0.0
+        extra = FIELDGEN_HALF_STEP_MM if self.siggen_conventions and self.ditch_depth else 0.0
         outer = self.wrap_around_radius
         return outer - self.ditch_thickness - extra, outer + extra, self.ditch_depth + extra
 
@@ -246,7 +254,9 @@ class Detector(Config):
         >>> read_detector("icpc").inside([0, 0, 12, 40], [10, 90, 1, 50])
         array([ True, False, False,  True])
         """
-        return np.asarray(self._at("insides", r, z), np.bool_)
+        from cpunet.simulation import outline  # compiled, which few users of a detector need
+
+        return outline.at(outline.fill_insides, np.bool_, self, r, z)
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
@@ -257,7 +267,7 @@ class Detector(Config):
         >>> read_detector("icpc").active([0, 0, 12, 40], [10, 1, 1, 50])
         array([ True, False, False, False])
         """
-        from cpunet.simulation.outline import GERMANIUM  # see `_at`
+        from cpunet.simulation.outline import GERMANIUM
 
         return np.asarray(self.region(r, z) == GERMANIUM)
 
@@ -266,15 +276,9 @@ class Detector(Config):
 
         Surfaces belong to the contacts and to the ditch.
         """
-        return np.asarray(self._at("regions", r, z), np.int8)
+        from cpunet.simulation import outline
 
-    def _at(self, loop: str, r: npt.ArrayLike, z: npt.ArrayLike) -> Any:
-        """What a loop of `cpunet.simulation.outline` finds at each place."""
-        from cpunet.simulation import outline  # compiled, which few users of a detector need
-
-        r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
-        found = getattr(outline, loop)(outline.Outline.of(self), r.flatten(), z.flatten())
-        return found.reshape(r.shape)
+        return outline.at(outline.fill_regions, np.int8, self, r, z)
 
     def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
         """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""

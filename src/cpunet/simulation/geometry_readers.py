@@ -174,13 +174,15 @@ def _legend(diode: dict[str, Any], given: dict[str, Any], name: str) -> Detector
         for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
         for suffix in _MAPPINGS
     ]
-    found = next(filter(Path.is_file, places), None)
-    content = read_values(found) if found else {}
+    crystal = next(filter(Path.is_file, places), None)
+    content = read_values(crystal) if crystal else {}
     hints, length = why_missing(), values.get("crystal_length")
     if content.get("impurity_curve") is None:
-        hints[_Z0] = f"{found} has no impurity_curve" if found else f"there is no {places[0]}"
+        hints[_Z0] = (
+            f"{crystal} has no impurity_curve" if crystal else f"there is no {places[0]}"
+        )
     elif isinstance(length, int | float):  # else refused with the rest of the geometry
-        values |= impurity_values(content, str(found), slice_name, length)
+        values |= impurity_values(content, str(crystal), slice_name, length)
     return _completed(values, given, name, hints)
 
 
@@ -237,9 +239,9 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     }
     for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
         width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
-        found = math.degrees(math.atan(width / length)) if length else math.nan
-        if length and not math.isclose(found, values.get("taper_angle") or math.nan):
-            fields[angle] = found
+        own_angle = math.degrees(math.atan(width / length)) if length else math.nan
+        if length and not math.isclose(own_angle, values.get("taper_angle") or math.nan):
+            fields[angle] = own_angle
     # siggen keeps the radius and the rounding of a hole that does not exist
     if not fields.get("bore_length"):
         fields = {k: v for k, v in fields.items() if not k.startswith("bore_")}

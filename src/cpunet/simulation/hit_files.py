@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.hit_tables import Steps, StepTable, hit_format, step_tables
+from cpunet.simulation.hit_tables import StepTable, hit_format, step_tables
 from cpunet.simulation.hits import (
     FARTHEST_MM,
     LATE_NS,
@@ -67,7 +67,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
         table, label = _chosen(file, tables, options.hits_detector)
         steps = table.steps(options, label)
         origin = table.origin_mm(label or table.name)
-    hits = _to_hits(file, replace(steps, position_mm=steps.position_mm - origin), options)
+    hits = _to_hits(file, steps, origin, options)
     energy_kev = hits.energy_kev
     if not len(hits):
         raise CpunetError(f"{file}: no step deposits energy; check the detector's name")
@@ -92,35 +92,37 @@ def holds_hits(path: Path | str) -> bool:
 
 def _by_detector(tables: list[StepTable]) -> dict[str, tuple[StepTable, str | None]]:
     """Tables by the names of their detectors, with their labels where they share a table."""
-    found: dict[str, tuple[StepTable, str | None]] = {}
+    detectors: dict[str, tuple[StepTable, str | None]] = {}
     for table in tables:
         labels = table.detectors()
         if len(labels) > 1 or (labels and not table.name):
-            found |= {label: (table, label) for label in labels}
+            detectors |= {label: (table, label) for label in labels}
         else:
-            found[table.name] = (table, None)
-    return found
+            detectors[table.name] = (table, None)
+    return detectors
 
 
 def _chosen(
     path: Path, tables: list[StepTable], detector: str | None
 ) -> tuple[StepTable, str | None]:
     """The table and the label there of the detector wanted, or of the only one."""
-    there = _by_detector(tables)
-    names = ", ".join(there)
-    if detector is None and len(there) > 1:
+    detectors = _by_detector(tables)
+    names = ", ".join(detectors)
+    if detector is None and len(detectors) > 1:
         raise CpunetError(f"{path}: holds detectors {names}; choose one with `hits_detector`")
     if detector is not None and not names:
         raise CpunetError(
             f"{path}: its hits name no detector to pick {detector} by; leave out "
             "`hits_detector`"
         )
-    if detector is not None and detector not in there:
+    if detector is not None and detector not in detectors:
         raise CpunetError(f"{path}: no detector {detector}; it holds {names}")
-    return next(iter(there.values())) if detector is None else there[detector]
+    return next(iter(detectors.values())) if detector is None else detectors[detector]
 
 
-def _to_hits(path: Path, steps: Steps, options: HitOptions) -> Hits:
+def _to_hits(
+    path: Path, steps: dict[str, npt.NDArray[Any]], origin_mm: FloatArray, options: HitOptions
+) -> Hits:
     """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
 
     Positions are moved to the frame of the crystal. An event whose number an earlier one has
@@ -131,36 +133,40 @@ def _to_hits(path: Path, steps: Steps, options: HitOptions) -> Hits:
     CpunetError
         If a step has no finite position, time or energy, or a negative energy.
     """
+    position = np.stack([steps[axis] for axis in "xyz"], axis=1) - origin_mm
+    event, edep, time = steps["event"], steps["edep"], steps.get("time")
     # written so that NaN fails
-    placed = (np.abs(steps.position_mm) <= FARTHEST_MM).all(axis=1)
-    bad = ~(placed & (steps.edep_kev >= 0) & (steps.edep_kev <= MAX_KEV))
-    if steps.time_ns is not None:
-        bad |= ~np.isfinite(steps.time_ns)
+    placed = (np.abs(position) <= FARTHEST_MM).all(axis=1)
+    bad = ~(placed & (edep >= 0) & (edep <= MAX_KEV))
+    if time is not None:
+        bad |= ~np.isfinite(time)
     if bad.any():
-        event = steps.event[np.argmax(bad)]
         raise CpunetError(
-            f"{path}: event {event}: a step has no finite position or time, or no energy of at "
-            f"least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
+            f"{path}: event {event[np.argmax(bad)]}: a step has no finite position or time, or "
+            f"no energy of at least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
             f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
         )
-    kept = steps[steps.edep_kev > 0]
-    first = first_of_event(kept.event, kept.time_ns)
+    kept = edep > 0
+    largest = event.max(initial=-1)
+    event, edep, position = event[kept], edep[kept], position[kept]
+    time = None if time is None else time[kept]
+    first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")
     starts, counts = np.unique(first, return_counts=True)
-    numbers = kept.event[starts]
+    numbers = event[starts]
     again = np.ones(len(numbers), bool)
     again[np.unique(numbers, return_index=True)[1]] = False
-    numbers[again] = steps.event.max(initial=-1) + 1 + np.arange(again.sum())
+    numbers[again] = largest + 1 + np.arange(again.sum())
     hits = Hits.of(
-        options.to_crystal(kept.position_mm[order]),
-        kept.edep_kev[order],
+        options.to_crystal(position[order]),
+        edep[order],
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
     )
-    if kept.time_ns is None or not len(hits):
+    if time is None or not len(hits):
         return hits
-    times, begins = kept.time_ns[order], hits.offsets[:-1]
+    times, begins = time[order], hits.offsets[:-1]
     spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
     return replace(hits, n_late=int((spread > LATE_NS).sum()))
 
@@ -248,30 +254,25 @@ def describe_hits(
         energies, gamma lines and extents in the frame of the file; or the reason why they
         cannot be read.
     """
-    found: dict[str, Lines] = {}
+    detectors: dict[str, Lines] = {}
     with step_tables(path) as tables:
         names = list(_by_detector(tables))
     for name in names:
         try:
             hits = read_hits(path, HitOptions(name or None, units=units))
         except CpunetError as error:
-            found[name] = [("hits", str(error).removeprefix(f"{path}: "))]
-        else:
-            found[name] = _in_words(hits, peaks)
-    return found
-
-
-def _in_words(hits: Hits, peaks: Mapping[str, PeakConfig]) -> list[tuple[str, str]]:
-    energy_kev = hits.energy_kev
-    lines = label_peaks(energy_kev, peaks)
-    places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
-    extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
-    return [
-        ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
-        ("energy", f"{span(_ends(energy_kev))} keV an event"),
-        ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
-        ("extents", f"{', '.join(extents)} mm"),
-    ]
+            detectors[name] = [("hits", str(error).removeprefix(f"{path}: "))]
+            continue
+        lines = label_peaks(hits.energy_kev, peaks)
+        places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
+        extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
+        detectors[name] = [
+            ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
+            ("energy", f"{span(_ends(hits.energy_kev))} keV an event"),
+            ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
+            ("extents", f"{', '.join(extents)} mm"),
+        ]
+    return detectors
 
 
 def _ends(values: FloatArray) -> list[float]:

@@ -39,21 +39,21 @@ _STRAY, _MISPLACED = 1e-3, 0.9
 def energy_windows(
     text: str, peaks: Mapping[str, PeakConfig], half_width_kev: float
 ) -> list[EnergyWindow]:
-    """EnergyWindows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
+    """Windows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
 
     Parameters
     ----------
     text
         Names and ranges, separated by commas.
     peaks
-        Known gamma lines.
+        Gamma lines.
     half_width_kev
         Half-width of the windows around the lines.
 
     Raises
     ------
     CpunetError
-        If a part is neither a known line nor a range.
+        If a part is neither a line of `peaks` nor a range.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def energy_windows(
 def wanted_events(
     events: str | Mapping[str, int], peaks: Mapping[str, PeakConfig], half_width_kev: float
 ) -> dict[EnergyWindow, int]:
-    """EnergyWindows and the events wanted in each.
+    """Windows, and the events wanted in each.
 
     Parameters
     ----------
@@ -105,23 +105,20 @@ def wanted_events(
     if len(set(names)) < len(names):
         raise CpunetError(f"`events` {events}: names a peak twice; give each once")
     windows = energy_windows(",".join(names), peaks, half_width_kev)
-    return dict(zip(windows, (_count(number) for _, number in pairs), strict=True))
-
-
-def _count(text: str) -> int:
-    # underscores and signs, which int() takes, are more likely slips
-    if not re.fullmatch(r"\s*\d{1,9}\s*", text):
-        raise CpunetError(
-            f"`events`: {text[:60]!r} is no number of events; give N or FEP=N,DEP=M"
-        )
-    return int(text)
+    for _, number in pairs:
+        # underscores and signs, which int() takes, are more likely slips
+        if not re.fullmatch(r"\s*\d{1,9}\s*", number):
+            raise CpunetError(
+                f"`events`: {number[:60]!r} is no number of events; give N or FEP=N,DEP=M"
+            )
+    return {window: int(number) for window, (_, number) in zip(windows, pairs, strict=True)}
 
 
 @dataclass(frozen=True)
 class HitFile:
     """Hits of a file, see `cpunet.simulation.hit_files.read_hits`.
 
-    With `windows`, only events with a deposited energy in one of them are used.  `placed` hits
+    With `windows`, only events with a deposited energy within them are used.  `placed` hits
     are those of a simulation: they have been checked against the crystal and merged.
     """
 
@@ -147,7 +144,10 @@ class HitFile:
                 "them numbers of their own"
             )
         if self.windows:
-            hits = hits[_in_windows(hits.energy_kev, self.windows)]
+            # sums of deposits are rounded, in some formats to float32; windows are wider
+            energy = hits.energy_kev
+            inside = [(energy >= w.low_kev) & (energy <= w.high_kev) for w in self.windows]
+            hits = hits[np.logical_or.reduce(inside)]
         if not len(hits):
             names = ", ".join(window.name for window in self.windows)
             raise CpunetError(f"{self.path}: no event in {names}; widen window_kev")
@@ -261,12 +261,6 @@ class GammaSource:
 
 
 HitSource = HitFile | GammaSource
-
-
-def _in_windows(energy_kev: Any, windows: tuple[EnergyWindow, ...]) -> Any:
-    # sums of deposits are rounded, in some formats to float32; windows are wider than that
-    inside = [(energy_kev >= w.low_kev) & (energy_kev <= w.high_kev) for w in windows]
-    return np.logical_or.reduce(inside)
 
 
 def _by_name(windows: Iterable[EnergyWindow]) -> dict[str, tuple[float, float]]:

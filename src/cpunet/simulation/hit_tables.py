@@ -28,7 +28,7 @@ NTUPLES, STEPS = "default_ntuples", "stp"
 _G4SIMPLE, _G4SIMPLE_TITLE = "g4sntuple", "steps data"
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
-# what a column is, and its names in small letters: the first that is there is read
+# what a column is, and its names in small letters: the first of these is read
 _NAMES = {
     "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
     "x": ("xloc", "x"),
@@ -40,35 +40,17 @@ _NAMES = {
 _NEEDED = ("event", "x", "y", "z", "edep")
 _VECTORS = ("cumulative_length", "flattened_data")
 _WITH_UNIT = re.compile(r"(.+?)\s*(?:\[(.*)\]|_in_(.+))$")
-# arrays of an NPZ beside the offsets, and the columns that they are
+# arrays of an NPZ, and the columns that they are
 _ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep_in_keV"}
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Steps relative to the detector's origin in the frame of a file; events in any order.
-
-    `time_ns` is None where the file tells no times.
-    """
-
-    event: IntArray
-    position_mm: FloatArray
-    edep_kev: FloatArray
-    time_ns: FloatArray | None = None
-
-    def __getitem__(self, kept: npt.NDArray[np.bool_]) -> Steps:
-        """Steps that are `kept`."""
-        time = None if self.time_ns is None else self.time_ns[kept]
-        return Steps(self.event[kept], self.position_mm[kept], self.edep_kev[kept], time)
 
 
 @dataclass(frozen=True)
 class StepTable:
     """A table of steps: its columns by name, arrays or items of an open HDF5 file.
 
-    Those of HDF5 are arrays with a value per row, or vectors with one per step of the row; the
-    vectors of deposits tell the steps of each row. The `name` is that of the detector, empty if
-    there is none. Units that neither column nor options tell are those of g4simple, MeV and
+    Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
+    the vectors of deposits give the steps of each row. The `name` is that of the detector,
+    empty without any. Units that neither column nor options tell are those of g4simple, MeV and
     mm, if the table is `g4simple`'s. A `file` of remage tells where its detectors are.
     """
 
@@ -78,22 +60,21 @@ class StepTable:
     g4simple: bool = False
     file: h5py.File | None = None
 
-    @classmethod
-    def of_group(cls, path: Path, group: h5py.Group, name: str, file: h5py.File) -> StepTable:
-        """A table in HDF5. g4simple writes one for all detectors."""
-        # the values of a column of Geant4's HDF5 are its pages
-        held = members(group).items()
-        pages = {name: item["pages"] if _has(item, "pages") else item for name, item in held}
-        g4simple = name == _G4SIMPLE
-        return cls(path, pages, "" if g4simple else name, g4simple, file)
-
     @cached_property
     def roles(self) -> dict[str, tuple[str, str]]:
-        """What there is, see `roles`."""
+        """Roles of the columns, see `roles`."""
         return roles(self.columns)
 
-    def steps(self, options: HitOptions, label: str | None = None) -> Steps:
-        """Steps of all detectors, or of the one with a label.
+    def steps(
+        self, options: HitOptions, label: str | None = None
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Steps of all detectors, or of that with a label; events in any order.
+
+        Returns
+        -------
+        dict
+            ``event`` numbers, ``x``, ``y``, ``z`` (mm) in the frame of the file, ``edep`` (keV)
+            and, if the file has them, ``time`` (ns).
 
         Raises
         ------
@@ -107,22 +88,23 @@ class StepTable:
                 f"{self.path}: no column for {missing[0]}; "
                 f"the file holds {', '.join(self.columns)}"
             )
-        values: dict[str, npt.NDArray[Any]] = {}
+        chosen = slice(None) if label is None else self._labels == label
+        steps: dict[str, npt.NDArray[Any]] = {}
         for role, (name, in_name) in self.roles.items():
-            read, unit = self._read(name)
+            values, unit = self._read(name)
             where = f"{self.path}: column {name}"
-            if read.ndim != 1 or read.dtype.kind not in "iuf":
+            if values.ndim != 1 or values.dtype.kind not in "iuf":
                 raise CpunetError(
-                    f"{where} is of {read.dtype} and shape {read.shape}; give one number per "
-                    "step (g4simple: its option for steps)"
+                    f"{where} is of {values.dtype} and shape {values.shape}; give one number "
+                    "per step (g4simple: its option for steps)"
                 )
-            if role == "event":
-                values[role] = whole_numbers(read, where)
-            else:
-                values[role] = read * _unit_factor(options, role, where, unit or in_name)
-        position = np.stack([values[axis] for axis in "xyz"], axis=1)
-        steps = Steps(values["event"], position, values["edep"], values.get("time"))
-        return steps if label is None else steps[self._labels == label]
+            values = (
+                whole_numbers(values, where)
+                if role == "event"
+                else values * _unit_factor(options, role, where, unit or in_name)
+            )
+            steps[role] = values[chosen]
+        return steps
 
     def detectors(self) -> list[str]:
         """Labels of detectors with deposits; those without are the world or a holder."""
@@ -151,10 +133,7 @@ class StepTable:
 
     @cached_property
     def _labels(self) -> npt.NDArray[np.str_]:
-        """Detector of each step as text; empty if no column tells it.
-
-        That is a value, or those of several columns, as of a volume and its replicas.
-        """
+        """Detector of each step as text, from one column or several; empty if there is none."""
         if "edep" not in self.roles:
             return np.empty(0, np.str_)
         of = {name: self._read(name)[0] for name in self.columns if divides(name)}
@@ -190,7 +169,7 @@ class StepTable:
 
 
 def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """What there is among the `names` of columns: role → (name, unit in the name or ``""``).
+    """What the columns of these `names` are: role → (name, unit in the name or ``""``).
 
     Examples
     --------
@@ -202,11 +181,11 @@ def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
         match = _WITH_UNIT.match(name)
         base, unit = (match[1], (match[2] or match[3] or "").strip()) if match else (name, "")
         plain.setdefault(base.lower(), (name, unit))
-    found = {}
-    for role, known in _NAMES.items():
-        if there := [plain[name] for name in known if name in plain]:
-            found[role] = there[0]
-    return found
+    return {
+        role: plain[next(filter(plain.__contains__, spellings))]
+        for role, spellings in _NAMES.items()
+        if not plain.keys().isdisjoint(spellings)
+    }
 
 
 def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> float:
@@ -224,13 +203,13 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
     given = [unit for unit in (*re.split(r"[\s,]+", options.units), "ns") if factor(unit, to)]
     if not (unit := named or next(iter(given), "")):
         raise CpunetError(f"{where} names no unit; give `units`, one of {unit_names(to)}")
-    if (found := factor(unit, to)) is None:
+    if (to_ours := factor(unit, to)) is None:
         raise CpunetError(f"{where} is in {unit!r}; expected one of {unit_names(to)}")
-    return found
+    return to_ours
 
 
 def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
-    """Format of a file of hits by its content; `stored` are hits beside their pulses."""
+    """Format of a file of hits by its content; `stored` are hits with their pulses."""
     try:
         with path.open("rb") as stream:
             start = stream.read(len(_CSV_MAGIC))
@@ -265,15 +244,21 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
         with opened(path) as file:
             folders = [item_at(file, folder) for folder in (STEPS, NTUPLES)]
             groups = [
-                one for held in folders if held is not None for one in members(held).items()
+                group for held in folders if held is not None for group in members(held).items()
             ]
             if kind == "stored":
                 groups = [("", file[HIT_TABLE])]
-            tables = [
-                StepTable.of_group(path, group, str(name), file)
-                for name, group in groups
-                if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys()
-            ]
+            tables = []
+            for name, group in groups:
+                if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys():
+                    # the values of a column of Geant4's HDF5 are its pages
+                    columns = {
+                        key: item["pages"] if _has(item, "pages") else item
+                        for key, item in members(group).items()
+                    }
+                    g4simple = name == _G4SIMPLE  # which writes one table for all detectors
+                    of = "" if g4simple else str(name)
+                    tables.append(StepTable(path, columns, of, g4simple, file))
             if not tables:
                 raise CpunetError(
                     f"{path}: no table of {STEPS} or {NTUPLES} has columns for "
@@ -282,7 +267,7 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
             yield tables
     else:
         raise CpunetError(
-            f"{path}: no known format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
+            f"{path}: no format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
             f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
         )
 
@@ -314,19 +299,19 @@ def _npz_table(path: Path) -> StepTable:
 
 
 def _csv_table(path: Path) -> StepTable:
-    """A CSV ntuple of Geant4. That of g4simple is recognised by its title."""
+    """A CSV ntuple of Geant4, or several in one file; g4simple's is recognised by its title."""
     from pandas import DataFrame, read_csv  # half a second, which other formats do not need
 
     with path.open(encoding="utf-8", errors="replace") as lines:
         head = list(takewhile(lambda line: line.startswith("#"), lines))
-    told = [line[1:].strip().partition(" ")[::2] for line in head]
-    names = [value.partition(" ")[2] for key, value in told if key == "column"]
-    about = {"title": "", "separator": str(ord(","))} | dict(told)
+    header = [line[1:].strip().partition(" ")[::2] for line in head]
+    names = [value.partition(" ")[2] for key, value in header if key == "column"]
+    about = {"title": "", "separator": str(ord(","))} | dict(header)
     separator = chr(int(about["separator"]))
     try:
         # the columns of one file can be numbers, text or both
         cells: DataFrame = read_csv(
-            path, sep=separator, header=None, skiprows=len(head), low_memory=False,
+            path, sep=separator, header=None, comment="#", low_memory=False,
             encoding_errors="replace",
         )  # fmt: skip
     except ValueError as error:

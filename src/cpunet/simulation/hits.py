@@ -99,7 +99,7 @@ class Hits:
         farthest = np.abs(self.position_mm).max(initial=0)
         if farthest > FARTHEST_MM:
             raise CpunetError(
-                f"hits: one lies {farthest:g} mm away; check the units and the origin"
+                f"hits: a hit lies {farthest:g} mm away; check the units and the origin"
             )
 
     @classmethod
@@ -163,20 +163,20 @@ class Hits:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         # hit j of the result is hit j - offsets[i] of its original event
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
-        kept = self.position_mm[take], self.edep_kev[take]
-        return Hits.of(*kept, offsets, self.event_number[rows])
+        chosen = self.position_mm[take], self.edep_kev[take]
+        return Hits.of(*chosen, offsets, self.event_number[rows])
 
     def where(self, keep: npt.NDArray[np.bool_]) -> Hits:
         """The same events with only the hits of a mask. An event may become empty."""
-        kept = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
+        ends = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
         left = self.position_mm[keep], self.edep_kev[keep]
-        return Hits.of(*left, kept[self.offsets], self.event_number)
+        return Hits.of(*left, ends[self.offsets], self.event_number)
 
     def of_events(self, event_number: npt.ArrayLike) -> Hits:
         """Events with the given numbers, in their order.
 
-        A number without an event yields an event without hits, so the result has one event for
-        each number. Of several events with one number it is the first.
+        A number without an event yields an event without hits, so the result has an event for
+        each number. Of several events with the same number it is the first.
 
         Examples
         --------
@@ -186,14 +186,16 @@ class Hits:
         """
         wanted = np.asarray(event_number, np.int64)
         order = np.argsort(self.event_number, kind="stable")
-        known = self.event_number[order]
-        first, last = (np.searchsorted(known, wanted, side) for side in ("left", "right"))
-        found = last > first
-        kept = self[order[first[found]]]
+        sorted_numbers = self.event_number[order]
+        first, last = (
+            np.searchsorted(sorted_numbers, wanted, side) for side in ("left", "right")
+        )
+        present = last > first
+        events = self[order[first[present]]]
         counts = np.zeros(len(wanted), np.int64)
-        counts[found] = np.diff(kept.offsets)
+        counts[present] = np.diff(events.offsets)
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        return Hits.of(kept.position_mm, kept.edep_kev, offsets, wanted)
+        return Hits.of(events.position_mm, events.edep_kev, offsets, wanted)
 
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:

@@ -205,7 +205,7 @@ def impurity_values(
     model = curve.get("model")
     if not isinstance(model, str) or model not in MODELS:
         raise CpunetError(
-            f"{source}: impurity_curve.model {model!r} is not known; there are "
+            f"{source}: impurity_curve.model {model!r} is unknown; models are "
             f"{', '.join(MODELS)}; {_ANOTHER}"
         )
     numbers = dict.fromkeys("abcn", 0.0) | {
@@ -246,11 +246,11 @@ def _number_at(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
     """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
-    there = _at(values, place, source)
-    found = default if there is None else there
-    if found is None:
+    stored = _at(values, place, source)
+    value = default if stored is None else stored
+    if value is None:
         raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
-    number = isinstance(found, int | float) and not isinstance(found, bool)
-    if not number or not math.isfinite(found):
-        raise CpunetError(f"{source}: {place} = {found!r} is no number; {_ANOTHER}")
-    return float(found)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not math.isfinite(value):
+        raise CpunetError(f"{source}: {place} = {value!r} is no number; {_ANOTHER}")
+    return float(value)

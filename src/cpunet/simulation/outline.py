@@ -51,28 +51,34 @@ class Outline(NamedTuple):
         return cls(*(getattr(detector, name) for name in cls._fields))
 
 
+def at(
+    loop: Any, kind: type, detector: Any, r: npt.ArrayLike, z: npt.ArrayLike
+) -> npt.NDArray[Any]:
+    """What `fill_regions` or `fill_insides` gives at places of a `Detector`."""
+    r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
+    values: npt.NDArray[Any] = np.empty(r.shape, kind)
+    loop(Outline.of(detector), r.flatten(), z.flatten(), values.reshape(-1))
+    return values
+
+
 @kernel(error_model="numpy")
-def regions(outline: Outline, r: Array, z: Array) -> npt.NDArray[np.int8]:
+def fill_regions(outline: Outline, r: Array, z: Array, region: npt.NDArray[np.int8]) -> None:
     """See `Detector.region`."""
-    found = np.empty(len(r), np.int8)
     radius, length = outline.point_contact_radius, outline.point_contact_length
     for i in range(len(r)):
         if r[i] <= radius + _TOLERANCE and z[i] <= length + _TOLERANCE:
-            found[i] = POINT_CONTACT
+            region[i] = POINT_CONTACT
         elif not _within(outline, r[i], z[i], outline.li_thickness + _TOLERANCE, -_TOLERANCE):
-            found[i] = LI_CONTACT
+            region[i] = LI_CONTACT
         else:
-            found[i] = DITCH if _in_ditch(outline, r[i], z[i], _TOLERANCE) else GERMANIUM
-    return found
+            region[i] = DITCH if _in_ditch(outline, r[i], z[i], _TOLERANCE) else GERMANIUM
 
 
 @kernel(error_model="numpy")
-def insides(outline: Outline, r: Array, z: Array) -> npt.NDArray[np.bool_]:
+def fill_insides(outline: Outline, r: Array, z: Array, inside: npt.NDArray[np.bool_]) -> None:
     """See `Detector.inside`."""
-    found = np.empty(len(r), np.bool_)
     for i in range(len(r)):
-        found[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
-    return found
+        inside[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
 
 
 @kernel(error_model="numpy")

@@ -167,34 +167,6 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     """
     r_flux, z_flux, to_ground = conductances(detector, grid)
     free = grid.free
-    # the contacts are known: their columns are moved to the right-hand side
-    to_contact, columns = _solver(r_flux, z_flux, to_ground, free)
-
-    def solved(boundary: FloatArray, charge: FloatArray) -> FloatArray:
-        potential = boundary.copy()
-        potential[free] = columns.solve((charge + to_contact(boundary))[free])
-        return potential
-
-    nothing = np.zeros(free.shape)
-    point_contact = solved((grid.region == POINT_CONTACT).astype(float), nothing)
-    bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
-    impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
-    impurities = solved(nothing, charges(detector, grid, impurity))
-    tilt = solved(nothing, charges(detector, grid, detector.per_tilt_cm(grid.z_mm)))
-    surface = nothing
-    if detector.surface_charge_1e10_per_cm2:
-        surface = solved(nothing, surface_charges(detector, grid))
-    energy = (r_flux * np.diff(point_contact, axis=0) ** 2).sum()
-    energy += (z_flux * np.diff(point_contact, axis=1) ** 2).sum()
-    energy += (to_ground * point_contact[:, 0] ** 2).sum()
-    capacitance = float(2 * np.pi * PF_PER_MM * energy)
-    return Potentials(point_contact, bias, impurities, tilt, surface, capacitance)
-
-
-def _solver(
-    r_flux: FloatArray, z_flux: FloatArray, to_ground: FloatArray, free: Any
-) -> tuple[Any, Any]:
-    """Function that computes the flux from the neighbours, and the factorised matrix."""
 
     def from_neighbours(values: FloatArray) -> FloatArray:
         flux = np.zeros(free.shape)
@@ -223,7 +195,27 @@ def _solver(
     # symmetric and diagonally dominant: no pivoting, and an ordering that exploits it
     options = {"SymmetricMode": True}
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return from_neighbours, factors
+
+    def solved(boundary: FloatArray, charge: FloatArray) -> FloatArray:
+        # potentials of contacts are given: their columns are moved to the right-hand side
+        potential = boundary.copy()
+        potential[free] = factors.solve((charge + from_neighbours(boundary))[free])
+        return potential
+
+    nothing = np.zeros(free.shape)
+    point_contact = solved((grid.region == POINT_CONTACT).astype(float), nothing)
+    bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
+    impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
+    impurities = solved(nothing, charges(detector, grid, impurity))
+    tilt = solved(nothing, charges(detector, grid, detector.per_tilt_cm(grid.z_mm)))
+    surface = nothing
+    if detector.surface_charge_1e10_per_cm2:
+        surface = solved(nothing, surface_charges(detector, grid))
+    energy = (r_flux * np.diff(point_contact, axis=0) ** 2).sum()
+    energy += (z_flux * np.diff(point_contact, axis=1) ** 2).sum()
+    energy += (to_ground * point_contact[:, 0] ** 2).sum()
+    capacitance = float(2 * np.pi * PF_PER_MM * energy)
+    return Potentials(point_contact, bias, impurities, tilt, surface, capacitance)
 
 
 def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray]:

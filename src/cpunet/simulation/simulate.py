@@ -100,7 +100,7 @@ class Simulation:
 
     def __str__(self) -> str:
         lines = ", ".join(f"{n} {name}" for name, n in self.lines.items())
-        told = [
+        text = [
             f"{self.n_written} of {self.n_events} events written ({lines} by collected "
             f"energy); {self.without_signal} without any signal",
             f"{self.hits} hits ({self.hits_before_merging} before merging): "
@@ -110,10 +110,10 @@ class Simulation:
             f"{self.events_with_loss} events",
         ]
         if self.not_collected:
-            told.append(f"{self.not_collected} hits not collected in full; raise length_ns")
+            text.append(f"{self.not_collected} hits not collected in full; raise length_ns")
         if self.trapped_kev:
-            told.append(f"{self.trapped_kev / self.energy_kev:.2%} of the energy trapped")
-        return "\n".join(f"{self.path}: {line}" for line in told)
+            text.append(f"{self.trapped_kev / self.energy_kev:.2%} of the energy trapped")
+        return "\n".join(f"{self.path}: {line}" for line in text)
 
 
 def simulate(
@@ -174,7 +174,7 @@ def simulate(
     files = [f for f in (detector, *words) if isinstance(f, str | Path)]
     files += [hits.path if isinstance(hits, HitFile) else hits] if hits is not None else []
     refuse_inputs(out, *files)
-    found, physics = detector_and_settings(detector, settings)
+    crystal, physics = detector_and_settings(detector, settings)
     peaks = load_recipe("fast").peaks
     windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
     source: HitSource
@@ -190,43 +190,36 @@ def simulate(
         source = GammaSource(wanted, physics.source_height_mm, physics.source_radius_mm, seed)
     else:
         raise CpunetError("give `hits` of a file, or `events` for the gamma Monte Carlo")
-    simulation = Simulation(out, found, physics, windows, seed)
+    simulation = Simulation(out, crystal, physics, windows, seed)
     attrs = {MADE_BY: f"cpunet simulate {cpunet.__version__}"}
     writer = PulseWriter(out, attrs=attrs, force=force)
-    _simulate(simulation, source, writer)
-    return simulation
-
-
-def _simulate(simulation: Simulation, source: HitSource, writer: PulseWriter) -> None:
-    """Write the pulses, and count them."""
-    detector, settings = simulation.detector, simulation.settings
-    opened = source.open(detector)
-    simulator = Simulator(detector, settings)
+    opened, simulator = source.open(crystal), Simulator(crystal, physics)
     with writer:
-        for before_merging, events in simulator.blocks(opened, f"Simulating {detector.name}"):
-            simulation.count(before_merging, events)
-            kept = events.collected_kev > 0
+        for before_merging, block in simulator.blocks(opened, f"Simulating {crystal.name}"):
+            simulation.count(before_merging, block)
+            kept = block.collected_kev > 0
             columns: dict[str, tuple[Any, str]] = {
-                "lost_energy": (events.lost_kev[kept], "keV"),
-                "n_hits": (np.diff(events.hits.offsets)[kept], ""),
+                "lost_energy": (block.lost_kev[kept], "keV"),
+                "n_hits": (np.diff(block.hits.offsets)[kept], ""),
             }
-            if any(settings.trapping_per_ns):
-                columns["trapped_energy"] = (events.trapped_kev[kept], "keV")
-            writer.append(events.pulses(), columns)
-            writer.append_rows(HIT_TABLE, hit_columns(events.hits[kept]))
+            if any(physics.trapping_per_ns):
+                columns["trapped_energy"] = (block.trapped_kev[kept], "keV")
+            writer.append(block.pulses(), columns)
+            writer.append_rows(HIT_TABLE, hit_columns(block.hits[kept]))
         if not writer.n_pulses:
             raise CpunetError(
-                f"{simulation.path}: none of {simulation.n_events} events gives a signal: "
-                f"their hits lie outside {detector.name} or in its contacts; check their frame"
+                f"{out}: none of {simulation.n_events} events gives a signal: their hits lie "
+                f"outside {crystal.name} or in its contacts; check their frame"
             )
-        made = {
+        provenance = {
             "cpunet": cpunet.__version__,
-            "detector": detector.model_dump(mode="json"),
-            "settings": settings.model_dump(mode="json"),
+            "detector": crystal.model_dump(mode="json"),
+            "settings": physics.model_dump(mode="json"),
             "hits": source.provenance(),
-            "seed": simulation.seed,
+            "seed": seed,
             "events": simulation.n_events,
             "events_without_signal": simulation.without_signal,
             "depletion_V": simulator.fields.depletion_V,
         }
-        writer.annotate(SIMULATION, json.dumps(made))
+        writer.annotate(SIMULATION, json.dumps(provenance))
+    return simulation

@@ -106,12 +106,12 @@ class EventPulses:
     def pulses(self) -> Pulses:
         """Events with a signal as `Pulses`, with their collected energies."""
         energy_kev = self.collected_kev
-        kept = energy_kev > 0
+        with_signal = energy_kev > 0
         return Pulses.of(
-            self.waveforms[kept],
+            self.waveforms[with_signal],
             dt_ns=self.dt_ns,
-            energy_kev=energy_kev[kept],
-            event_number=self.hits.event_number[kept],
+            energy_kev=energy_kev[with_signal],
+            event_number=self.hits.event_number[with_signal],
         )
 
 
@@ -131,7 +131,6 @@ class Task(NamedTuple):
     step_ns: float
     stride: int
     per_sample: int
-    n_samples: int
 
 
 class Simulator:
@@ -211,7 +210,6 @@ class Simulator:
             step_ns=stride * settings.step_ns,
             stride=stride,
             per_sample=settings.steps_per_sample // stride,
-            n_samples=settings.n_samples,
         )
 
     def signals(

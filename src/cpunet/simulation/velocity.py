@@ -99,9 +99,12 @@ def velocity_table(
     field = measured[:, 0]
     step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
     grid = np.arange(round(field[-1] / step) + 1) * step
+    low, high = _RANGE_K
+    within = min(max(temperature_K, low), high)
     tables = []
     for carrier in (ELECTRON, HOLE):
-        factor = _temperature_factor(carrier, field, temperature_K)
+        now, then = (_speed_model(carrier, field, kelvin) for kelvin in (within, _TABLE_K))
+        factor = np.divide(now, then, out=np.ones_like(field), where=then > 0)
         factor = factor * velocity_factor(field, *factors[carrier])
         v100, v110, v111 = (measured[:, 1 + 3 * carrier : 4 + 3 * carrier] * factor[:, None]).T
         a = v100 / 2 - 4 * v110 + 4.5 * v111
@@ -126,13 +129,6 @@ def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> F
     field = np.clip(np.asarray(field_V_per_cm, np.float64), _LOW_FIELD, _HIGH_FIELD)
     x = np.log(field / _LOW_FIELD) / math.log(_HIGH_FIELD / _LOW_FIELD)
     return np.asarray(low + (high - low) * x * x * (3 - 2 * x), np.float64)
-
-
-def _temperature_factor(carrier: int, field: FloatArray, temperature_K: float) -> FloatArray:
-    low, high = _RANGE_K
-    now = _speed_model(carrier, field, min(max(temperature_K, low), high))
-    then = _speed_model(carrier, field, _TABLE_K)
-    return np.divide(now, then, out=np.ones_like(field), where=then > 0)
 
 
 def _speed_model(carrier: int, field: FloatArray, temperature_K: float) -> FloatArray:

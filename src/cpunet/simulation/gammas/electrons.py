@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.kernels import kernel
 from cpunet.simulation.gammas.germanium import ELECTRON_CUT, ELECTRON_MASS, Array, ElectronTable
@@ -123,25 +124,49 @@ def annihilation_energy(kinetic: float, rng: np.random.Generator) -> tuple[float
     return energy, min(max(cosine, -1.0), 1.0)
 
 
+# Entries of `Event.counts`.
+HITS, PHOTONS, LOST = range(3)
+
+
+class Event(NamedTuple):
+    """An event as it develops.
+
+    ``hits`` has a row x, y, z (mm), energy (MeV) per deposit, ``photons`` a row x, y, z,
+    direction, energy per photon still to be followed. ``counts`` are the numbers of both, and
+    of deposits and photons for which there was no room.
+    """
+
+    hits: Array
+    photons: Array
+    counts: npt.NDArray[np.int64]
+
+
 @kernel(error_model="numpy")
-def record(hits: Array, n: int, x: float, y: float, z: float, energy: float) -> int:
-    """Append a deposit (mm, MeV) to the hits; return the new number of hits."""
-    if energy > 0.0 and n < len(hits):
-        hits[n, 0], hits[n, 1], hits[n, 2], hits[n, 3] = x, y, z, energy
-        return n + 1
-    return n
+def record(event: Event, x: float, y: float, z: float, energy: float) -> None:
+    """Append a deposit (mm, MeV)."""
+    n = event.counts[HITS]
+    if energy > 0.0 and n < len(event.hits):
+        row = event.hits[n]
+        row[0], row[1], row[2], row[3] = x, y, z, energy
+        event.counts[HITS] = n + 1
+    elif energy > 0.0:
+        event.counts[LOST] += 1
 
 
 @kernel(error_model="numpy")
 def put_photon(
-    stack: Array, n: int, x: float, y: float, z: float, direction: UnitVector, energy: float
-) -> int:
-    """Push a photon onto the stack of pending photons; return the new height."""
-    row = stack[n]
+    event: Event, x: float, y: float, z: float, direction: UnitVector, energy: float
+) -> None:
+    """Append a photon to those still to be followed."""
+    n = event.counts[PHOTONS]
+    if n == len(event.photons):
+        event.counts[LOST] += 1
+        return
+    row = event.photons[n]
     row[0], row[1], row[2] = x, y, z
     row[3], row[4], row[5] = direction.x, direction.y, direction.z
     row[6] = energy
-    return n + 1
+    event.counts[PHOTONS] = n + 1
 
 
 @kernel(error_model="numpy")
@@ -157,17 +182,14 @@ def row_of(table: ElectronTable, kinetic: float) -> int:
 def slow_down(
     outline: Outline,
     table: ElectronTable,
+    event: Event,
     position: tuple[float, float, float],
     direction: UnitVector,
     kinetic: float,
     positron: bool,
-    hits: Array,
-    n_hits: int,
-    stack: Array,
-    n_stack: int,
     rng: np.random.Generator,
-) -> tuple[int, int]:
-    """Follow an electron until it stops or escapes; return the numbers of hits and photons.
+) -> None:
+    """Follow an electron until it stops or escapes, with its deposits and photons.
 
     Each step runs straight to a random hinge, deposits its energy there, turns and runs
     straight to its end (Baró et al., NIM B 100 (1995) 31). Mean and spread of the
@@ -177,25 +199,20 @@ def slow_down(
     row = row_of(table, kinetic)
     part = (kinetic - table.energy[row + 1]) / (table.energy[row] - table.energy[row + 1])
     while kinetic > ELECTRON_CUT:
-        lower = table.energy[row + 1]
         length = part * table.step[row]
         hinge = length * rng.random()
-        x += hinge * direction.x
-        y += hinge * direction.y
-        z += hinge * direction.z
+        x, y, z = x + hinge * direction.x, y + hinge * direction.y, z + hinge * direction.z
         if not in_germanium(outline, x, y, z):
-            return n_hits, n_stack
-        n_hits = record(hits, n_hits, x, y, z, kinetic - lower)
-        kinetic = lower
+            return
+        record(event, x, y, z, kinetic - table.energy[row + 1])
+        kinetic = table.energy[row + 1]
         scale = table.scattering[row] * part
         cosine = 1.0 + scale * math.log(1.0 - rng.random() * table.scattering_cut[row])
         direction = turned(direction, cosine, 2.0 * math.pi * rng.random())
         rest = length - hinge
-        x += rest * direction.x
-        y += rest * direction.y
-        z += rest * direction.z
+        x, y, z = x + rest * direction.x, y + rest * direction.y, z + rest * direction.z
         if not in_germanium(outline, x, y, z):
-            return n_hits, n_stack
+            return
         chance = rng.random()
         if chance < part * table.brems[row]:
             shares = table.photon_share[row]
@@ -203,8 +220,7 @@ def slow_down(
             node = int(at)
             share = shares[node] + (at - node) * (shares[node + 1] - shares[node])
             photon = min(share, 1.0) * kinetic
-            away = forward(direction, kinetic, rng)
-            n_stack = put_photon(stack, n_stack, x, y, z, away, photon)
+            put_photon(event, x, y, z, forward(direction, kinetic, rng), photon)
             kinetic -= photon
             row = row_of(table, kinetic)
             above = table.energy[row + 1]
@@ -214,15 +230,14 @@ def slow_down(
             energy, cosine = annihilation_energy(kinetic, rng)
             momentum = math.sqrt(kinetic * (kinetic + 2.0 * ELECTRON_MASS))
             first = turned(direction, cosine, 2.0 * math.pi * rng.random())
+            put_photon(event, x, y, z, first, energy)
             second = remainder(momentum, direction, energy, first)
-            n_stack = put_photon(stack, n_stack, x, y, z, first, energy)
-            other = kinetic + 2.0 * ELECTRON_MASS - energy
-            return n_hits, put_photon(stack, n_stack, x, y, z, second, other)
+            put_photon(event, x, y, z, second, kinetic + 2.0 * ELECTRON_MASS - energy)
+            return
         row, part = row + 1, 1.0
-    n_hits = record(hits, n_hits, x, y, z, kinetic)
+    record(event, x, y, z, kinetic)
     if positron:
         first = isotropic(rng)
+        put_photon(event, x, y, z, first, ELECTRON_MASS)
         second = UnitVector(-first.x, -first.y, -first.z)
-        n_stack = put_photon(stack, n_stack, x, y, z, first, ELECTRON_MASS)
-        n_stack = put_photon(stack, n_stack, x, y, z, second, ELECTRON_MASS)
-    return n_hits, n_stack
+        put_photon(event, x, y, z, second, ELECTRON_MASS)

@@ -5,6 +5,7 @@ In the compiled event loop photons from the source are followed until absorbed o
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -16,6 +17,10 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.gammas.electrons import (
+    HITS,
+    LOST,
+    PHOTONS,
+    Event,
     UnitVector,
     compton_energy,
     forward,
@@ -40,11 +45,12 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.outline import Outline, in_germanium
 
+log = logging.getLogger(__name__)
+
 Integers = npt.NDArray[np.int64]
 
-STACK_HEIGHT = 256
-MAX_HITS = 2000
-"""Maximum number of hits per event; Tl-208 gives about 200."""
+MAX_HITS, MAX_PHOTONS = 2000, 256
+"""Maximum numbers of hits and of photons per event; Tl-208 gives about 200 hits."""
 
 
 class SourceDisc(NamedTuple):
@@ -56,81 +62,75 @@ class SourceDisc(NamedTuple):
     least_cosine: float
 
 
+class Medium(NamedTuple):
+    """A crystal, and the tables of photons and electrons in germanium."""
+
+    outline: Outline
+    photons: PhotonTable
+    electrons: ElectronTable
+
+    @classmethod
+    def of(cls, detector: Detector) -> Medium:
+        """The crystal of a detector; its lithium layer is treated as germanium."""
+        return cls(Outline.of(detector), photon_table(), electron_table())
+
+
 @kernel(error_model="numpy")
-def follow_photons(
-    outline: Outline,
-    photons: PhotonTable,
-    electrons: ElectronTable,
-    hits: Array,
-    stack: Array,
-    n_stack: int,
-    rng: np.random.Generator,
-) -> int:
-    """Follow all photons on the stack; return the number of hits.
+def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> None:
+    """Follow all photons of an event, and all that these make.
 
     The path to the next interaction is drawn as if germanium filled all space. If it ends in
     vacuum, nothing happens and the photon continues (Woodcock's method), so any outline is
     possible. A photon that leaves the cylinder around the crystal does not return.
     """
-    # numba compiles a function anew for each constant that it is called with
-    n_hits, electron = int(np.int64(0)), bool(np.bool_(False))
-    length = outline.crystal_length
-    while n_stack > 0:
-        n_stack -= 1
-        x, y, z = stack[n_stack, 0], stack[n_stack, 1], stack[n_stack, 2]
-        direction = UnitVector(stack[n_stack, 3], stack[n_stack, 4], stack[n_stack, 5])
-        energy = stack[n_stack, 6]
+    outline, photons, electrons = medium
+    electron = bool(np.bool_(False))  # numba compiles a function anew for each constant
+    while event.counts[PHOTONS] > 0:
+        event.counts[PHOTONS] -= 1
+        row = event.photons[event.counts[PHOTONS]]
+        x, y, z, energy = row[0], row[1], row[2], row[6]
+        direction = UnitVector(row[3], row[4], row[5])
         while True:
             if energy < PHOTON_CUT:
                 if in_germanium(outline, x, y, z):
-                    n_hits = record(hits, n_hits, x, y, z, energy)
+                    record(event, x, y, z, energy)
                 break
             at = (math.log(energy) - photons.log_first) * photons.per_log
             node = int(at)
-            more = at - node
             left = photons.attenuation_per_mm[node]
-            attenuation = left + more * (photons.attenuation_per_mm[node + 1] - left)
+            attenuation = left + (at - node) * (photons.attenuation_per_mm[node + 1] - left)
             path = -math.log(1.0 - rng.random()) / attenuation
-            x += path * direction.x
-            y += path * direction.y
-            z += path * direction.z
-            if not 0.0 <= z <= length or x * x + y * y > outline.crystal_radius**2:
+            x, y, z = x + path * direction.x, y + path * direction.y, z + path * direction.z
+            if (
+                not 0.0 <= z <= outline.crystal_length
+                or x * x + y * y > outline.crystal_radius**2
+            ):
                 break
             if not in_germanium(outline, x, y, z):
                 continue
-            chance = rng.random()
+            place, chance = (x, y, z), rng.random()
             if chance < photons.photoelectric[node]:
-                bound = K_BINDING if energy > K_BINDING else energy
-                n_hits = record(hits, n_hits, x, y, z, bound)
-                kinetic = energy - bound
+                kinetic = energy - min(energy, K_BINDING)
+                record(event, x, y, z, min(energy, K_BINDING))
                 away = forward(direction, kinetic, rng)
-                n_hits, n_stack = slow_down(
-                    outline, electrons, (x, y, z), away, kinetic, electron,
-                    hits, n_hits, stack, n_stack, rng,
-                )  # fmt: skip
+                slow_down(outline, electrons, event, place, away, kinetic, electron, rng)
                 break
             if chance < photons.not_pair[node]:
                 left_over = compton_energy(energy, rng)
                 cosine = 1.0 - ELECTRON_MASS * (1.0 / left_over - 1.0 / energy)
                 scattered = turned(direction, cosine, 2.0 * math.pi * rng.random())
                 recoil = remainder(energy, direction, left_over, scattered)
-                n_hits, n_stack = slow_down(
-                    outline, electrons, (x, y, z), recoil, energy - left_over, electron,
-                    hits, n_hits, stack, n_stack, rng,
-                )  # fmt: skip
+                kinetic = energy - left_over
+                slow_down(outline, electrons, event, place, recoil, kinetic, electron, rng)
                 energy, direction = left_over, scattered
                 continue
             kinetic = energy - 2.0 * ELECTRON_MASS
-            mine = pair_share(rng) * kinetic
+            of_electron = pair_share(rng) * kinetic
             for positron in (False, True):
-                part = kinetic - mine if positron else mine
+                part = kinetic - of_electron if positron else of_electron
                 away = forward(direction, part, rng)
-                n_hits, n_stack = slow_down(
-                    outline, electrons, (x, y, z), away, part, positron,
-                    hits, n_hits, stack, n_stack, rng,
-                )  # fmt: skip
+                slow_down(outline, electrons, event, place, away, part, positron, rng)
             break
-    return n_hits
 
 
 @kernel(error_model="numpy")
@@ -157,73 +157,77 @@ def way_to_cylinder(
 
 
 @kernel(error_model="numpy")
-def emit(outline: Outline, source: SourceDisc, stack: Array, rng: np.random.Generator) -> int:
-    """Place a photon where it meets the cylinder of the crystal; return 0 if it misses."""
+def emit(outline: Outline, source: SourceDisc, event: Event, rng: np.random.Generator) -> None:
+    """Place a photon where it meets the cylinder of the crystal; none if it misses."""
     r = source.radius * math.sqrt(rng.random())
     around = 2.0 * math.pi * rng.random()
     x, y, z = r * math.cos(around), r * math.sin(around), outline.crystal_length + source.height
     cosine = source.least_cosine + (1.0 - source.least_cosine) * rng.random()
     down = turned(UnitVector(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
     way = way_to_cylinder(outline, x, y, z, down)
-    if way < 0.0:
-        return 0
-    # rounding must not leave it just outside, where it would count as lost
-    way += 1e-9
-    return put_photon(
-        stack, 0, x + way * down.x, y + way * down.y, z + way * down.z, down, source.energy
-    )
+    if way >= 0.0:
+        way += 1e-9  # rounding must not leave it just outside, where it would count as lost
+        x, y, z = x + way * down.x, y + way * down.y, z + way * down.z
+        put_photon(event, x, y, z, down, source.energy)
+
+
+class Windows(NamedTuple):
+    """Windows of energy (MeV), and the numbers of events still missing in each."""
+
+    low: Array
+    high: Array
+    missing: Integers
 
 
 @kernel(error_model="numpy")
 def simulate_block(
-    outline: Outline,
+    medium: Medium,
     source: SourceDisc,
-    photons: PhotonTable,
-    electrons: ElectronTable,
     n_primaries: int,
-    low: Array,
-    high: Array,
-    wanted: Integers,
+    windows: Windows,
     rng: np.random.Generator,
     hits: Array,
     offsets: Integers,
     primaries: Integers,
-) -> tuple[int, int]:
-    """Simulate until the primaries, the space for hits or the requested events run out.
+) -> tuple[int, int, int]:
+    """Simulate until the primaries, the space for hits or the missing events run out.
 
-    Energies are in MeV. An event is kept if it lies in a window (low to high) that still
-    needs events, or always if there are no windows. `wanted` is counted down. Returns the
-    numbers of primaries done and of events kept.
+    An event is kept if it lies in a window that still misses events, or always if there are
+    no windows. Returns the numbers of primaries done, of events kept, and of events left out
+    because they have more than `MAX_HITS` deposits.
     """
-    stack = np.empty((STACK_HEIGHT, 7))
-    n_kept = 0
+    photons, counts = np.empty((MAX_PHOTONS, 7)), np.zeros(3, np.int64)
+    n_kept = n_left_out = 0
     offsets[0] = 0
     for primary in range(n_primaries):
         start = offsets[n_kept]
         full = len(hits) - start < MAX_HITS or n_kept == len(primaries)
-        if full or (len(wanted) > 0 and wanted.sum() == 0):
-            return primary, n_kept
-        n_stack = emit(outline, source, stack, rng)
-        if n_stack == 0:
+        if full or (len(windows.missing) > 0 and windows.missing.sum() == 0):
+            return primary, n_kept, n_left_out
+        counts[:] = 0
+        event = Event(hits[start : start + MAX_HITS], photons, counts)
+        emit(medium.outline, source, event, rng)
+        follow_photons(medium, event, rng)
+        if counts[LOST] > 0:
+            n_left_out += 1
             continue
-        mine = hits[start : start + MAX_HITS]
-        n_hits = follow_photons(outline, photons, electrons, mine, stack, n_stack, rng)
         energy = 0.0
-        for i in range(n_hits):
-            energy += mine[i, 3]
+        for i in range(counts[HITS]):
+            energy += event.hits[i, 3]
         if energy == 0.0:
             continue
-        keep = len(wanted) == 0
-        for line in range(len(wanted)):
-            if wanted[line] > 0 and low[line] <= energy <= high[line]:
-                wanted[line] -= 1
+        keep = len(windows.missing) == 0
+        for line in range(len(windows.missing)):
+            within = windows.low[line] <= energy <= windows.high[line]
+            if windows.missing[line] > 0 and within:
+                windows.missing[line] -= 1
                 keep = True
                 break
         if keep:
             primaries[n_kept] = primary
             n_kept += 1
-            offsets[n_kept] = start + n_hits
-    return n_primaries, n_kept
+            offsets[n_kept] = start + counts[HITS]
+    return n_primaries, n_kept, n_left_out
 
 
 TL208_KEV = 2614.511
@@ -299,8 +303,8 @@ def simulate_gammas(
                 f"{line.name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
                 f"the {energy_kev} keV line; give another"
             )
-    outline = Outline.of(detector)
-    reach = outline.crystal_radius + source_radius_mm
+    medium = Medium.of(detector)
+    reach = detector.crystal_radius + source_radius_mm
     cosine = source_height_mm / math.hypot(source_height_mm, reach)
     source = SourceDisc(
         energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine
@@ -309,23 +313,25 @@ def simulate_gammas(
     low = np.array([line.low_kev / 1e3 - 1e-9 for line in wanted])
     high = np.array([line.high_kev / 1e3 + 1e-9 for line in wanted])
     missing = np.array(list(wanted.values()), np.int64)
+    windows = Windows(low, high, missing)
     rng = np.random.default_rng(seed)
     hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
     offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
     primaries = np.empty(_BLOCK_EVENTS, np.int64)
     blocks: list[Hits] = [Hits.of([], [], [0])]
-    done = 0
+    done = left_out = 0
     while done < n_primaries and not (wanted and missing.sum() == 0):
-        tried, kept = simulate_block(
-            outline, source, photon_table(), electron_table(), n_primaries - done,
-            low, high, missing, rng, hits, offsets, primaries,
-        )  # fmt: skip
+        tried, kept, large = simulate_block(
+            medium, source, n_primaries - done, windows, rng, hits, offsets, primaries
+        )
         ends = offsets[: kept + 1].copy()
         deposits = hits[: ends[-1]]
         blocks.append(
             Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, ends, primaries[:kept] + done)
         )
-        done += tried
+        done, left_out = done + tried, left_out + large
+    if left_out:
+        log.warning(f"{left_out} events have more than {MAX_HITS} deposits and are left out")
     if missing.any():
         short = ", ".join(f"{n} of {w.name}" for w, n in zip(wanted, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")

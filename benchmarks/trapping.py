@@ -1,12 +1,9 @@
-"""Effects of delayed charge from the lithium layer, and of trapping, on A/E and late charge.
+"""Effects of trapping on A/E and late charge.
 
-    python benchmarks/surface_and_trapping.py RUN [--detector icpc]
+    python benchmarks/trapping.py RUN [--detector icpc]
 
-Pulses have the response of RUN's readout chain, without noise and decays.  The first table is
-for hits at several depths in a lithium layer of 1 mm, at half of the crystal's height: fraction
-of the charge collected, A/E and late charge relative to a hit at the layer's inner boundary.
-The second shows the changes due to trapping for hits throughout the crystal: median and the
-range from 16 to 84 %.
+Pulses of hits throughout the crystal have the response of RUN's readout chain, without noise
+and decays.  Changes are medians with the range from 16 to 84 %.
 """
 
 from __future__ import annotations
@@ -18,7 +15,6 @@ import numpy as np
 import scipy.fft
 
 from cpunet.legend.currents import PEAK, currents_about_peak
-from cpunet.legend.lithium import LithiumLayer, arrived
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
@@ -27,7 +23,6 @@ from cpunet.simulation.simulator import Simulator
 from cpunet.training.closed_forms import StepResponse, learned_chain
 from cpunet.translation.translator import REN
 
-DEPTHS_MM = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6)
 LENGTH, PLATEAU = 12_000, 10_000  # ns
 HITS = 500
 TRAPPING = ("hole_trapping_per_us", "electron_trapping_per_us")
@@ -48,45 +43,6 @@ def told(undecayed: StepResponse, fine: np.ndarray) -> tuple[np.ndarray, np.ndar
     currents, _ = currents_about_peak(signal)
     late = np.arange(PLATEAU) > (signal < 0.8).argmin(axis=1)[:, None]
     return currents[..., PEAK], ((1 - signal[:, :PLATEAU]) * late).sum(axis=1)
-
-
-def delayed(charge: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Pulses of charge that reaches the boundary gradually.
-
-    Parameters
-    ----------
-    charge
-        Pulses of charge released at the boundary, shape (n, samples).
-    share
-        Fraction that has arrived at each sample, shape (n, samples) or (samples,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Float32 (n, samples), in units of the charge released in the layer.
-    """
-    n_samples = charge.shape[1]
-    coming = np.diff(np.broadcast_to(share, charge.shape), axis=1, prepend=0)
-    length = scipy.fft.next_fast_len(2 * n_samples, real=True)
-    spectra = scipy.fft.rfft(charge.astype(float), length) * scipy.fft.rfft(coming, length)
-    return np.asarray(scipy.fft.irfft(spectra, length)[:, :n_samples], np.float32)
-
-
-def of_the_layer(chain: StepResponse, detector: Detector, fields: FieldMaps) -> None:
-    """Print a table by depth."""
-    layer = LithiumLayer(1.0)
-    r = detector.crystal_radius - detector.li_thickness - 0.1
-    pulse = Simulator(detector, settings(), fields=fields).signals(
-        r, 0, 0.5 * detector.crystal_length, 1000.0
-    )
-    assert pulse.valid.all()
-    share = arrived(layer, DEPTHS_MM, np.arange(LENGTH, dtype=float))
-    late = delayed(np.repeat(pulse.waveforms, len(DEPTHS_MM), axis=0), share)
-    amplitude, charge = told(chain, late)
-    print("depth mm   collected %   A/E against bulk   late charge ns (less bulk's)")
-    for depth, end, a, lq in zip(DEPTHS_MM, share[:, -1], amplitude, charge, strict=True):
-        relative, more = a / amplitude[0], lq - charge[0]
-        print(f"{depth:8.2f} {100 * end:13.1f} {relative:18.4f} {more:16.1f}")
 
 
 def of_trapping(chain: StepResponse, detector: Detector, fields: FieldMaps) -> None:
@@ -122,7 +78,7 @@ def of_trapping(chain: StepResponse, detector: Detector, fields: FieldMaps) -> N
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--detector", default="icpc")
@@ -132,7 +88,6 @@ def main() -> None:
     chain = learned_chain(generator.response, "run").undecayed
     detector = read_detector(given.detector)
     fields = compute_fields(detector)
-    of_the_layer(chain, detector, fields)
     of_trapping(chain, detector, fields)
 
 
