@@ -138,7 +138,7 @@ class SecondRate(NamedTuple):
 
 
 def second_rate(traces: FloatArray) -> SecondRate | None:
-    """Find where digitisers begin to average samples, which are then further apart in time.
+    """Find where digitisers begin to average samples, which are then longer.
 
     Averages of m samples have less noise, by the root of m if it is white, and the decay goes
     on m times as fast from sample to sample.

@@ -105,7 +105,7 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
 
     Each value of that chain is a positively weighted mean of the current some samples
     away.  The chain is therefore first run only around the steepest point of a
-    pulse.  If the current elsewhere exceeds the maximum found there, the whole pulse is
+    pulse.  If the current elsewhere exceeds the maximum of that part, the whole pulse is
     processed.
 
     Parameters
@@ -360,11 +360,11 @@ def _shifted(coefficients, times, pad, n_before, moved):  # type: ignore[no-unty
     n_after = moved.shape[1] - n_before
     for row in range(len(times)):
         start = int(np.floor(times[row]))
-        known = coefficients.shape[1] - 2 * pad
+        end = coefficients.shape[1] - 2 * pad
         if times[row] > start:
-            known -= 1
+            end -= 1
         a, b, c, d = _weights(times[row] - start)
-        first, stop = max(start - n_before, 0), min(start + n_after, known)
+        first, stop = max(start - n_before, 0), min(start + n_after, end)
         if first >= stop:
             continue
         near = coefficients[row, first + pad - 1 : stop + pad + 2]

@@ -63,7 +63,7 @@ class EnergySelection:
     name
         The selection as the user wrote it.
     peaks
-        All known lines; a pulse between two belongs to the nearest.
+        All lines; a pulse between two belongs to the nearest.
     chosen
         Names of the selected lines.
     ranges_kev
@@ -136,9 +136,9 @@ def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelecti
             continue
         match = _RANGE.fullmatch(part)
         if match is None:
-            known = ", ".join(peaks) or "none"
+            names = ", ".join(peaks) or "none"
             raise CpunetError(
-                f"energies {text!r}: {part!r} is no known peak ({known}) "
+                f"energies {text!r}: {part!r} is no known peak ({names}) "
                 "and no range in keV such as 300-3000 or 300-"
             )
         low, high = float(match[1]), float(match[2] or np.inf)

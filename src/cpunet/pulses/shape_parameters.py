@@ -89,7 +89,7 @@ def all_parameters(
     scores
         Score settings, with the fraction of the maximum at which the drift time begins.
     amplitudes
-        Current amplitudes of the pulses, if they are known; else they are computed.
+        Current amplitudes of the pulses; computed by default.
     decay_ns
         Decay that LEGEND's parameters are corrected for; by default the median one of these
         pulses.

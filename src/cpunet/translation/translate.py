@@ -84,7 +84,7 @@ def translate(
     jobs
         Processes, each of which translates a file at a time.
     resume
-        Keep files that are there already, if made from the same input in the same way.
+        Leave files that exist already, if made from the same input in the same way.
     read
         How files are read, if they do not tell themselves.  With ``all`` for the table, each
         table is translated to a file in `out`.

@@ -1,4 +1,4 @@
-"""A file of pulses and how it is read: its format is told by its first bytes."""
+"""A file of pulses and how it is read: its first bytes show its format."""
 
 from __future__ import annotations
 
