@@ -152,21 +152,21 @@ def each_channel(
             f"{len(channels)}"
         )
     make = partial(_work, dict(channels), out, do)
-    done: dict[str, R] = {}
-    failed: dict[str, str] = {}
+    arrived: dict[str, R | CpunetError] = {}
     with (
         stage("Channels", len(channels)) as bar,
         closing(outcomes(make, list(channels), usable_cores())) as results,
     ):
         for name, outcome in results:
             bar.update()
+            arrived[name] = outcome
             if isinstance(outcome, CpunetError):
-                failed[name] = str(outcome)
                 log.info(f"{name}: failed: {outcome}")
-            else:
-                done[name] = outcome
-    in_order = {name: done[name] for name in channels if name in done}
-    return Outcome(in_order, {name: failed[name] for name in channels if name in failed})
+    in_order = [(name, arrived[name]) for name in channels]
+    return Outcome(
+        {name: result for name, result in in_order if not isinstance(result, CpunetError)},
+        {name: str(error) for name, error in in_order if isinstance(error, CpunetError)},
+    )
 
 
 def _work(

@@ -8,10 +8,9 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses, line_slope
-from cpunet.pulses.peaks import label_peaks
+from cpunet.pulses.peaks import label_peaks, suggested_calibration
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.source import PulseSource, amplitude
-from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
 from cpunet.tables import counted, span
 

@@ -14,9 +14,8 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.peaks import EnergySelection, suggested_calibration
 from cpunet.pulses.reading.source import amplitude
-from cpunet.pulses.spectrum import suggested_calibration
 
 if TYPE_CHECKING:  # compiled loops, which a look into a file does not need
     from cpunet.pulses.preparation import Kind
