@@ -37,13 +37,13 @@ def other_package() -> str | None:
         None if it is not installed, or in another folder.
     """
     here = Path(__file__).resolve().parent
-    found = next(here.parent.glob(f"{OTHER}-*.dist-info"), None)
-    if found is None:
+    metadata = next(here.parent.glob(f"{OTHER}-*.dist-info"), None)
+    if metadata is None:
         return None
     # Imported only here, since it would make `cpunet --help` wait for tens of milliseconds
     from importlib.metadata import Distribution
 
-    other = Distribution.at(found)
+    other = Distribution.at(metadata)
     files = (Path(str(other.locate_file(file))) for file in other.files or ())
     if not any(here == file.parent.resolve() for file in files if file.suffix == ".py"):
         return None

@@ -176,7 +176,7 @@ def main() -> None:
     """Run the command line: it ends in one line on stderr, if anything goes wrong."""
     words = sys.argv[1:]
     end = words.index("--") if "--" in words else len(words)  # then names only
-    debug = DEBUG in words[:end]  # known wherever it stands
+    debug = DEBUG in words[:end]  # wherever it stands
     words = [word for word in words[:end] if word != DEBUG] + words[end:]
     logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines())

@@ -86,7 +86,7 @@ def start_threads() -> int:
     OpenMP, which torch uses as well, keeps its number of threads.
 
     numba starts them with the first parallel loop and then sets OpenMP's number for the whole
-    process.  From then on torch would use another number of threads than it was told, and the
+    process.  From then on torch would use another number of threads than it was set to, and the
     last bits of a network's output depend on that number.
     """
     with suppress(ImportError):  # another threading layer

@@ -1,6 +1,6 @@
 """Outputs appear whole or not at all, and replace nothing that the user did not mean.
 
-A file or folder is written under a hidden name beside its destination, and moved there when it
+A file or folder is written under a hidden name next to its destination, and moved when it
 is complete.  No output is an input.  What exists is replaced only with ``--force``, a folder
 only if this program made it and nothing else is in it: `MARKER` lists its files.
 """
@@ -148,7 +148,7 @@ def remove_own(folder: Path, kind: FolderKind) -> None:
 
 @contextmanager
 def written_aside(target: Path) -> Iterator[Path]:
-    """Yield a temporary file name beside `target`; on success, move the file to `target`.
+    """Yield a temporary file name next to `target`; on success, move the file to `target`.
 
     On an exception the temporary file is removed and `target` is unchanged.
 
@@ -175,7 +175,7 @@ def written_aside(target: Path) -> Iterator[Path]:
 def folder_written_aside(
     target: Path, kind: FolderKind, *inputs: Given, force: bool = False
 ) -> Iterator[Path]:
-    """Yield a temporary folder beside `target`; on success, move it to `target`.
+    """Yield a temporary folder next to `target`; on success, move it to `target`.
 
     Parameters
     ----------

@@ -29,8 +29,8 @@ class _Logged(Stage):
     @property
     def format_dict(self) -> dict[str, Any]:
         left = "/{total}, {rate_noinv_fmt}, {remaining} left"
-        known = self.total and self.n < self.total
-        form = "{desc}: {n}" + (left if known else ", {rate_noinv_fmt}") + "{postfix}"
+        ends = self.total and self.n < self.total
+        form = "{desc}: {n}" + (left if ends else ", {rate_noinv_fmt}") + "{postfix}"
         return {**super().format_dict, "bar_format": form}
 
 
@@ -49,8 +49,8 @@ class _Lines:
 def stage(title: str, total: int | None = None) -> Iterator[Stage]:
     """Show how far the work within is: by a bar on a terminal or in a notebook.
 
-    Elsewhere it is told at level INFO, every `LOG_EVERY_S` seconds and at the end.  A level of
-    the logger ``cpunet`` above WARNING silences bars, too.
+    Elsewhere the log has it at level INFO, every `LOG_EVERY_S` seconds and at the end.  A level
+    of the logger ``cpunet`` above WARNING silences bars, too.
 
     Parameters
     ----------

@@ -119,7 +119,7 @@ def test_energies_of_another_file(file, tmp_path, raw):
     blocks = list(open_pulses(file, energy=f"{hit}:ch1/hit/E_cal").blocks(4))
     energies = np.concatenate([block.energy_kev for block in blocks])
     np.testing.assert_array_equal(energies, np.arange(N) * 1.5)
-    with pytest.raises(CpunetError, match=rf"has 3 values beside {N} waveforms"):
+    with pytest.raises(CpunetError, match=rf"has 3 values for {N} waveforms"):
         open_pulses(file, energy=f"{hit}:ch1/short/E_cal")
     with pytest.raises(CpunetError, match=r"hit.lh5: no column ch1/hit/x; there are E_cal"):
         open_pulses(file, energy=f"{hit}:ch1/hit/x")

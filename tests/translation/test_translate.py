@@ -188,7 +188,7 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
     assert plain(table.depth) == list(range(N))
     assert plain(table.text) == [b"a", b"bc"] * (N // 2)
     told = " ".join(caplog.messages)
-    assert "column short is left out: 3 rows beside 40 pulses" in told
+    assert "column short is left out: 3 rows for 40 pulses" in told
     assert "column pair is left out: of type complex128" in told
     assert {"short", "pair"}.isdisjoint(table)
 

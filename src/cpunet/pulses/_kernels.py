@@ -398,10 +398,10 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
 @compiled
 def _jumps(smooth, align, rise, s):  # type: ignore[no-untyped-def]
     """Whether most of the rise of a tail is within the time over which noise is averaged."""
-    apart = 2 * s.smoothed + 1
+    width = 2 * s.smoothed + 1
     first = max(align + s.samples_after - s.decay_fit_samples, 0)
-    for i in range(first, min(align + s.samples_after, len(smooth)) - apart):
-        if smooth[i + apart] - smooth[i] > 0.5 * rise:
+    for i in range(first, min(align + s.samples_after, len(smooth)) - width):
+        if smooth[i + width] - smooth[i] > 0.5 * rise:
             return True
     return False
 
@@ -494,7 +494,7 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
 
 @compiled
 def prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
-    """Prepare all traces; accepted ones fill the first rows.  Return how many there are."""
+    """Prepare all traces; accepted ones fill the first rows.  Return their number."""
     logs, smooth = np.empty(s.decay_fit_samples), np.empty(waveforms.shape[1])
     n = 0
     for i in range(len(waveforms)):

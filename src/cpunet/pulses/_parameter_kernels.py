@@ -1,4 +1,4 @@
-"""Compiled loops of the pulse-shape parameters: several pulses in, their numbers out.
+"""Compiled loops of the current amplitude: several pulses in, their numbers out.
 
 Each step of dspeed's moving windows depends on the one before, so a single pulse leaves most of
 a processor idle.  Here each step of the current amplitude is done for `LANES` pulses at once.
@@ -11,7 +11,6 @@ exception.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -90,24 +89,3 @@ def averaged_maxima(current, first, samples, upsampling, widths, ends):  # type:
         for lane in range(min(LANES, n - begin)):
             maxima[begin + lane] = highest[lane]
     return maxima
-
-
-@_compiled
-def crossings(waveforms, levels, stops):  # type: ignore[no-untyped-def]
-    """Times in samples of the last crossings of levels before a sample; NaN without one.
-
-    They are those of dspeed's ``interpolated_time_point_thresh``, backward and with straight
-    lines between samples, of waveforms ``(n, length)`` and levels ``(n, levels)``, searched
-    from the samples `stops`.
-    """
-    times = np.full(levels.shape, math.nan)
-    for row in range(len(waveforms)):
-        pulse = waveforms[row]
-        for column in range(levels.shape[1]):
-            level = np.float64(levels[row, column])
-            for i in range(stops[row], 1, -1):
-                before, after = np.float64(pulse[i - 1]), np.float64(pulse[i])
-                if before < level <= after or before > level >= after:
-                    times[row, column] = i - 1 + (level - before) / (after - before)
-                    break
-    return times

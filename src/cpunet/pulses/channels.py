@@ -96,18 +96,18 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
     if sim.table != ALL:
         return {name: (sim, file) for name, file in measured.items()}
     simulated = channels_of(sim)
-    there = ", ".join(simulated)
+    names = ", ".join(simulated)
     return {
         name: (simulated[name], file)
         if name in simulated
-        else CpunetError(f"{sim.path}: no table of {name}; there are those of {there}")
+        else CpunetError(f"{sim.path}: no table of {name}; there are those of {names}")
         for name, file in measured.items()
     }
 
 
 @dataclass(frozen=True)
 class Outcome(Generic[R]):
-    """Outcome of each channel: a result, or the reason why there is none."""
+    """Outcome of each channel: a result, or the reason of its failure."""
 
     done: dict[str, R] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
@@ -115,10 +115,12 @@ class Outcome(Generic[R]):
     @property
     def ok(self) -> bool:
         """Whether no channel failed, and no result is bad."""
-        return not self.failed and all(getattr(one, "ok", True) for one in self.done.values())
+        return not self.failed and all(
+            getattr(result, "ok", True) for result in self.done.values()
+        )
 
     def __str__(self) -> str:
-        lines = {name: repr(found).strip("<>'") for name, found in self.done.items()}
+        lines = {name: repr(result).strip("<>'") for name, result in self.done.items()}
         lines |= {name: f"failed: {reason}" for name, reason in self.failed.items()}
         width = max(map(len, lines), default=0)
         return "\n".join(f"{name:<{width}}  {line}" for name, line in lines.items())
@@ -150,21 +152,21 @@ def each_channel(
             f"{len(channels)}"
         )
     make = partial(_work, dict(channels), out, do)
-    done: dict[str, R] = {}
-    failed: dict[str, str] = {}
+    arrived: dict[str, R | CpunetError] = {}
     with (
         stage("Channels", len(channels)) as bar,
-        closing(outcomes(make, list(channels), usable_cores())) as found,
+        closing(outcomes(make, list(channels), usable_cores())) as results,
     ):
-        for name, outcome in found:
+        for name, outcome in results:
             bar.update()
+            arrived[name] = outcome
             if isinstance(outcome, CpunetError):
-                failed[name] = str(outcome)
                 log.info(f"{name}: failed: {outcome}")
-            else:
-                done[name] = outcome
-    in_order = {name: done[name] for name in channels if name in done}
-    return Outcome(in_order, {name: failed[name] for name in channels if name in failed})
+    in_order = [(name, arrived[name]) for name in channels]
+    return Outcome(
+        {name: result for name, result in in_order if not isinstance(result, CpunetError)},
+        {name: str(error) for name, error in in_order if isinstance(error, CpunetError)},
+    )
 
 
 def _work(

@@ -76,7 +76,7 @@ class Pulses:
         for name in _PER_PULSE[1:]:
             shape = getattr(self, name).shape
             if shape != (n,):
-                raise CpunetError(f"{name} has shape {shape} beside {n} waveforms")
+                raise CpunetError(f"{name} has shape {shape} for {n} waveforms")
         if not (np.isfinite(self.dt_ns) and self.dt_ns > 0):
             raise CpunetError(f"the sampling period is {self.dt_ns} ns; expected more than 0")
 
@@ -125,8 +125,8 @@ class Pulses:
         return Pulses(dt_ns=self.dt_ns, **chosen)
 
     def __repr__(self) -> str:
-        known = self.energy_kev[np.isfinite(self.energy_kev)]
-        kev = f", {known.min():.0f} to {known.max():.0f} keV" if len(known) else ""
+        finite = self.energy_kev[np.isfinite(self.energy_kev)]
+        kev = f", {finite.min():.0f} to {finite.max():.0f} keV" if len(finite) else ""
         return f"<{len(self)} pulses of {self.length} samples, {self.dt_ns:g} ns each{kev}>"
 
     def to_dataframe(self) -> DataFrame:

@@ -8,10 +8,9 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses, line_slope
-from cpunet.pulses.peaks import label_peaks
+from cpunet.pulses.peaks import label_peaks, suggested_calibration
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.source import PulseSource, amplitude
-from cpunet.pulses.spectrum import suggested_calibration
 from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
 from cpunet.tables import counted, span
 
@@ -102,8 +101,8 @@ def describe_pulses(
     seen = set[int]()
     for block in blocks:
         n_pulses += len(block)
-        energies.append(known := block.energy_kev[np.isfinite(block.energy_kev)])
-        if not len(known):
+        energies.append(of_block := block.energy_kev[np.isfinite(block.energy_kev)])
+        if not len(of_block):
             heights.append(amplitude(block.waveforms))
         # A sum is NaN or infinite if any sample is; this needs no mask as large as the block.
         with np.errstate(invalid="ignore", over="ignore"):
@@ -117,16 +116,16 @@ def describe_pulses(
         seen.update(hashes)
         extremes += [low, high]
     kev, samples = np.concatenate(energies), np.concatenate(extremes)
-    found = suggested_calibration(kev if len(kev) else np.concatenate(heights))
+    lines_at = suggested_calibration(kev if len(kev) else np.concatenate(heights))
     energy, origin, amplitudes = source.energies, "", ""
     if len(kev):
         energy += f", {span([kev.min(), kev.max()])} keV"
         energy += f"; {n_pulses - len(kev)} pulses have none" if len(kev) < n_pulses else ""
-        if found is not None:
-            place = f"{1 / found.kev_per_adc:.4f} of their energies"
-            origin = f"lines of {found.source}, at {place}"
+        if lines_at is not None:
+            place = f"{1 / lines_at.kev_per_adc:.4f} of their energies"
+            origin = f"lines of {lines_at.source}, at {place}"
     else:
-        amplitudes = "no lines that stand out" if found is None else f"like {found}"
+        amplitudes = "no lines that stand out" if lines_at is None else f"like {lines_at}"
     lines, odd = label_peaks(kev, peaks), {"not finite": n_not_finite, "constant": n_constant}
     odd["copies of others"] = n_copies
     odds = "".join(f"; {n} traces {what}" for what, n in odd.items() if n)

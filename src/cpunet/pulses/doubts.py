@@ -14,9 +14,8 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.peaks import EnergySelection, suggested_calibration
 from cpunet.pulses.reading.source import amplitude
-from cpunet.pulses.spectrum import suggested_calibration
 
 if TYPE_CHECKING:  # compiled loops, which a look into a file does not need
     from cpunet.pulses.preparation import Kind
@@ -138,7 +137,7 @@ class SecondRate(NamedTuple):
 
 
 def second_rate(traces: FloatArray) -> SecondRate | None:
-    """Find where digitisers begin to average samples, which are then further apart in time.
+    """Find where digitisers begin to average samples, which are then longer.
 
     Averages of m samples have less noise, by the root of m if it is white, and the decay goes
     on m times as fast from sample to sample.

@@ -1,6 +1,6 @@
 """Read and prepare the input files of a command, block by block.
 
-Only the windows of accepted pulses are kept, so memory grows with the pulses used and not with
+Only the windows of accepted pulses stay, so memory grows with the pulses used and not with
 the size of the file.
 """
 
@@ -78,7 +78,7 @@ _REMEDIES = {
 
 
 class InfoPart(BaseModel):
-    """Further entries are kept as they are."""
+    """Further entries stay as they are."""
 
     model_config = ConfigDict(
         extra="allow",
@@ -90,7 +90,7 @@ class InfoPart(BaseModel):
 
 
 class SideInfo(InfoPart):
-    """The pulses of one side of a training, as far as they are known.
+    """The pulses of one side of a training, as far as a run says.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class SideInfo(InfoPart):
 class InputSet:
     """The prepared pulses of a file, with the quality cuts if they are measured.
 
-    ``energies_kev`` contains the known energies of all pulses of the file, selected or not;
+    ``energies_kev`` contains the finite energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
     simulated detector, if the file contains it; ``baselines`` what noise and pile-up tails need
     of measured traces; ``counts`` their lowest and highest sample.
@@ -193,7 +193,7 @@ def load_pulses(
     max_pulses
         Use a sample of so many pulses, if there are more.
     tell
-        Whether the log says what was found.
+        Whether the log has the counts.
 
     Raises
     ------

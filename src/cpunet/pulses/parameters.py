@@ -11,21 +11,21 @@ is given by the cubic spline through the samples: linear interpolation would smo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.kernels import kernel
 from cpunet.pulses import _parameter_kernels as kernels
 from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
 Values = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
 
     Each value of that chain is a positively weighted mean of the current some samples
     away.  The chain is therefore first run only around the steepest point of a
-    pulse.  If the current elsewhere exceeds the maximum found there, the whole pulse is
+    pulse.  If the current elsewhere exceeds the maximum of that part, the whole pulse is
     processed.
 
     Parameters
@@ -229,7 +229,7 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     def one_block(block: FloatArray) -> Values:
         end = block.argmax(axis=1)
         height = np.take_along_axis(block, end[:, np.newaxis], axis=1)
-        start = kernels.crossings(block, start_fraction * height, end)[:, 0]
+        start = crossings(block, start_fraction * height, end)[:, 0]
         return np.asarray((end - start) * dt_ns)
 
     return _by_blocks(one_block, waveforms, shortest=2)
@@ -324,57 +324,41 @@ def _by_blocks(
     return values
 
 
-_compiled: Any = kernel(error_model="numpy")
+BISECTIONS = 30  # of one sample: a precision of 1e-9
+PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
 
 
-@_compiled
-def _weights(t):  # type: ignore[no-untyped-def]
-    """Weights of the coefficients at -1, 0, 1, 2 for a time between 0 and 1."""
+def _spline(near: Sequence[Values], t: Values) -> Values:
+    """Cubic spline of coefficients at -1, 0, 1 and 2, at times between 0 and 1."""
     s = 1 - t
-    return (
+    weights = (
         s * s * s / 6,
         (3 * t * t * t - 6 * t * t + 4) / 6,
         (3 * s * s * s - 6 * s * s + 4) / 6,
         t * t * t / 6,
     )
+    a, b, c, d = (w * values for w, values in zip(weights, near, strict=True))
+    return np.asarray(a + b + c + d)
 
 
-@_compiled
-def _crossings(coefficients, before, pad, levels, bisections, times):  # type: ignore[no-untyped-def]
-    for row in range(len(levels)):
-        at = before[row] + pad
-        near = coefficients[row, at - 1 : at + 3]
-        low, high = 0.0, 1.0
-        for _ in range(bisections):
-            middle = 0.5 * (low + high)
-            a, b, c, d = _weights(middle)
-            if a * near[0] + b * near[1] + c * near[2] + d * near[3] < levels[row]:
-                low = middle
-            else:
-                high = middle
-        times[row] = before[row] + 0.5 * (low + high)
+def crossings(waveforms: FloatArray, levels: FloatArray, stops: Integers) -> Values:
+    """Times in samples of the last crossings of levels before a sample; NaN without any.
 
-
-@_compiled
-def _shifted(coefficients, times, pad, n_before, moved):  # type: ignore[no-untyped-def]
-    n_after = moved.shape[1] - n_before
-    for row in range(len(times)):
-        start = int(np.floor(times[row]))
-        known = coefficients.shape[1] - 2 * pad
-        if times[row] > start:
-            known -= 1
-        a, b, c, d = _weights(times[row] - start)
-        first, stop = max(start - n_before, 0), min(start + n_after, known)
-        if first >= stop:
-            continue
-        near = coefficients[row, first + pad - 1 : stop + pad + 2]
-        shown = moved[row, first - start + n_before : stop - start + n_before]
-        for i in range(len(shown)):
-            shown[i] = a * near[i] + b * near[i + 1] + c * near[i + 2] + d * near[i + 3]
-
-
-BISECTIONS = 30  # of one sample: a precision of 1e-9
-PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
+    They are those of dspeed's ``interpolated_time_point_thresh``, backward and with straight
+    lines between samples, of waveforms ``(n, length)`` and levels ``(n, levels)``, searched
+    from the samples `stops`.
+    """
+    times, sample = np.full(levels.shape, np.nan), np.arange(waveforms.shape[1] - 1)
+    searched = (sample >= 1) & (sample < stops[:, np.newaxis])
+    for column, level in enumerate(levels.T):
+        below, above = waveforms < level[:, np.newaxis], waveforms > level[:, np.newaxis]
+        crosses = (below[:, :-1] & ~below[:, 1:]) | (above[:, :-1] & ~above[:, 1:])
+        crosses &= searched
+        last = len(sample) - 1 - crosses[:, ::-1].argmax(axis=1)
+        rows = np.flatnonzero(crosses[np.arange(len(last)), last])
+        low, high = (waveforms[rows, last[rows] + i].astype(float) for i in (0, 1))
+        times[rows, column] = last[rows] + (level[rows].astype(float) - low) / (high - low)
+    return times
 
 
 def last_below(
@@ -446,13 +430,26 @@ def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
     crosses, before = last_below(waveforms, top, 0.5 * height)
-    if (usable := finite & (height > 0) & crosses).any():
-        pulses = waveforms[usable]
-        padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
-        coefficients = spline_filter1d(padded, order=3, axis=1)
-        times, shifted = np.empty(len(pulses)), moved[usable]
-        level = 0.5 * pulses.max(axis=1).astype(float)
-        _crossings(coefficients, before[usable], PAD, level, BISECTIONS, times)
-        _shifted(coefficients, times, PAD, n_before, shifted)
-        moved[usable] = shifted
+    if not (usable := finite & (height > 0) & crosses).any():
+        return moved
+    pulses, before = waveforms[usable], before[usable]
+    padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
+    coefficients = spline_filter1d(padded, order=3, axis=1)
+    level = 0.5 * pulses.max(axis=1).astype(float)
+    rows, places = np.arange(len(pulses)), before + PAD + np.arange(-1, 3)[:, np.newaxis]
+    near, low, high = coefficients[rows, places], np.zeros(len(pulses)), np.ones(len(pulses))
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        below = _spline(near, middle) < level
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    times = before + 0.5 * (low + high)
+    n, start = n_before + n_after, np.floor(times).astype(int)
+    samples = start[:, np.newaxis] - n_before + np.arange(-1, n + 2)
+    places = (samples + PAD).clip(0, padded.shape[1] - 1)
+    around = np.take_along_axis(coefficients, places, axis=1)
+    part = (times - start)[:, np.newaxis]
+    shifted = _spline([around[:, k : k + n] for k in range(4)], part)
+    end = pulses.shape[1] - (times > start)
+    shifted[(samples[:, 1:-2] < 0) | (samples[:, 1:-2] >= end[:, np.newaxis])] = np.nan
+    moved[usable] = shifted
     return moved

@@ -1,4 +1,4 @@
-"""Columns beside the waveforms of a file, copied row by row."""
+"""Columns of a file other than the waveforms, copied row by row."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Read: TypeAlias = Callable[[int, int], dict[str, LGDO]]  # from a row on, so man
 
 
 def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict[str, str]]:
-    """Columns beside the waveforms of a file.
+    """Columns of a file other than the waveforms.
 
     Parameters
     ----------
@@ -116,4 +116,4 @@ def _unreadable(item: h5py.Group | h5py.Dataset, n_pulses: int) -> str:
             _rows(item, None, 0, 1)
         except Exception as error:  # the library raises various errors on foreign types
             return f"the LH5 library cannot read it ({' '.join(str(error).split())})"
-    return "" if rows == n_pulses else f"{rows} rows beside {n_pulses} pulses"
+    return "" if rows == n_pulses else f"{rows} rows for {n_pulses} pulses"

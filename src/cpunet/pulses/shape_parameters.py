@@ -12,7 +12,6 @@ import hist
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.pulses import _parameter_kernels as kernels
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.legend_parameters import legend_parameters
 from cpunet.pulses.parameters import (
@@ -20,6 +19,7 @@ from cpunet.pulses.parameters import (
     PARAMETERS,
     Parameter,
     Values,
+    crossings,
     current_amplitude,
     drift_time,
     tail_slope,
@@ -89,7 +89,7 @@ def all_parameters(
     scores
         Score settings, with the fraction of the maximum at which the drift time begins.
     amplitudes
-        Current amplitudes of the pulses, if they are known; else they are computed.
+        Current amplitudes of the pulses; computed by default.
     decay_ns
         Decay that LEGEND's parameters are corrected for; by default the median one of these
         pulses.
@@ -141,7 +141,7 @@ def all_parameters(
             positive = height > 0  # False for NaN
             stop = np.where(positive, block.argmax(axis=1), 0)
             levels = np.outer(np.where(positive, height, np.nan), fractions)
-            samples = kernels.crossings(block, levels.astype(np.float32), stop)
+            samples = crossings(block, levels.astype(np.float32), stop)
             times = (samples - preparation.samples_before) * dt_ns
             columns |= dict(zip(TIME_POINTS, times.T, strict=True))
             for name, (begin, end) in RISE_TIMES.items():

@@ -2,7 +2,7 @@
 
 The classifier two-sample test (Lopez-Paz & Oquab, ICLR 2017) trains a classifier on part
 of both datasets and tests on the rest how well it separates them.  An area under the ROC
-curve (AUC) of 0.5 means that it found no difference; 1 means that it is never wrong.
+curve (AUC) of 0.5 means that it sees no difference; 1 means that it is never wrong.
 
 The classifier is a ridge regression on ±1 labels with expanded features: the pulse shape,
 and products and sinusoids of its leading components.  On synthetic pulses with small
@@ -123,7 +123,7 @@ def classifier_auc(
             f"and {size} of each would be compared; a two-sample test needs {MIN_PULSES} "
             "of each"
         )
-    rows = [np.sort(rng.choice(found, size, replace=False)) for found in usable]
+    rows = [np.sort(rng.choice(own, size, replace=False)) for own in usable]
     windows = np.concatenate([s[r] for s, r in zip(sides, rows, strict=True)]).astype(float)
     extra = np.concatenate([e[r] for e, r in zip(extras, rows, strict=True)])
 
@@ -284,7 +284,7 @@ def _ridge(features: Values, labels: Values) -> Values:
     shrink = 1 / (np.maximum(eigenvalues, 0)[:, np.newaxis] + PENALTIES * n)
     leverage = rotated**2 @ shrink + 1 / n
     projected = rotated.T @ targets
-    # float32 suffices to choose among penalties that are factors of three apart
+    # float32 suffices to choose among penalties at factors of three
     few_digits, wanted = rotated.astype(np.float32), targets.astype(np.float32)
     errors = []
     for shrunk, h in zip(shrink.T[..., np.newaxis], leverage.T[..., np.newaxis], strict=True):

@@ -192,7 +192,7 @@ class HeldFile(io.FileIO):
         return 0 if size is None else size
 
     def require_written(self) -> None:
-        """Raise the failure, if there was one."""
+        """Raise the failure, if any."""
         if self.failure is not None:
             raise self.failure
 

@@ -30,10 +30,9 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.parameters import Values, current_amplitude
-from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.peaks import EnergySelection, line_near, parse_selection
 from cpunet.pulses.preparation import Kind, Rejection
 from cpunet.pulses.reading.files import ALL, ReadOptions, Source
-from cpunet.pulses.spectrum import line_near
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.pulse_sets import MIN_PULSES, spread

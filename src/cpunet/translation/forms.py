@@ -231,8 +231,8 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
     Raises
     ------
     CpunetError
-        If one of the two is neither given nor known, the gain is not positive, or the baseline
-        is negative.
+        If one of the two is neither given nor in the run, the gain is not positive, or the
+        baseline is negative.
     """
     adc_per_kev, baseline = adc.adc_per_kev, adc.baseline
     if adc_per_kev is not None and not (np.isfinite(adc_per_kev) and adc_per_kev > 0):

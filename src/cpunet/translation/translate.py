@@ -84,7 +84,7 @@ def translate(
     jobs
         Processes, each of which translates a file at a time.
     resume
-        Keep files that are there already, if made from the same input in the same way.
+        Leave files that exist already, if made from the same input in the same way.
     read
         How files are read, if they do not tell themselves.  With ``all`` for the table, each
         table is translated to a file in `out`.
@@ -137,7 +137,7 @@ def translate(
     run = used_run(run)
     if several:
         return to_files.several(run, files, Path(out), jobs)
-    return to_files.one(run, files[0], Path(out))
+    return to_files.single(run, files[0], Path(out))
 
 
 def _files(
@@ -166,7 +166,7 @@ class _ToFiles:
     resume: bool
     force: bool
 
-    def one(
+    def single(
         self, run: Run, source: PulseFile, out: Path, noise_key: str | None = None
     ) -> Translation:
         job = FileTranslation(run, self.options)
@@ -191,7 +191,7 @@ class _ToFiles:
 
     def of_channel(self, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
         run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-        return self.one(used_run(run), pair[0], place.with_name(f"{name}.lh5"), name)
+        return self.single(used_run(run), pair[0], place.with_name(f"{name}.lh5"), name)
 
     def several(
         self, run: Run, sources: Sequence[PulseFile], out: Path, jobs: int

@@ -219,7 +219,7 @@ class Translator:
             shape = np.shape(np.asarray(values))
             if shape not in ((), (len(pulses),)):
                 raise CpunetError(
-                    f"{name} has shape {shape} beside {len(pulses)} pulses; give one for each, "
+                    f"{name} has shape {shape} for {len(pulses)} pulses; give one for each, "
                     "or one for all"
                 )
             if values is not None:

@@ -71,7 +71,7 @@ class Column:
         """Raise a `CpunetError` unless it has a value for each pulse, or one for all."""
         if n_pulses is not None and not self.constant and len(self) != n_pulses:
             raise CpunetError(
-                f"{path}: column {name} has {len(self)} values beside {n_pulses} waveforms; "
+                f"{path}: column {name} has {len(self)} values for {n_pulses} waveforms; "
                 "give the column of the same events"
             )
 

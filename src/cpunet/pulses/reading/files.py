@@ -1,4 +1,4 @@
-"""A file of pulses and how it is read: its format is told by its first bytes."""
+"""A file of pulses and how it is read: its first bytes show its format."""
 
 from __future__ import annotations
 
@@ -177,17 +177,17 @@ class PulseFile:
     def chosen_of(
         self,
         tables: list[str],
-        one: str,
-        many: str,
+        kind: str,
+        kinds: str,
         remedy: str = "choose one with `table` (`sim_table`, `data_table`)",
     ) -> str:
-        """The table that the user chose, or the only one.
+        """The table that the user chose, or the only table.
 
         Parameters
         ----------
         tables
             Tables in the file, at least one.
-        one, many
+        kind, kinds
             What a table and several are called.
         remedy
             What to do if nothing was chosen.
@@ -201,11 +201,11 @@ class PulseFile:
             if len(tables) == 1:
                 return tables[0]
             raise CpunetError(
-                f"{self.path}: {len(tables)} {many} ({shortened(tables)}); {remedy}"
+                f"{self.path}: {len(tables)} {kinds} ({shortened(tables)}); {remedy}"
             )
         if self.place not in tables:
             raise CpunetError(
-                f"{self.path}: no {one} {self.place}; there are {shortened(tables)}"
+                f"{self.path}: no {kind} {self.place}; there are {shortened(tables)}"
             )
         return self.place
 

@@ -35,7 +35,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 
 WAVEFORMS, DETECTOR = "raw_waveform", "detector"
-_NUMBERS = (DETECTOR, "run_number", "id")  # beside the waveforms, in every file
+_NUMBERS = (DETECTOR, "run_number", "id")  # in every file, with the waveforms
 _RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
 
 
@@ -116,8 +116,8 @@ def read_pickles(options: PulseFile) -> PulseSource:
             with np.errstate(over="ignore"):  # values beyond single precision are counted later
                 trace = np.asarray(entry["wf"], np.float32)
             events.append(int(entry.get("event", place)))
-            beside = entry.keys() & {"tp0", "energy", "dc_label"}
-            numbers.append({name: float(entry[name]) for name in beside})
+            names = entry.keys() & {"tp0", "energy", "dc_label"}
+            numbers.append({name: float(entry[name]) for name in names})
         except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
             raise CpunetError(
                 f"{path}: entry {place} is no pulse (a dictionary of wf and numbers); {_OTHERS}"

@@ -160,7 +160,7 @@ class PulseSource:
         sizes = {len(column) for column in columns.values() if not column.constant}
         if length in sizes and n not in sizes:
             raise CpunetError(
-                f"{path}: traces of shape {values.shape} beside columns of {length}: their "
+                f"{path}: traces of shape {values.shape} with columns of {length}: their "
                 "dimensions are reversed",
                 "write them transposed, with the pulses first",
             )
