@@ -111,7 +111,8 @@ def panels(
     from matplotlib.figure import Figure
     from matplotlib.transforms import ScaledTranslation
 
-    figure, (width, height) = Figure(figsize=size, layout="none"), size
+    figure, (width, height) = Figure(figsize=size), size
+    figure.set_layout_engine("none")
     grid = figure.subplots(rows, columns, squeeze=False, **how)
     across = 0.15 if how.get("sharey") or not labels else LEFT
     down = 0.15 if how.get("sharex") else BOTTOM + 0.1
@@ -127,12 +128,10 @@ def panels(
         hspace=down / high,
     )
     for axes in grid.flat:
-        for axis, place, inches in (
-            (axes.xaxis, (0.5, 0), (0, -0.25)),
-            (axes.yaxis, (0, 0.5), (-LABEL, 0)),
-        ):
-            away = ScaledTranslation(*inches, figure.dpi_scale_trans)
-            axis.set_label_coords(*place, transform=axes.transAxes + away)
+        below = axes.transAxes + ScaledTranslation(0, -0.25, figure.dpi_scale_trans)
+        left_of = axes.transAxes + ScaledTranslation(-LABEL, 0, figure.dpi_scale_trans)
+        axes.xaxis.set_label_coords(0.5, 0, transform=below)
+        axes.yaxis.set_label_coords(0, 0.5, transform=left_of)
     return figure, grid
 
 

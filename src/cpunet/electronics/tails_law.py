@@ -360,7 +360,7 @@ class _Likelihood:
     def rate_error(self, vector: FloatArray, fixed: FloatArray | None) -> float:
         """Relative standard error of the rate at a minimum; 0 without a curvature there."""
         fit = minimised(lambda v: -self.value(v, fixed), vector, self.steps, descend=False)
-        return fit.errors[0] if fit.fmin.has_posdef_covar else 0.0
+        return float(fit.errors[0]) if fit.fmin.has_posdef_covar else 0.0
 
     def without(self) -> float:
         """Maximum log-likelihood without any tails."""
@@ -368,10 +368,11 @@ class _Likelihood:
         spread = max(float(self.kev.std()), self.sigma)
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
         steps = self.steps[1:3]
-        return -min(
-            minimised(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s, steps).fval
-            for s in starts
-        )
+        fits = [
+            minimised(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), start, steps)
+            for start in starts
+        ]
+        return -min(float(fit.fval) for fit in fits)
 
 
 def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
@@ -404,7 +405,7 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
 
 def minimised(
     cost: Function,
-    start: Sequence[float],
+    start: npt.ArrayLike,
     steps: Sequence[float],
     *,
     limits: Sequence[tuple[float, float] | None] | None = None,
@@ -413,9 +414,10 @@ def minimised(
     """Minimum of a negative log-likelihood by MIGRAD, or its curvature where it stands."""
     from iminuit import Minuit  # few channels come so far
 
-    fit = Minuit(cost, np.asarray(start, float))
+    begin = np.asarray(start, float)
+    fit = Minuit(cost, begin)
     fit.errordef = Minuit.LIKELIHOOD
-    fit.errors = steps[: len(start)]
+    fit.errors = steps[: len(begin)]
     if limits:
         fit.limits = limits
     return fit.migrad() if descend else fit.hesse()
