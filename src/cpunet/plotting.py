@@ -50,6 +50,9 @@ LABELS = {
 # two panels above each other, the lower one smaller
 STACKED: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
 
+# Inches around panels, from an axis to its label, and of a line of a legend.
+LEFT, RIGHT, BOTTOM, TOP, LABEL, LINE = 0.85, 0.15, 0.48, 0.3, 0.48, 0.18
+
 _STYLE = {
     "font.size": 10.0,
     "axes.labelsize": 10.0,
@@ -94,13 +97,42 @@ def group(drawn: Container, method: str) -> None:
 
 
 def panels(
-    size: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any
+    size: tuple[float, float],
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    labels: bool = True,
+    **how: Any,
 ) -> tuple[Figure, npt.NDArray[Any]]:
-    """A figure of a size in inches with a grid of panels, made as `Figure.subplots` says."""
-    from matplotlib.figure import Figure
+    """A figure of a size in inches with a grid of panels, made as `Figure.subplots` says.
 
-    figure = Figure(figsize=size)
-    return figure, figure.subplots(rows, columns, squeeze=False, **how)
+    Margins and places of labels are fixed: to measure all texts takes most of the time.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import ScaledTranslation
+
+    figure, (width, height) = Figure(figsize=size), size
+    figure.set_layout_engine("none")
+    grid = figure.subplots(rows, columns, squeeze=False, **how)
+    across = 0.15 if how.get("sharey") or not labels else LEFT
+    down = 0.15 if how.get("sharex") else BOTTOM + 0.1
+    left = LEFT if labels else 0.15
+    wide = (width - left - RIGHT - across * (columns - 1)) / columns
+    high = (height - BOTTOM - TOP - down * (rows - 1)) / rows
+    figure.subplots_adjust(
+        left=left / width,
+        right=1 - RIGHT / width,
+        bottom=BOTTOM / height,
+        top=1 - TOP / height,
+        wspace=across / wide,
+        hspace=down / high,
+    )
+    for axes in grid.flat:
+        below = axes.transAxes + ScaledTranslation(0, -0.25, figure.dpi_scale_trans)
+        left_of = axes.transAxes + ScaledTranslation(-LABEL, 0, figure.dpi_scale_trans)
+        axes.xaxis.set_label_coords(0.5, 0, transform=below)
+        axes.yaxis.set_label_coords(0, 0.5, transform=left_of)
+    return figure, grid
 
 
 def own_axes(ax: Axes | None) -> Axes:
@@ -117,13 +149,23 @@ def legend_above(
     figure: Figure, axes: Axes, columns: int = 1, title: str | None = None
 ) -> None:
     """Put the legend of one panel above all."""
+    handles, texts = axes.get_legend_handles_labels()
+    titles = title.count("\n") + 1 if title else 0
+    lines = -(-len(texts) // columns) + 1.3 * titles
+    height = figure.get_figheight()
     figure.legend(
-        *axes.get_legend_handles_labels(),
-        loc="outside upper left",
+        handles,
+        texts,
+        loc="upper left",
+        bbox_to_anchor=(0, 1),
+        borderaxespad=0.2,
         ncols=columns,
         title=title,
         alignment="left",
     )
+    # titles of panels stand below it
+    panel = LINE if axes.get_title() else 0.0
+    figure.subplots_adjust(top=1 - (0.12 + LINE * lines + panel) / height)
 
 
 def steps(axes: Axes, heights: Any, edges: Any, method: str, text: str) -> None:

@@ -171,6 +171,20 @@ def test_noise_slower_than_a_baseline_is_found() -> None:
     assert found == pytest.approx(4 * power[slow].sum(), rel=0.5)
 
 
+@pytest.mark.parametrize("samples", [3000, 6000, 8192])
+def test_a_line_does_not_beat_in_long_records(samples: int) -> None:
+    lines = np.zeros((1, 4097))
+    lines[0, 901] = 100.0
+    quiet = np.zeros((1, 4097))
+    noise = BaselineNoise(
+        lines[0], 8192, DT_NS, 100, kinds=quiet, lines=lines, shares=np.ones(1)
+    )
+    drawn = noise.draw(np.ones(40), samples, np.random.default_rng(3))
+    rms = drawn.std(axis=1)
+    assert np.ptp(rms) < 0.01 * rms.mean()
+    assert rms.mean() == pytest.approx(np.sqrt(2 * 100.0 / 8192), rel=0.01)
+
+
 def test_a_line_is_a_sine_of_its_height() -> None:
     rng = np.random.default_rng(9)
     phase = rng.uniform(0, 2 * np.pi, (800, 1))

@@ -17,9 +17,10 @@ import numpy.typing as npt
 import scipy.fft
 import scipy.ndimage
 import scipy.optimize
+from scipy.stats import median_abs_deviation
 
 from cpunet.electronics.exponentials import FloatArray as Values
-from cpunet.electronics.pile_up_tails import MIN_BASELINES, SIGMA_PER_MAD
+from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray
@@ -180,8 +181,9 @@ class BaselineNoise:
         # Twice as long as needed, so that its end is independent of its beginning.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
         each = max(1, (long - length) // length)  # parts of a trace, with a gap at its end
-        size = self._sizes(self.density[np.newaxis] if self.kinds is None else self.kinds, long)
-        lines = None if self.lines is None else self._sizes(self.lines, long)
+        continua = self.density[np.newaxis] if self.kinds is None else self.kinds
+        size = _sizes(self._at(continua, long), long)
+        lines = None if self.lines is None else _sizes(self._lines_at(long), long)
         noise = np.empty((n, length), np.float32)
         order = rng.permutation(n)
         for first in range(0, n, each * TRACES):
@@ -197,15 +199,6 @@ class BaselineNoise:
         noise *= (rng.choice((-1.0, 1.0), n) / energy_kev)[:, np.newaxis]
         return noise
 
-    def _sizes(self, densities: Values, long: int) -> FloatArray:
-        """Standard deviation of the real and imaginary parts of FFT bins of `long` samples."""
-        variances = 0.5 * long * self._at(densities, long)
-        # these bins are real: all their power is in the real part
-        variances[:, 0] *= 2
-        if long % 2 == 0:
-            variances[:, -1] *= 2
-        return np.asarray(np.sqrt(variances), np.float32)
-
     def density_of(self, length: int) -> Values:
         """Density at the frequencies of a real FFT of `length` samples, shape ``(bins,)``."""
         return np.asarray(self._at(self.density[np.newaxis], length)[0], float)
@@ -216,6 +209,25 @@ class BaselineNoise:
         if len(wanted) == len(known):
             return densities
         return np.asarray([np.interp(wanted, known, one) for one in densities], float)
+
+    def _lines_at(self, length: int) -> Values:
+        """Lines at the frequencies of an FFT of `length` samples: each stays in one bin."""
+        assert self.lines is not None
+        moved = np.zeros((len(self.lines), length // 2 + 1))
+        kind, place = np.nonzero(self.lines)
+        nearest = np.rint(place * (length / self.samples)).astype(int)
+        np.add.at(moved, (kind, nearest), self.lines[kind, place] * (length / self.samples))
+        return moved
+
+
+def _sizes(densities: Values, long: int) -> FloatArray:
+    """Standard deviation of the real and imaginary parts of FFT bins of `long` samples."""
+    variances = 0.5 * long * densities
+    # these bins are real: all their power is in the real part
+    variances[:, 0] *= 2
+    if long % 2 == 0:
+        variances[:, -1] *= 2
+    return np.asarray(np.sqrt(variances), np.float32)
 
 
 def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
@@ -322,9 +334,8 @@ def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
     flat = np.ones(len(baselines), bool)
     for _ in range(CLIPS):
         for values in (slope, width):
-            centre = np.median(values[flat])
-            sigma = SIGMA_PER_MAD * np.median(np.abs(values[flat] - centre))
-            flat &= np.abs(values - centre) <= FLAT_SIGMAS * sigma
+            sigma = median_abs_deviation(values[flat], scale="normal")
+            flat &= np.abs(values - np.median(values[flat])) <= FLAT_SIGMAS * sigma
     return flat
 
 

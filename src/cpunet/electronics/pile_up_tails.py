@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
+from scipy.stats import median_abs_deviation
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
@@ -25,7 +26,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InfoPart
 
 MIN_BASELINES = 30  # minimum number of baselines
-SIGMA_PER_MAD = 1.4826
+SIGMA_PER_MAD = 1.4826  # of a normal distribution
 MIN_LARGE = 20  # minimum number of large tails to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
 # that of a tail.
@@ -150,7 +151,7 @@ def own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None:
     middle = float(np.median(fall)) if whole.sum() >= MIN_LARGE else 0.0
     if not middle > 0:
         return None
-    error = 1.2533 * SIGMA_PER_MAD * float(np.median(np.abs(fall - middle)))
+    error = 1.2533 * float(median_abs_deviation(fall, scale="normal"))
     decay = half * dt_ns * 1e-3 / middle
     return decay, decay * error / middle / float(np.sqrt(len(fall)))
 
@@ -385,7 +386,7 @@ def _read(
     if len(finite) < MIN_BASELINES:
         raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
     centre = float(np.median(finite))
-    sigma = SIGMA_PER_MAD * float(np.median(np.abs(finite - centre)))
+    sigma = float(median_abs_deviation(finite, scale="normal"))
     broadest = centre + max(DISTURBED * sigma, 0.1 * centre)
     return mean, left, width <= broadest, broadest
 

@@ -38,11 +38,11 @@ class Parameter:
     @property
     def axis_label(self) -> str:
         """Label and unit as one string, ``"Tail slope [1/ms]"``."""
-        return f"{self.label} [{self.unit}]"
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
 
 
 PARAMETERS = {
-    "current_amplitude": Parameter("Current amplitude $I_{max}$", "1/sample"),
+    "current_amplitude": Parameter("Current amplitude", "1/sample"),
     "drift_time": Parameter("Drift time, 1 % to maximum", "ns"),
     "tail_slope": Parameter("Tail slope", "1/ms"),
 }

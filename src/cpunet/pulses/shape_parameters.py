@@ -46,7 +46,7 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
     "current_amplitude": PARAMETERS["current_amplitude"],
     "drift_time": PARAMETERS["drift_time"],
     **{
-        name: Parameter(rf"$t_{{{100 * fraction:g}\,\%}}$", "ns")
+        name: Parameter(f"t({100 * fraction:g} %)", "ns")
         for name, fraction in TIME_POINTS.items()
     },
     **{

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
+from iminuit import Minuit
 from matplotlib.figure import Figure
 from scipy.special import expit, log_ndtr, ndtr
 
@@ -199,20 +200,15 @@ def site_fit(
     x = x[(x > -BELOW) & (x < ABOVE)]
     if len(x) < MIN_EVENTS:
         return None
-    start = np.array([0.0, 0.0, -0.5, 1.0])
-    found = scipy.optimize.minimize(_nll, start, args=(x,), method="BFGS")
-    errors = _errors(found.x, x)
-    if errors is None:
+    fit = Minuit(lambda parameters: _nll(parameters, x), np.array([0.0, 0.0, -0.5, 1.0]))
+    fit.errordef = Minuit.LIKELIHOOD
+    fit.errors = (0.1, 0.1, 0.5, 0.5)
+    fit.migrad().hesse()
+    if not fit.valid:
         return None
-    mean, log_sigma = found.x[:2]
-    sigma = float(np.exp(log_sigma))
-    return (
-        float(centre + width * mean),
-        float(width * errors[0]),
-        width * sigma,
-        float(width * sigma * errors[1]),
-        len(x),
-    )
+    (mean, log_sigma, *_), (error, log_error, *_) = fit.values, fit.errors
+    sigma = width * float(np.exp(log_sigma))
+    return centre + width * mean, width * error, sigma, sigma * log_error, len(x)
 
 
 @styled
@@ -339,21 +335,3 @@ def _nll(parameters: Values, x: Values) -> float:
     held = 0.5 * (((share + 0.5) / 2) ** 2 + ((log_tail - 1) / 1.5) ** 2)
     held += 0.5 * (log_sigma / 0.4) ** 2
     return float(-np.log(np.maximum(density, 1e-300)).sum() + held)
-
-
-def _errors(best: Values, x: Values) -> Values | None:
-    """Errors of mean and log sigma from second differences of the likelihood."""
-    step, signs = 1e-3, ((1, 1), (1, -1), (-1, 1), (-1, -1))
-    moves = step * np.eye(len(best))
-    hessian = [
-        [sum(s * r * _nll(best + s * one + r * other, x) for s, r in signs) for other in moves]
-        for one in moves
-    ]
-    try:
-        covariance = np.linalg.inv(np.array(hessian) / (4 * step * step))
-    except np.linalg.LinAlgError:
-        return None
-    variances = np.diag(covariance)[:2]
-    if not (np.isfinite(variances).all() and (variances > 0).all()):
-        return None
-    return np.asarray(np.sqrt(variances))

@@ -19,6 +19,7 @@ from cpunet.plotting import label
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.tables import NO_VALUE, text_table
 from cpunet.training.response import Response, response
+from cpunet.training.response_tables import FAR, outliers
 from cpunet.training.run import Run, RunLike
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 from cpunet.validation.verdicts import (
@@ -49,9 +50,10 @@ ORIGIN = (
 
 
 class Cell(NamedTuple):
-    """A score, its format and text, and its distance from the best possible one."""
+    """A score with its error, its format and text, and its distance from the best possible."""
 
     value: float | None = None
+    error: float | None = None
     digits: str = ""
     text: str = NO_VALUE
     off: float = math.inf
@@ -64,7 +66,7 @@ class Cell(NamedTuple):
         if value is None:
             return cls()
         spread = "" if error is None else f" ± {error:{digits.lstrip('+')}}"
-        return cls(value, digits, f"{value:{digits}}{spread}{more}", abs(value - best))
+        return cls(value, error, digits, f"{value:{digits}}{spread}{more}", abs(value - best))
 
 
 class Row(NamedTuple):
@@ -93,6 +95,11 @@ class Row(NamedTuple):
         """Scores as displayed; the best are marked."""
         best = self.best
         return [f"{cell.text}{'*' * (i in best)}" for i, cell in enumerate(self.cells)]
+
+    @property
+    def far(self) -> list[bool]:
+        """Which runs are far from the median of all, beyond the scatter and the own error."""
+        return outliers([c.value for c in self.cells], [c.error for c in self.cells])
 
     @property
     def over(self) -> str:
@@ -203,7 +210,7 @@ class Comparison:
         title = f"{label(self.method)}: {len(self.metrics)} runs compared"
         runs = [_overview(name, one, self.method) for name, one in self.metrics.items()]
         values = {"title": title, "comparison": self, "runs": runs, "links": links}
-        page = rendered("compare.html", **values, peaks=peaks, over=OVER)
+        page = rendered("compare.html", **values, peaks=peaks, over=OVER, far=f"{FAR:g}")
         with written_aside(path) as aside:
             aside.write_text(page, encoding="utf-8")
 

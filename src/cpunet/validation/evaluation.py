@@ -121,14 +121,11 @@ def evaluate(
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
     ends = fit_ends(run, ren)
-    with stage("Moving by errors of the fit", len(sets)) as bar:
-        moved = {}
-        for peak in sets:
-            moved[peak.name] = moved_values(peak, ends, seed)
-            bar.update(1)
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         scales = _dep_scales(sets, seed)
         decays = _decays_ns(translations)
+        ended = pool.map(partial(moved_values, ends=ends, seed=seed), sets)
+        moved = {peak.name: values for peak, values in zip(sets, ended, strict=True)}
         work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
         scored = pool.map(work, sets, moved.values())
         for peak, (found, peaks[peak.name]) in zip(sets, scored, strict=True):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
@@ -27,6 +28,7 @@ from cpunet.electronics.finishing import finish
 from cpunet.electronics.fitted_kernels import BASELINE_METHODS
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
+from cpunet.processes import usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.loading import InputSet
@@ -223,11 +225,15 @@ def fit_baseline_methods(
         side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
         for side in (sim, data)
     )
-    with stage("Fitting baseline methods", len(kinds)) as bar:
-        for name, kind in kinds.items():
+    with (
+        stage("Fitting baseline methods", len(kinds)) as bar,
+        ThreadPoolExecutor(usable_cores()) as pool,
+    ):
+        how = (fit_sim, fit_data, sim.dt_ns, config.samples_before)
+        fits = {name: pool.submit(kind.fit, *how) for name, kind in kinds.items()}
+        for name, fit in fits.items():
             try:
-                method = kind.fit(fit_sim, fit_data, sim.dt_ns, config.samples_before)
-                result.methods[name] = method
+                result.methods[name] = fit.result()
             except CpunetError as error:
                 result.missing[name] = str(error)
             bar.update(1)

@@ -138,6 +138,9 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
         yscale="linear" if silent else "log",
     )
     above.legend()
+    for axis in (above.yaxis, below.xaxis):
+        axis.set_major_formatter("{x:g}")  # powers as formulas take long to set
+        axis.set_minor_formatter("")
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Self
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.peaks import EnergySelection
@@ -230,12 +232,15 @@ def classifier_tests(
     seed
         Seed of the folds.
     """
-    tested: dict[str, TwoSample | Missing] = {}
     data = peak.windows("data")
-    for method in list(values)[1:]:
-        others, features = peak.windows(method), (values["data"], values[method])
+
+    def tested(method: str) -> TwoSample | Missing:
+        features = values["data"], values[method]
         try:
-            tested[method] = classifier_auc(data, others, seed=seed, features=features)
+            return classifier_auc(data, peak.windows(method), seed=seed, features=features)
         except CpunetError as error:
-            tested[method] = Missing(str(error))
-    return tested
+            return Missing(str(error))
+
+    methods = list(values)[1:]
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        return dict(zip(methods, pool.map(tested, methods), strict=True))

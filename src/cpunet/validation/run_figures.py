@@ -22,6 +22,7 @@ from cpunet.errors import CpunetError
 from cpunet.plotting import (
     COLOURS,
     DATA_FILL,
+    LINE,
     STACKED,
     group,
     label,
@@ -126,7 +127,8 @@ def parameter_histograms(
 
     For the parameters see `draw_parameter`; `peak` is the name of the gamma line.
     """
-    figure, ((axes,), (below,)) = panels((5.6, 5.2), 2, **STACKED)
+    height = 4.0 + LINE * len(values)
+    figure, ((axes,), (below,)) = panels((5.6, height), 2, **STACKED)
     draw_parameter(axes, values, axis, parameter, comparison)
     counts = {method: histogram(v, axis)[1:-2] for method, v in values.items()}
     sizes = {method: max(len(v), 1) for method, v in values.items()}
@@ -194,6 +196,7 @@ def overlap_figure(metrics: Mapping[str, Any], peaks: Sequence[str]) -> Figure:
         axes.set_xticklabels(texts, rotation=30, ha="right")
     grid[0].set_ylabel("Overlap with the data [%]\n(bands: data vs data)")
     legend_above(figure, grid[0], 4)
+    figure.subplots_adjust(bottom=0.2)  # names are longer than numbers
     return figure
 
 
@@ -252,7 +255,7 @@ def further_histograms(
         Name of the gamma line, for the title.
     """
     rows, methods = -(-len(values) // COLUMNS), list(next(iter(values.values())))
-    figure, grid = panels((10.5, 1.9 * rows + 0.4), rows, COLUMNS)
+    figure, grid = panels((10.5, 1.9 * rows + 0.4), rows, COLUMNS, labels=False)
     for axes, (name, by_method) in zip(grid.flat, values.items(), strict=False):
         axis = data_axis(by_method["data"], max_bins)
         for method, of_method in by_method.items():
