@@ -1,4 +1,4 @@
-"""Recipes: all settings of a run in one validated YAML file."""
+"""Recipes: all settings of a run in a validated YAML file."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def load_recipe(recipe: str | Path | Recipe, settings: Set = ()) -> Recipe:
     Parameters
     ----------
     recipe
-        One of `list_recipes`, a path to a YAML file, or a recipe, which is returned.
+        Any of `list_recipes`, a path to a YAML file, or a recipe, which is returned.
     settings
         ``"training.batch_size=16"`` and the like; values are YAML. Or a mapping.
 
     Raises
     ------
     CpunetError
-        If there is no such recipe, or a key or value is not allowed, or a recipe that is whole
+        If no recipe has this name, or a key or value is not allowed, or a recipe that is whole
         already is to be overridden.
 
     Examples
@@ -42,7 +42,7 @@ def load_recipe(recipe: str | Path | Recipe, settings: Set = ()) -> Recipe:
         return read_settings(Recipe, recipe, settings, _FOLDER)
     if settings:
         raise CpunetError(
-            "settings override values of a recipe that is given by name; this one is whole "
+            "settings override values of a recipe that is given by name; this recipe is whole "
             "already",
             "change it, and leave settings out",
         )

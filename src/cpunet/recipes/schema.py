@@ -1,7 +1,7 @@
-"""Every setting of a run, validated: one small class per part of a recipe.
+"""Every setting of a run, validated: a small class per part of a recipe.
 
 The values are in the YAML files next to this module.  A missing field is an error,
-and so is an unknown one.  Times are in ns, so that a recipe means the same at any sampling
+and so is an unknown key.  Times are in ns, so that a recipe means the same at any sampling
 period; `Recipe.at` makes numbers of samples of them.
 """
 
@@ -97,13 +97,13 @@ class ResponseConfig(Config):
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
 
-    The GRU takes one step per ``samples_per_step`` samples (1 in the paper); more samples
+    The GRU takes a step per ``samples_per_step`` samples (1 in the paper); more samples
     make it that many times faster, on the same embedded samples.  The table of
     vectors spans ``value_range``, or each pulse's own minimum to maximum (the
     paper's choice, blind to the pulse height) if that is null.  It reads the ``window`` or, in
     units of the ``spread`` of the real pulses, charge and current in turn, and then
     ``components``; see `cpunet.training.views`.  A batch norm of its context, as published,
-    is one more difference between training and use.
+    is another difference between training and use.
     """
 
     name: Literal["gru"]
@@ -142,7 +142,7 @@ class PreparationConfig(Timed):
 
     A window reaches from ``before_ns`` before the alignment to ``after_ns`` after it.  With
     ``align_at`` ``half_height``, pulses are aligned where they cross half of the height that a
-    straight line through the last ``decay_fit_ns`` of the window has there; with a number, at
+    straight line through the last ``decay_fit_ns`` of the window has at that time; with a number, at
     that fraction of their maximum (paper: 0.999).  ``padding_before_ns`` and
     ``padding_after_ns`` limit how much of a *measured* window may lie outside its record; it
     is filled with the baseline and with the last value.  Simulated pulses are padded without
@@ -292,9 +292,9 @@ class MatchingConfig(Timed):
     last ``level_ns`` scaled to the level of the preparation.  The valley is searched for with
     ``search_pulses`` of each side, in fits of at most ``steps`` iterations.  A fit that ends in
     the wrong valley is started again with the response's poles times the next of
-    ``start_factors``; the best of all is kept.  Each pulse is compared with ``noise_sets``
+    ``start_factors``; the best of all counts.  Each pulse is compared with ``noise_sets``
     draws of the noise.  If a fit is bad and pulses begin differently than simulated, up to
-    ``drift_terms`` parameters that stretch the drift are tried, and kept if held-out pulses
+    ``drift_terms`` parameters that stretch the drift are tried, and used if held-out pulses
     gain.
     """
 
@@ -343,7 +343,7 @@ class ScoreConfig(Timed):
     """Histograms and resampling for the comparison of two distributions.
 
     ``sideband_kev`` are the nearest and farthest distances of the sidebands from a line, where
-    there is only background.  ``continuum_kev`` are the limits of named ranges without lines,
+    only background is.  ``continuum_kev`` are the limits of named ranges without lines,
     for which the survival of an A/E cut is also reported.
     """
 
@@ -363,7 +363,7 @@ class ScoreConfig(Timed):
 class SearchConfig(Config):
     """Values of a setting that `cpunet.tune` tries.
 
-    Either a range from ``low`` to ``high``, on a logarithmic scale if ``log``, or one of
+    Either a range from ``low`` to ``high``, on a logarithmic scale if ``log``, or any of
     ``choices``.  Values are integers if ``low``, ``high`` and the setting are.
     """
 
@@ -519,7 +519,7 @@ class Recipe(Config):
         if not network and self.residual is None:
             return self
         if (self.cyclegan.generator.linear == "solved") == network:
-            raise ValueError("generator.linear must be solved in a residual, and there alone")
+            raise ValueError("generator.linear must be solved in a residual, and only in it")
         losses, window = self.cyclegan.training.losses, self.preparation
         covered = losses.baseline_ns + losses.rising_edge_ns + losses.tail_ns
         length = window.before_ns + window.after_ns
