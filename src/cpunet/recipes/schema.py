@@ -142,7 +142,7 @@ class PreparationConfig(Timed):
 
     A window reaches from ``before_ns`` before the alignment to ``after_ns`` after it.  With
     ``align_at`` ``half_height``, pulses are aligned where they cross half of the height that a
-    straight line through the last ``decay_fit_ns`` of the window has at that time; with a number, at
+    straight line through the last ``decay_fit_ns`` of the window has then; with a number, at
     that fraction of their maximum (paper: 0.999).  ``padding_before_ns`` and
     ``padding_after_ns`` limit how much of a *measured* window may lie outside its record; it
     is filled with the baseline and with the last value.  Simulated pulses are padded without
