@@ -189,7 +189,8 @@ def test_joined_jobs_number_their_events_anew(tmp_path: Path, layout: str) -> No
 
 
 def test_joined_csv_files_are_read_as_jobs(tmp_path: Path) -> None:
-    columns, rows = ["event", "Edep", "x", "y", "z"], [f"{i},{i + 1},1,2,3" for i in range(4)]
+    columns = ["event", "Edep", "x", "y", "z", "volume"]
+    rows = [f"{i},{i + 1},1,2,3,Ge#1" for i in range(4)]
     alone = csv_file(tmp_path, columns, rows, title="steps data").read_text()
     joined = tmp_path / "joined.csv"
     joined.write_text(f"{alone}\n{alone}\n{alone}")

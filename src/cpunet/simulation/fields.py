@@ -103,7 +103,7 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
 
 
 # part of the file name, so that results of an older solver are not used
-SOLVER_VERSION = 3
+SOLVER_VERSION = 4
 
 
 def cache_file(key: str) -> Path:

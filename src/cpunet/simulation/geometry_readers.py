@@ -232,8 +232,7 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
         raise CpunetError(
             f"detector {name}: rounded point contacts are not simulated; set bulletize_PC to 0"
         )
-    _widen(values)
-    _cut(values, name)
+    _fit(values, name)
     fields = {
         _SIGGEN_FIELDS[key]: value for key, value in values.items() if key in _SIGGEN_FIELDS
     }
@@ -251,16 +250,12 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     return fields
 
 
-def _widen(values: dict[str, float]) -> None:
-    """Give tapers the width of their angle; without one, their own widths count."""
+def _fit(values: dict[str, float], name: str) -> None:
+    """Widen tapers to their angle, if any, and cut sizes that exceed others, as siggen does."""
     if angle := values.get("taper_angle"):
         for side in ("outer", "inner"):
             length = values.get(f"{side}_taper_length", 0.0)
             values[f"{side}_taper_width"] = length * math.tan(math.radians(angle))
-
-
-def _cut(values: dict[str, float], name: str) -> None:
-    """Cut sizes that do not fit in each other, as siggen does, with a word."""
     around, ditch = values.get("wrap_around_radius", 0.0), values.get("ditch_thickness", 0.0)
     straight = values.get("hole_length", math.inf) - values.get("hole_bullet_radius", 0.0)
     most = {  # a taper that is cut keeps its width

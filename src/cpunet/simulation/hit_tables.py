@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -303,15 +302,16 @@ def _csv_table(path: Path) -> StepTable:
     from pandas import DataFrame, read_csv  # half a second, which other formats do not need
 
     with path.open(encoding="utf-8", errors="replace") as lines:
-        head = list(takewhile(lambda line: line.startswith("#"), lines))
-    header = [line[1:].strip().partition(" ")[::2] for line in head]
+        headers = {n: line for n, line in enumerate(lines) if line.startswith("#")}
+    first = (line for i, (n, line) in enumerate(headers.items()) if i == n)
+    header = [line[1:].strip().partition(" ")[::2] for line in first]
     names = [value.partition(" ")[2] for key, value in header if key == "column"]
     about = {"title": "", "separator": str(ord(","))} | dict(header)
     separator = chr(int(about["separator"]))
     try:
         # the columns of one file can be numbers, text or both
         cells: DataFrame = read_csv(
-            path, sep=separator, header=None, comment="#", low_memory=False,
+            path, sep=separator, header=None, skiprows=[*headers], low_memory=False,
             encoding_errors="replace",
         )  # fmt: skip
     except ValueError as error:
