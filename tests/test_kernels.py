@@ -88,7 +88,7 @@ def test_of_two_who_compile_at_once_none_has_the_code_of_the_other(
     def twice(value):
         return 2 * value
 
-    monkeypatch.setattr(kernels, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(kernels, "code_folder", lambda: tmp_path)
     one, other, later = (kernels.kernel(twice) for _ in range(3))
     monkeypatch.setattr(other._cache._cache_file, "_load_index", dict)
     assert (one(1), other(1.5)) == (2, 3.0)

@@ -131,7 +131,7 @@ def info(
     """
     if out is not None:
         refuse_picture(Path(out), path, read.energy, force=force)
-    content = _look(path, read, units, key_values(settings), quality)
+    content = look(path, read, units, key_values(settings), quality)
     if out is not None:
         content.save(out, force)
     return content
@@ -170,13 +170,14 @@ def load(path: str | Path) -> Loaded:
     )
 
 
-def _look(
+def look(
     path: str | Path,
     read: FileOptions,
     units: str,
     settings: Mapping[str, Any],
     quality: bool,
 ) -> InfoResult:
+    """What is in a file, detector or folder; see `info`."""
     from cpunet.recipes import load_recipe
     from cpunet.simulation.hit_files import describe_hits, holds_hits
 

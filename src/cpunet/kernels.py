@@ -52,7 +52,7 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         # cache; their last bits differ.  Inlined into the caller there is only one version.
         options.setdefault("forceinline", True)
     compiled = numba.njit(nogil=True, **options)(function)
-    if _folder() is not None:
+    if code_folder() is not None:
         compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
     compiled._compilation_chain_init_hook = lambda: None  # noqa: SLF001  see `_Cache`
     if not options.get("parallel"):
@@ -119,7 +119,7 @@ def use_threads(count: int) -> None:
 
 
 @functools.cache
-def _folder() -> Path | None:
+def code_folder() -> Path | None:
     """Folder of the code of these sources; of earlier ones the last few remain.
 
     Its name is a digest of all modules with loops and of those that they import.
@@ -149,13 +149,13 @@ def _folder() -> Path | None:
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    """The code of a loop in `_folder`, which is loaded without extensions of numba.
+    """The code of a loop in `code_folder`, which is loaded without extensions of numba.
 
     Those of awkward take 0.4 s, and no loop here needs them.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        before, config.CACHE_DIR = config.CACHE_DIR, str(_folder())
+        before, config.CACHE_DIR = config.CACHE_DIR, str(code_folder())
         try:
             super().__init__(function)
         finally:

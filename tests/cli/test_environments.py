@@ -94,7 +94,7 @@ def test_signals_of_batch_systems_leave_nothing(command, stand, tmp_path, monkey
     signal.signal(number, before := signal.SIG_IGN)  # as by nohup
     try:
         with monkeypatch.context() as patched:
-            patched.setattr("cpunet.inspection._look", arrive)
+            patched.setattr("cpunet.inspection.look", arrive)
             command("info", stand.sim)
         assert signal.getsignal(number) == before
     finally:

@@ -61,7 +61,7 @@ def without(package: str) -> Patch:
     return lambda patch: patch.setitem(sys.modules, package, None)
 
 
-DESCRIBE = "cpunet.inspection._look"
+DESCRIBE = "cpunet.inspection.look"
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 MISTAKES = {
     # files

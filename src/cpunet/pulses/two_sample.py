@@ -186,34 +186,9 @@ def auc_and_variance(negatives: Values, positives: Values) -> tuple[Values, Valu
 def _expanded(windows: Values, extra: Values) -> Values:
     """Features of all pulses, independent of their side; the windows are overwritten.
 
-    All blocks have about the same total variance, so that the many products do not
-    outweigh the shape itself.
-    """
-    components, rest = _components(windows)
-    plain = np.column_stack(
-        [_standard(components, SMALLEST), _standard(rest), _standard(extra)]
-    )
-    n_components = components.shape[1]
-    main = np.delete(plain, np.s_[LEADING:n_components], axis=1)
-
-    i, j = np.triu_indices(main.shape[1])
-    products = main[:, i] * main[:, j]
-    waves = np.column_stack(
-        [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
-    )
-    blocks = [plain]
-    for block in (products, waves):
-        centred = block - block.mean(axis=0)
-        spread = centred.std(axis=0)
-        weight = np.sqrt(2 * main.shape[1] / block.shape[1])
-        blocks.append(weight * centred / np.where(spread > 0, spread, 1))
-    return np.concatenate(blocks, axis=1)
-
-
-def _components(windows: Values) -> tuple[Values, Values]:
-    """Leading principal components, and log RMS of the remainder and of its differences.
-
-    The windows are overwritten.
+    They are the leading principal components, log RMS of the remainder and of its differences,
+    and products and sinusoids of these.  All blocks have about the same total variance, so that
+    the many products do not outweigh the shape itself.
     """
     from scipy.linalg import eigh
 
@@ -226,15 +201,28 @@ def _components(windows: Values) -> tuple[Values, Values]:
     squares, length = weighted.T @ weighted, windows.shape[1]
     del weighted
     first = max(0, length - COMPONENTS)
-    _, vectors = eigh(squares, subset_by_index=[first, length - 1])
-    vectors = vectors[:, ::-1]
-    components = centred @ vectors
-    sizes = np.empty((len(windows), 2))
+    vectors = eigh(squares, subset_by_index=[first, length - 1])[1][:, ::-1]
+    components, sizes = centred @ vectors, np.empty((len(windows), 2))
     for rows in blocks(len(windows), BLOCK):
         rest = centred[rows] - components[rows] @ vectors.T
         for column, values in enumerate((rest, np.diff(rest, axis=1))):
             sizes[rows, column] = np.sqrt(np.mean(values**2, axis=1))
-    return components, np.log(np.maximum(sizes, SMALLEST))
+    rough = _standard(np.log(np.maximum(sizes, SMALLEST)))
+    plain = np.column_stack([_standard(components, SMALLEST), rough, _standard(extra)])
+
+    main = np.delete(plain, np.s_[LEADING : components.shape[1]], axis=1)
+    i, j = np.triu_indices(main.shape[1])
+    products = main[:, i] * main[:, j]
+    waves = np.column_stack(
+        [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
+    )
+    parts = [plain]
+    for part in (products, waves):
+        part = part - part.mean(axis=0)
+        spread = part.std(axis=0)
+        weight = np.sqrt(2 * main.shape[1] / part.shape[1])
+        parts.append(weight * part / np.where(spread > 0, spread, 1))
+    return np.concatenate(parts, axis=1)
 
 
 def _standard(values: Values, smallest: float = 0.0) -> Values:
