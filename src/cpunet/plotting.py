@@ -111,8 +111,7 @@ def panels(
     from matplotlib.figure import Figure
     from matplotlib.transforms import ScaledTranslation
 
-    figure, (width, height) = Figure(figsize=size), size
-    figure.set_layout_engine("none")
+    figure, (width, height) = Figure(figsize=size, layout="none"), size  # type: ignore[arg-type]
     grid = figure.subplots(rows, columns, squeeze=False, **how)
     across = 0.15 if how.get("sharey") or not labels else LEFT
     down = 0.15 if how.get("sharex") else BOTTOM + 0.1

@@ -69,6 +69,18 @@ def test_rows_and_what_they_show():
     assert table.scores.loc["SEP", "edge RMSE [10⁻³]"].tolist() == [0.6, 0.6]
 
 
+def test_a_run_far_from_all_others_is_shaded(tmp_path):
+    runs = {f"ch{i}": scores(iou) for i, iou in enumerate((80.0, 81.0, 80.5, 79.0, 82.0, 60.0))}
+    far = {row.score: row.far for row in of(**runs).rows}
+    assert far.pop("drift time: IoU [%] (data vs data)") == [False] * 5 + [True]
+    assert not any(far["classifier: AUC"])
+    page = table_page(tmp_path, runs)
+    assert '<td class="off">60.0 ± 2.5 (88.0)</td>' in page
+    assert '<td class="off">79.0' not in page
+    few = of(**{name: runs[name] for name in ("ch0", "ch1", "ch5")})
+    assert not any(any(row.far) for row in few.rows)  # among three none is an outlier
+
+
 def test_what_a_run_lacks_is_a_dash():
     old = scores()
     sep = old["peaks"]["SEP"]

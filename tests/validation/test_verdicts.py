@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
+import cpunet
 from cpunet.validation.comparisons import compare, two_sample_test
-from cpunet.validation.verdicts import ALARM, Verdict, summary, verdict_table
+from cpunet.validation.verdicts import (
+    ALARM,
+    Verdict,
+    method_verdicts,
+    summary,
+    verdict_table,
+)
 from synthetic import load_recipe
 
+STANDS = 12
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 60})
 
 
@@ -140,6 +148,28 @@ def test_p_is_uniform_for_one_distribution_and_small_for_two():
     assert kstest(p, "uniform").pvalue > 0.01
     assert (p < ALARM).mean() <= 0.01
     assert max(found[name]["p"]["shifted"] for name in names) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_p_of_the_truth_is_uniform_over_stands(tmp_path):
+    """What statistics alone explain agrees, and the simulation without electronics is off."""
+    few: dict[str, Any] = {"events": "FEP=700,SEP=300,DEP=300", "settings": ("step_ns=2",)}
+    names = ("ae_survival", "lq", "rise_time")
+    p: dict[str, list[float]] = {name: [] for name in names}
+    run = None
+    for seed in range(STANDS):
+        stand = cpunet.make_stand(tmp_path / f"stand{seed}", seed=seed, **few)
+        run = run or cpunet.train(stand.sim, stand.data)
+        report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth, baselines=False)
+        truth, raw = (method_verdicts(report.metrics, "SEP", m) for m in ("truth", "raw"))
+        assert not raw["lq"].agrees
+        assert not raw["rise_time"].agrees
+        for name in names:
+            p[name].append(truth[name].p)
+    for name, values in p.items():
+        assert kstest(values, "uniform").pvalue > 0.01, (name, values)
+        assert min(values) > ALARM / 10, (name, values)
 
 
 def test_errors_of_a_fit_are_in_p_and_in_the_error_of_the_mean():
