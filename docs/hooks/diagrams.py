@@ -170,7 +170,7 @@ WAYS = {
     "hit": (
         "simulation.read_hits",
         "simulation.merge_hits",
-        "simulation.simulate_events",
+        "simulation.Simulator.events",
         "pulses.prepare",
         "translation.Translator.translate_pulses",
         "validation.score_peak",
