@@ -102,15 +102,17 @@ def tune(
             "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    out, sides = Path(out), read.files(sim, data)
-    recipe = load_recipe(recipe, settings)
+    out, sides, recipe = Path(out), read.files(sim, data), load_recipe(recipe, settings)
     device, space = resolve_device(device, recipe), search_space(recipe)
     refuse_inputs(out, *sides[0].files, *sides[1].files)
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
     selection = parse_selection(peak, recipe.peaks)
-    simulated = load_pulses(sides[0], "simulated", recipe, selection)
-    measured = load_pulses(sides[1], "measured", recipe, selection)
+    how = recipe, selection
+    simulated, measured = (
+        load_pulses(sides[0], "simulated", *how),
+        load_pulses(sides[1], "measured", *how),
+    )
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
     held_out = HeldOut.of(simulated, measured, recipe, seed)
