@@ -141,11 +141,12 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     names = {column.rpartition("/")[2]: column for column in columns}
     best = next((name for name in _PREFERRED if name in names), None)
     if len(tables) > 1 or best is None:
-        several = f"{len(columns)} waveform columns ({shortened(columns)})"
+        several, what = columns, "waveform columns ("
         if len(tables) > 1:
-            several = f"{len(tables)} tables of waveforms ({shortened(tables)})"
+            several, what = tables, "tables of waveforms ("
         raise CpunetError(
-            f"{path}: {several}; choose one with `table` (`sim_table`, `data_table`)"
+            f"{path}: {len(several)} {what}{shortened(several)}); choose one with `table` "
+            "(`sim_table`, `data_table`)"
         )
     others = ", ".join(sorted(names.keys() - {best}))
     log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
