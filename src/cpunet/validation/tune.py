@@ -108,11 +108,8 @@ def tune(
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
     selection = parse_selection(peak, recipe.peaks)
-    how = recipe, selection
-    simulated, measured = (
-        load_pulses(sides[0], "simulated", *how),
-        load_pulses(sides[1], "measured", *how),
-    )
+    simulated = load_pulses(sides[0], "simulated", recipe, selection)
+    measured = load_pulses(sides[1], "measured", recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
     held_out = HeldOut.of(simulated, measured, recipe, seed)
@@ -130,8 +127,7 @@ def tune(
             "choose another name"
         )
     study.set_user_attr(BEGUN, begun)
-    known = dict(flat(recipe.model_dump(mode="json")))
-    own = {key: known[key] for key in space}
+    own = {key: v for key, v in flat(recipe.model_dump(mode="json")) if key in space}
     given = {key: _in_journal(space[key], value) for key, value in own.items()}
     if not study.trials and None not in given.values():
         study.enqueue_trial(given, {UNCHANGED: True})
