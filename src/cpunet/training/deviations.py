@@ -46,8 +46,9 @@ FREE = 0.3  # of the priors of the chain's parameters, within which they are fre
 # must lower chi-square for another.
 STAGES = ((6.0, 1024, 0.03), (1.5, MOST, 0.003))
 # Most steps of a stage; lengths of a step in standard deviations below which the stage ends,
-# and derivatives are used again.
-STEPS, SETTLED, CLOSE = 10, 0.7, 3.0
+# and derivatives are used again; largest change of the step response in a step, beyond which
+# pulses are far from linear.
+STEPS, SETTLED, CLOSE, LARGEST = 25, 0.7, 3.0, 0.05
 # Errors are larger than those of independent slices, since both kinds see the same pulses: rise
 # times (10 to 90, 1 to 99, 0.1 to 99.9 %) on seven stands scatter by this factor more.
 SHARED = 1.5
@@ -292,7 +293,8 @@ def with_deviations(
             if first is None and evidence < 0:
                 return Deviated(response, evidence)
             first = evidence if first is None else first
-            move, place = new - place, new
+            largest = np.abs(knots.between @ (new - place)).max()
+            place = place + (move := (new - place) * min(1.0, LARGEST / largest))
             size = float(np.sqrt(move @ problem.information @ move))
             far = size > CLOSE
             if size < SETTLED or gained < gain * cost:
@@ -361,7 +363,12 @@ class Linearised:
     def evaluate(self, transfer: Spectrum, place: Values, *, anew: bool) -> float:
         """Chi-square; information and right side with derivatives at this place if `anew`."""
         basis = self.basis if anew else None
-        differences = [d for c in self.comparisons for d in c.differences(transfer, basis)]
+        with np.errstate(divide="ignore", invalid="ignore"):  # far away, pulses have no edge
+            differences = [d for c in self.comparisons for d in c.differences(transfer, basis)]
+        if not all(
+            np.isfinite(d.slopes).all() and np.isfinite(d.values).all() for d in differences
+        ):
+            return np.nan
         n, cost = len(place), 0.0
         self.right = np.zeros(n)
         if anew:
