@@ -39,15 +39,14 @@ log = logging.getLogger(__name__)
 
 # What a command does. Its public function has the same name, or one of these.
 COMMANDS = {
-    "demo": "Simulate, digitise, train, translate and validate on a stand with a known answer.",
+    "demo": "Simulate, digitise, train, translate and validate on a stand with a given answer.",
     "check": "Say whether simulated and measured pulses can be compared, and what to do if "
     "not.",
     "export legend": "Export a readout chain as parameters for LEGEND's simulation chain.",
     "export onnx": "Export the deterministic part of a run as ONNX.",
     "import": "Make a run of the weights that the authors published.",
     "info": "Say what is in a file, detector, run or report.",
-    "response": "Say in terms of physics what readout was learned, with the truth if it is "
-    "known.",
+    "response": "Say in terms of physics what readout was learned, with the truth if given.",
     "library make": "Simulate the charge pulse of every place in a detector.",
     "library translate": "Translate a library of charge pulses with a trained run, without "
     "noise.",

@@ -1,4 +1,4 @@
-"""The whole job on a test stand whose truth is known: stand, training, validation, report."""
+"""The whole job on a test stand with its truth: stand, training, validation, report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUICK_LOOK = (
 def demo(
     out: str | Path = "demo", *, quick: bool = False, force: bool = False
 ) -> cpunet.Report:
-    """Simulate, digitise, train, translate and validate on a stand with a known answer.
+    """Simulate, digitise, train, translate and validate on a stand with a given answer.
 
     Parameters
     ----------

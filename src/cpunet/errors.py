@@ -33,7 +33,7 @@ def named(values: Mapping[str, Any], name: str, kind: str) -> Any:
     Raises
     ------
     CpunetError
-        If there is no such value; the message lists the known names.
+        If there is no such value; the message lists the names.
     """
     if name not in values:
         raise CpunetError(f"no {kind} {name!r}; there are {', '.join(values)}")

@@ -1,1 +1,1 @@
-"""The detector readout: from ideal charge pulses to raw traces with a known truth."""
+"""The detector readout: from ideal charge pulses to raw traces with their truth."""

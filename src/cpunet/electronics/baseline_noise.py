@@ -27,7 +27,10 @@ from cpunet.pulses.container import FloatArray
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
-FLAT_SIGMAS, CLIPS = 4.0, 3  # robust standard deviations kept, and number of iterations
+FLAT_SIGMAS, CLIPS = (
+    4.0,
+    3,
+)  # robust standard deviations within which traces stay, and number of iterations
 # Baselines are clustered along directions in which their band powers spread this many times
 # more than those of baselines from a single spectrum.
 KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
@@ -155,7 +158,7 @@ class BaselineNoise:
 
         Each long trace of one kind is cut into parts for several pulses, assigned in random
         order and with random signs. Noise slower than a record is nearly the same in these
-        parts apart from the sign, so it does not shift all their means together.
+        parts except for the sign, so it does not shift all their means together.
 
         Parameters
         ----------
@@ -204,11 +207,13 @@ class BaselineNoise:
         return np.asarray(self._at(self.density[np.newaxis], length)[0], float)
 
     def _at(self, densities: Values, length: int) -> Values:
-        known = np.arange(densities.shape[1]) / self.samples
+        own_frequency = np.arange(densities.shape[1]) / self.samples
         wanted = np.arange(length // 2 + 1) / length
-        if len(wanted) == len(known):
+        if len(wanted) == len(own_frequency):
             return densities
-        return np.asarray([np.interp(wanted, known, one) for one in densities], float)
+        return np.asarray(
+            [np.interp(wanted, own_frequency, single) for single in densities], float
+        )
 
     def _lines_at(self, length: int) -> Values:
         """Lines at the frequencies of an FFT of `length` samples: each stays in one bin."""
@@ -267,11 +272,11 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     """
     import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
 
-    one = np.zeros(len(flat), np.intp)
+    single = np.zeros(len(flat), np.intp)
     kinds = min(KINDS, len(flat) // MIN_BASELINES)
     bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
     if kinds < 2 or bins < BANDS:
-        return one
+        return single
     rng = np.random.default_rng(0)
     own = _band_powers(flat)
     chance = _band_powers(mean.draw(np.ones(len(flat)), flat.shape[1], rng).astype(float))
@@ -280,7 +285,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     _, _, axes = np.linalg.svd(np.clip(own, -OUTLIER, OUTLIER), full_matrices=False)
     axes = axes[(own @ axes.T).std(axis=0) > DIFFERENT * (chance @ axes.T).std(axis=0)]
     if not len(axes):
-        return one
+        return single
     points = np.clip(own @ axes.T, -OUTLIER, OUTLIER)
     # kmeans2 warns of an empty kind, which is harmless: it is left out below
     with warnings.catch_warnings(action="ignore"):
@@ -288,7 +293,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     # baselines of kinds with too few are assigned to the nearest kind with enough
     enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
     if not enough.any():
-        return one
+        return single
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
 
 
@@ -304,8 +309,8 @@ def _band_powers(baselines: Values) -> Values:
 def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> Values:
     """Samples before the pulse in prepared units times keV, the same number for each trace."""
     energy_kev = baselines.first.energy_kev
-    known = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
-    rows = np.flatnonzero(known[baselines.prepared.index])
+    own_frequency = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
+    rows = np.flatnonzero(own_frequency[baselines.prepared.index])
     if len(rows) < MIN_BASELINES:
         raise CpunetError(
             f"only {len(rows)} of {len(baselines)} traces have a known energy and can be "
@@ -445,16 +450,16 @@ def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
     """
     samples, length = 2 * (len(lines) - 1), len(drift)
     frequency = np.arange(len(lines)) / samples
-    known = np.arange(len(density)) / length
-    join = known[FIRST_CLEAN_BIN]
-    fast = np.interp(frequency, known[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
+    own_frequency = np.arange(len(density)) / length
+    join = own_frequency[FIRST_CLEAN_BIN]
+    fast = np.interp(frequency, own_frequency[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
     corners = np.geomspace(2 / samples, join, CORNERS)[:, np.newaxis]
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
     slow = np.maximum(slow, 0)
     lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
     # both signs of the frequency: a density of 1 is a mean square of 1
-    apart = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
+    oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
     weights = 1 / drift[lags]
-    rest = (drift[lags] - apart @ (fast + lines)) * weights
-    heights, _ = scipy.optimize.nnls((apart @ slow.T) * weights[:, np.newaxis], rest)
+    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
+    heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
     return np.asarray(fast + heights @ slow, float)

@@ -109,16 +109,16 @@ class DrawnTails:
 
     def describe(self) -> dict[str, float | list[float] | None]:
         """Serialise to a mapping that `of` reads."""
-        told: dict[str, Any] = plain(asdict(self))
-        del told["decay_error_us"]
-        return {**told.pop("law"), **told}
+        values: dict[str, Any] = plain(asdict(self))
+        del values["decay_error_us"]
+        return {**values.pop("law"), **values}
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Self:
+    def of(cls, values: Mapping[str, Any]) -> Self:
         """Read a mapping written by `describe`."""
-        law = TailsLaw(told["rate_khz"], told["decay_us"], tuple(told["energies_kev"]))
-        passed = None if told["passed"] is None else tuple(told["passed"])
-        return cls(law, told["height"], told["lead_us"], told["dt_ns"], passed)
+        law = TailsLaw(values["rate_khz"], values["decay_us"], tuple(values["energies_kev"]))
+        passed = None if values["passed"] is None else tuple(values["passed"])
+        return cls(law, values["height"], values["lead_us"], values["dt_ns"], passed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,13 +217,13 @@ class InTracePileUp:
         """Piled-up pulses of selected traces, with the traces renumbered."""
         place = np.full(self.n, -1)
         place[rows] = np.arange(len(rows))
-        kept = place[self.row] >= 0
+        inside = place[self.row] >= 0
         return type(self)(
             len(rows),
-            place[self.row[kept]],
-            self.kev[kept],
-            self.after_ns[kept],
-            self.partner[kept] % max(len(rows), 1),
+            place[self.row[inside]],
+            self.kev[inside],
+            self.after_ns[inside],
+            self.partner[inside] % max(len(rows), 1),
         )
 
     def largest(self) -> tuple[npt.NDArray[np.int64], Values, Values]:

@@ -171,23 +171,23 @@ def finish(
             block = by_height(block, energy_kev[rows])
         clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
         codes[rows] = clean.codes
-        kept = np.arange(n)[rows][clean.index]
-        windows[kept] = clean.pulses.waveforms
-        begin[kept] = clean.align_sample - config.samples_before
+        places = np.arange(n)[rows][clean.index]
+        windows[places] = clean.pulses.waveforms
+        begin[places] = clean.align_sample - config.samples_before
         if noise is not None:
             assert energy_kev is not None  # noise scales as 1/energy
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
-            drawn = noise.draw(energy_kev[kept], block.shape[1], rng)
+            drawn = noise.draw(energy_kev[places], block.shape[1], rng)
             if added is not None:
-                drawn += added[kept]
+                drawn += added[places]
             noisy_records = np.asarray(level + drawn, np.float32)
             if by_height is not None:
                 charge = records[rows][clean.index] + drawn * height
-                noisy_records = np.asarray(by_height(charge, energy_kev[kept]), np.float32)
+                noisy_records = np.asarray(by_height(charge, energy_kev[places]), np.float32)
             raw = Pulses.of(noisy_records, dt_ns=dt_ns)
             prepared = prepare(raw, config, "measured")
-            codes[kept] = prepared.codes
-            noisy[kept[prepared.index]] = prepared.pulses.waveforms
-            begin[kept[prepared.index]] = prepared.align_sample - config.samples_before
+            codes[places] = prepared.codes
+            noisy[places[prepared.index]] = prepared.pulses.waveforms
+            begin[places[prepared.index]] = prepared.align_sample - config.samples_before
     return Finished(noisy, codes, windows, begin)

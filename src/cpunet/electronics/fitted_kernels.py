@@ -41,7 +41,7 @@ from cpunet.pulses.parameters import last_below
 Groups = list[npt.NDArray[np.int64]]
 
 SLICES = 8
-SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is kept
+SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is used
 RISE_START, RISE_END = 0.02, 0.95  # above the noise at the start, below the slow top
 
 
@@ -68,18 +68,18 @@ def crossing(steps: Values, fraction: float) -> Values:
     array([2.25])
     """
     top = (steps >= RISE_END).argmax(axis=1)
-    known, last = last_below(steps, top, np.full(len(steps), fraction))
+    crossed, last = last_below(steps, top, np.full(len(steps), fraction))
     last = np.minimum(last, steps.shape[1] - 2)
     rows = np.arange(len(steps))
     low, high = steps[rows, last], steps[rows, last + 1]
-    rise = np.where(known, high - low, 1.0)
-    return np.asarray(np.where(known, last + (fraction - low) / rise, np.nan), float)
+    rise = np.where(crossed, high - low, 1.0)
+    return np.asarray(np.where(crossed, last + (fraction - low) / rise, np.nan), float)
 
 
 def slices(current: Values) -> Groups:
     """Rows of single-site-like pulses between quantiles of rise time.
 
-    The pulses with the highest current in each slice are kept. They differ far less from
+    The pulses with the highest current in each slice are used. They differ far less from
     each other than multi-site pulses, and so do their means between datasets.
 
     Parameters
@@ -217,9 +217,9 @@ class RCLate(BaselineMethod):
         how = (start, np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS]), scale)
         fitted = _fitted(sim, data, dt_ns, align, _rc_late, how, charge=True)
         (tau, share, late), slope = fitted
-        found = cls(dt_ns, tau, share, late, slope)
-        own = _own_decay(found, slope, sim[:GAUSS_PULSES], align)
-        return replace(found, tail_slope_per_ms=own)
+        fitted_method = cls(dt_ns, tau, share, late, slope)
+        own = _own_decay(fitted_method, slope, sim[:GAUSS_PULSES], align)
+        return replace(fitted_method, tail_slope_per_ms=own)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
@@ -272,8 +272,8 @@ def _fitted(
             parameters: Values, sliced: Spectrum = sliced, places: Groups = places
         ) -> Values:
             response = sliced * kernel(length, dt_ns, parameters)
-            apart = _mean_currents(response, places, length, edge) - wanted
-            return np.asarray(np.cumsum(apart, axis=1) if charge else apart).ravel()
+            residual = _mean_currents(response, places, length, edge) - wanted
+            return np.asarray(np.cumsum(residual, axis=1) if charge else residual).ravel()
 
         best = scipy.optimize.least_squares(
             residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
@@ -304,7 +304,7 @@ def _mean_currents(spectra: Spectrum, groups: Groups, length: int, edge: int) ->
     return np.asarray(around[:, : 2 * edge], float)
 
 
-# the same of the free kernel, whose iterations take half maxima of the response found so far
+# the same of the free kernel, whose iterations take half maxima of the response so far
 FREE_PULSES, FREE_ROUNDS = 4000, 4
 # The kernel before and after the half maximum, and where its ends are tapered.
 LEAD_NS, LAG_NS = 512.0, 4096.0
@@ -351,9 +351,9 @@ class SuperpulseKernel(BaselineMethod):
                 spectra * _transfer(kernel, lead, length), length, axis=1
             )
             kernel = _kernel(wanted, _superpulses(spectra, response), length, dt_ns)
-        found = cls(dt_ns, kernel, slope)
-        own = _own_decay(found, slope, sim[:FREE_PULSES], align)
-        return replace(found, tail_slope_per_ms=own)
+        fitted_method = cls(dt_ns, kernel, slope)
+        own = _own_decay(fitted_method, slope, sim[:FREE_PULSES], align)
+        return replace(fitted_method, tail_slope_per_ms=own)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
@@ -373,11 +373,13 @@ class SuperpulseKernel(BaselineMethod):
         }
 
 
-def _own_decay(found: BaselineMethod, slope: float, sim: FloatArray, align: int) -> float:
+def _own_decay(
+    fitted_method: BaselineMethod, slope: float, sim: FloatArray, align: int
+) -> float:
     """Slope of the decay (1/ms) without what a kernel's late part contributes to the tail."""
-    before = padding(found.dt_ns)[0]
-    windows = found.translate(sim)[:, before : before + sim.shape[1]]
-    return slope - (fitted_tail_slope(windows, found.dt_ns, align) - slope)
+    before = padding(fitted_method.dt_ns)[0]
+    windows = fitted_method.translate(sim)[:, before : before + sim.shape[1]]
+    return slope - (fitted_tail_slope(windows, fitted_method.dt_ns, align) - slope)
 
 
 def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:

@@ -22,7 +22,7 @@ MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
 
 
 def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, TailsInfo]:
-    """Measure noise and pile-up tails in the data of a training, and note what was found.
+    """Measure noise and pile-up tails in the data of a training, and note the result.
 
     Parameters
     ----------
@@ -42,23 +42,23 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
     CpunetError
         If there are too few flat baselines.
     """
-    found, reason = tails_of(data)
+    pile_up, reason = tails_of(data)
     drawn: DrawnTails | None = None
-    told = TailsInfo(missing=reason)
-    if found is None:
+    info = TailsInfo(missing=reason)
+    if pile_up is None:
         log.info(f"pile-up tails are not measured: {reason}")
     else:
-        likely = drawn_like(found, data, config)
-        told = found.describe().model_copy(update={"drawn": likely.describe()})
-    if found is not None and found.law is not None:
-        drawn, tenth = likely, told.percent_above["10_kev"]["measured"]
-        alone = "" if found.coupled else " (by slopes alone: levels do not follow the tilts)"
+        likely = drawn_like(pile_up, data, config)
+        info = pile_up.describe().model_copy(update={"drawn": likely.describe()})
+    if pile_up is not None and pile_up.law is not None:
+        drawn, tenth = likely, info.percent_above["10_kev"]["measured"]
+        alone = "" if pile_up.coupled else " (by slopes alone: levels do not follow the tilts)"
         log.info(
-            f"pile-up tails: {found.law.rate_khz:.2f} ± {found.fit.rate_error_khz:.2f} "
+            f"pile-up tails: {pile_up.law.rate_khz:.2f} ± {pile_up.fit.rate_error_khz:.2f} "
             f"kHz{alone}, {tenth:.2g} % of the traces above 10 keV; translations are "
             "given them"
         )
-    return TraceNoise(noise_of(data, found), drawn), told
+    return TraceNoise(noise_of(data, pile_up), drawn), info
 
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
@@ -110,12 +110,12 @@ def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
     """
     baselines = _baselines(data)
     first = baselines.first
-    known = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
-    known[NOISE_TRACES:] = False
+    usable = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
+    usable[NOISE_TRACES:] = False
     if tails is not None and tails.law is not None:
-        empty = known & tails.empty(first)
-        known = empty if empty.sum() >= MIN_EMPTY else known
-    return BaselineNoise.of(baselines, known)
+        empty = usable & tails.empty(first)
+        usable = empty if empty.sum() >= MIN_EMPTY else usable
+    return BaselineNoise.of(baselines, usable)
 
 
 def _baselines(data: InputSet) -> Baselines:

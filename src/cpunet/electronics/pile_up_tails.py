@@ -5,7 +5,7 @@ A tail of height :math:`A` above the level of an empty baseline follows
 *level* is the more precise measure, since levels vary little between traces. Level and slope
 are weighted by their errors. These come from the lower side of each distribution, which the
 tails do not affect. Large tails also give the decay time: the means of the two halves of
-their baselines, a time :math:`h` apart, have a ratio of :math:`e^{h/\tau}`.
+their baselines, after a time :math:`h`, have a ratio of :math:`e^{h/\tau}`.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
     slope = float(np.median(prepared.tail_slope[large]))
     if not slope < 0:
         raise CpunetError(
-            "the tails of the traces do not decay, so nothing is known of earlier pulses; "
+            "the tails of the traces do not decay, so earlier pulses leave no trace; "
             "are these measured traces?"
         )
     values = baselines.first.waveforms[:, :length].astype(float)
@@ -282,7 +282,7 @@ class PileUpTails:
         baselines
             Baselines of measured traces of one channel, from any mixture of peaks.
         decay_us
-            Decay time of the preamplifier in us, if known. Otherwise it is taken from large
+            Decay time of the preamplifier in us, if given. Otherwise it is taken from large
             tails or, if there are none, from the tails of the pulses.
 
         Raises
@@ -355,7 +355,7 @@ class PileUpTails:
 
     def describe(self) -> TailsInfo:
         """Summary: the rate, its error, and fractions of traces above several thresholds."""
-        told = self.kev[np.isfinite(self.kev)]
+        with_level = self.kev[np.isfinite(self.kev)]
         law, surely = self.fit.law, self.law is not None
         of_law = law.share_above(SHARES_KEV) if surely else np.zeros(len(SHARES_KEV))
         return TailsInfo(
@@ -366,10 +366,10 @@ class PileUpTails:
             error_kev=self.error_kev,
             told_by="level and slope" if self.coupled else "slope",
             energies="recorded" if self.fit.recorded else "learned from the tails",
-            traces=len(told),
+            traces=len(with_level),
             percent_above={
                 f"{kev:g}_kev": {
-                    "measured": round(100 * float((told > kev).mean()), 2),
+                    "measured": round(100 * float((with_level > kev).mean()), 2),
                     "law": round(100 * float(share), 2),
                 }
                 for kev, share in zip(SHARES_KEV, of_law, strict=True)

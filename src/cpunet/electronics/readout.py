@@ -1,4 +1,4 @@
-"""From ideal pulses to raw traces as a digitiser writes them, with the truth kept.
+"""From ideal pulses to raw traces as a digitiser writes them, with the truth stored.
 
 Noise has a spectrum; earlier pulses, and others within the record, disturb the traces.
 """

@@ -89,10 +89,10 @@ class Stand:
             If it is none, or cannot be read.
         """
         path = Path(folder) / MARKER
-        told = read_json(path, "give the folder of a stand, or make one with cpunet stand")
+        stored = read_json(path, "give the folder of a stand, or make one with cpunet stand")
         try:
-            counts = {**told["counts"]}
-            electronics = checked(Electronics, told["electronics"], str(path))
+            counts = {**stored["counts"]}
+            electronics = checked(Electronics, stored["electronics"], str(path))
         except (KeyError, TypeError) as error:
             raise CpunetError(f"{path}: damaged; make the stand again") from error
         return cls(Path(folder), electronics, **counts)
@@ -245,15 +245,15 @@ class Side:
         opened = self.source.open(self.detector)
         gain = 0.0
         for _, events in simulator.blocks(opened, title):
-            kept = events.collected_kev > 0
+            detected = events.collected_kev > 0
             pulses = events.pulses()
             if len(pulses):
-                untrapped = pulses.energy_kev + events.trapped_kev[kept]
+                untrapped = pulses.energy_kev + events.trapped_kev[detected]
                 labels = labels_of(untrapped, self.source.events)
                 share, lines = untrapped / pulses.energy_kev, labels != OTHER
                 gain = gain or float(np.median(share[lines] if lines.any() else share))
                 calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
-                yield calibrated, labels, events.hits[kept]
+                yield calibrated, labels, events.hits[detected]
         if not gain:
             raise CpunetError(
                 f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
@@ -378,27 +378,27 @@ def _write_sim(folder: Path, side: Side, stand: Stand) -> None:
 def _write_data(folder: Path, side: Side, seed: int, stand: Stand) -> None:
     """Write ``data.lh5`` and the lines and flags of its traces."""
     electronics = stand.electronics
-    known: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("label", *OF_DATA)}
+    columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("label", *OF_DATA)}
     path, attrs = folder / "data.lh5", MADE | {SIDE: "measured"}
     with PulseWriter(path, table="geds/raw", waveform_units="ADC", attrs=attrs) as writer:
         for fine, label, _ in side.blocks("Measured events"):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(traces)
-            known["label"].append(label)
+            columns["label"].append(label)
             for name in OF_DATA:
-                known[name].append(getattr(traces, name))
-        told: dict[str, Any] = {n: np.concatenate(values) for n, values in known.items()}
-        flag = told["flag"]
+                columns[name].append(getattr(traces, name))
+        stored: dict[str, Any] = {n: np.concatenate(values) for n, values in columns.items()}
+        flag = stored["flag"]
         saturated = int((flag & SATURATED > 0).sum())
         if 2 * saturated > len(flag):
             raise CpunetError(
                 f"electronics {electronics.name}: {saturated} of {len(flag)} traces leave the "
                 "ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
             )
-    np.savez(folder / "data_labels.npz", **told)
+    np.savez(folder / "data_labels.npz", **stored)
     stand.n_data = len(flag)
-    stand.data_lines = _by_line(told["label"])
+    stand.data_lines = _by_line(stored["label"])
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
         stand.flags[name] = int((flag & bit > 0).sum())
 

@@ -12,7 +12,7 @@ tails is shot noise (Campbell 1909). The logarithm of its characteristic functio
 .. math:: \ln \varphi(u) = R \tau \left\langle \int_0^E \frac{e^{iux} - 1}{x} dx \right\rangle
     = R \tau \left\langle i\,\mathrm{Si}(uE) - \mathrm{Cin}(uE) \right\rangle .
 
-A tail is told by its height at the first sample of a trace, in keV. The only free
+A tail is described by its height at the first sample of a trace, in keV. The only free
 parameter of the law is the rate.
 
 In the likelihood fit of the rate each trace contributes one measured tail with an error,
@@ -251,7 +251,7 @@ def fit_rate(
 
     where :math:`p` is the density of the law convolved with the noise and :math:`u` a uniform
     density for a small fraction :math:`\epsilon` of outliers. With the characteristic function
-    :math:`\varphi` of the law, and apart from the wings of the noise,
+    :math:`\varphi` of the law, and except for the wings of the noise,
 
     .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du .
 
@@ -266,13 +266,13 @@ def fit_rate(
     energies_kev
         Energies of the pulses of the file in keV.
     """
-    known = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
-    highest = float(np.clip(known.max(initial=0.0), 100.0, HIGHEST_KEV))
+    finite = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
+    highest = float(np.clip(finite.max(initial=0.0), 100.0, HIGHEST_KEV))
     likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
     fixed = None
     vector, gain = likelihood.best()
-    if len(known):
-        own = np.histogram(np.log(known), _edges(likelihood.energies))[0] / len(known)
+    if len(finite):
+        own = np.histogram(np.log(finite), _edges(likelihood.energies))[0] / len(finite)
         recorded, of_recorded = likelihood.best(own)
         if gain <= of_recorded + WORTH:
             fixed, vector, gain = own, recorded, of_recorded

@@ -118,7 +118,7 @@ def _axis(column: h5py.Dataset, where: str, name: str) -> Values:
 
 
 def chosen_libraries(
-    file: h5py.File, source: Path, wanted: Sequence[str], known: str | None
+    file: h5py.File, source: Path, wanted: Sequence[str], name: str | None
 ) -> list[str]:
     """Paths of the libraries to translate.
 
@@ -128,7 +128,7 @@ def chosen_libraries(
         The file and its name.
     wanted
         Names given by the user, or an empty sequence.
-    known
+    name
         Detector that the run was trained with; None if unknown.
 
     Raises
@@ -149,15 +149,15 @@ def chosen_libraries(
             raise CpunetError(f"{source}: no library of {name}; the file has {held}")
     if wanted:
         return list(dict.fromkeys(wanted))
-    if known is None:
+    if name is None:
         return names
-    if known not in names:
+    if name not in names:
         raise CpunetError(
             f"{source}: a library of {held}, but the run was trained with a simulation of "
-            f"{known}; give the library of {known}, or `detector` {names[0]} to use this one "
+            f"{name}; give the library of {name}, or `detector` {names[0]} to use this one "
             "all the same"
         )
-    return [known]
+    return [name]
 
 
 def _libraries(file: h5py.File) -> list[str]:

@@ -53,7 +53,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
         Path of the file. A step takes some 240 bytes of memory.
     options
         How it is read; `hits_detector` is the name of the table, or the number or name in the
-        column that tells detectors apart (``det_uid``, ``volID``, ``detector``…). An unknown
+        column that distinguishes detectors (``det_uid``, ``volID``, ``detector``…). An unknown
         or missing unit is an error.
 
     Raises
@@ -146,10 +146,10 @@ def _to_hits(
             f"no energy of at least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
             f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
         )
-    kept = edep > 0
+    positive = edep > 0
     largest = event.max(initial=-1)
-    event, edep, position = event[kept], edep[kept], position[kept]
-    time = None if time is None else time[kept]
+    event, edep, position = event[positive], edep[positive], position[positive]
+    time = None if time is None else time[positive]
     first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")

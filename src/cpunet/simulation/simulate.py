@@ -197,15 +197,15 @@ def simulate(
     with writer:
         for before_merging, block in simulator.blocks(opened, f"Simulating {crystal.name}"):
             simulation.count(before_merging, block)
-            kept = block.collected_kev > 0
+            seen = block.collected_kev > 0
             columns: dict[str, tuple[Any, str]] = {
-                "lost_energy": (block.lost_kev[kept], "keV"),
-                "n_hits": (np.diff(block.hits.offsets)[kept], ""),
+                "lost_energy": (block.lost_kev[seen], "keV"),
+                "n_hits": (np.diff(block.hits.offsets)[seen], ""),
             }
             if any(physics.trapping_per_ns):
-                columns["trapped_energy"] = (block.trapped_kev[kept], "keV")
+                columns["trapped_energy"] = (block.trapped_kev[seen], "keV")
             writer.append(block.pulses(), columns)
-            writer.append_rows(HIT_TABLE, hit_columns(block.hits[kept]))
+            writer.append_rows(HIT_TABLE, hit_columns(block.hits[seen]))
         if not writer.n_pulses:
             raise CpunetError(
                 f"{out}: none of {simulation.n_events} events gives a signal: their hits lie "

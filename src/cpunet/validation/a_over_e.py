@@ -183,7 +183,7 @@ def survival_table(
         m for m in next(iter(ae.values())) if all(m in of_peak for of_peak in ae.values())
     ]
     methods.sort(key=lambda method: method != "data")
-    found = {
+    estimates = {
         method: ae_survival(
             ae[DEP][method],
             {name: of_peak[method] for name, of_peak in ae.items() if name != DEP},
@@ -196,15 +196,15 @@ def survival_table(
         events = {m: int(np.isfinite(of_peak[m]).sum()) for m in methods}
         row = SurvivalRow(events, {m: len(of_peak[m]) - events[m] for m in methods})
         if name == DEP:
-            cuts = {m: cut for m, (cut, _, _) in found.items()}
-            errors = {m: std for m, (_, std, _) in found.items()}
+            cuts = {m: cut for m, (cut, _, _) in estimates.items()}
+            errors = {m: std for m, (_, std, _) in estimates.items()}
             table[name] = replace(row, cut=cuts, cut_std=errors)
         else:
-            survival = {m: s[2][name] for m, s in found.items()}
+            survival = {m: s[2][name] for m, s in estimates.items()}
             of_fit = _of_fit(moved[DEP], moved[name]) if {DEP, name} <= moved.keys() else 0.0
             if "ren" in survival:
-                kept, error = survival["ren"]
-                survival["ren"] = kept, float(np.hypot(error, of_fit))
+                passed, error = survival["ren"]
+                survival["ren"] = passed, float(np.hypot(error, of_fit))
             spread = {
                 m: null_spread(
                     (ae[DEP]["data"], ae[DEP][m]), (of_peak["data"], of_peak[m]), rng
@@ -239,36 +239,36 @@ def peak_survival(
     peak
         Range of the line in keV: lower end (included) and upper end (excluded).
     sidebands
-        Ranges in keV beside the line that contain only background.
+        Ranges in keV on both sides of the line that contain only background.
     cut_std
         Error of the cut.
     """
     finite = np.isfinite(amplitude)
-    in_peak, beside = _within(energy_kev, [peak]), _within(energy_kev, sidebands)
-    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, beside))
+    in_peak, aside = _within(energy_kev, [peak]), _within(energy_kev, sidebands)
+    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, aside))
     survives = finite & (amplitude >= cut)
-    passing, side_pass = (int((survives & inside).sum()) for inside in (in_peak, beside))
+    passing, side_pass = (int((survives & inside).sum()) for inside in (in_peak, aside))
     width = sum(high - low for low, high in sidebands)
     scale = (peak[1] - peak[0]) / width if width else 0.0
-    undefined = int((~finite & (in_peak | beside)).sum())
-    found = RangeSurvival(n, passing, n_side, side_pass, scale, undefined)
+    undefined = int((~finite & (in_peak | aside)).sum())
+    estimates = RangeSurvival(n, passing, n_side, side_pass, scale, undefined)
     span = f"from {peak[0]:g} to {peak[1]:g} keV"
     if not np.isfinite(cut):
         missing = "there is no cut: too few events of the double-escape peak"
-        return replace(found, missing=missing)
+        return replace(estimates, missing=missing)
     if not n:
-        return replace(found, missing=f"no events {span}")
+        return replace(estimates, missing=f"no events {span}")
     survival, std = sideband_survival(passing, n, side_pass, n_side, scale)
     if not np.isfinite(survival):
-        return replace(found, missing=f"the sidebands leave no events of {n} {span}")
+        return replace(estimates, missing=f"the sidebands leave no events of {n} {span}")
     if not scale or not std:
         std = 100 * survival_error(passing, n)
     if cut_std:
         ends = (cut - cut_std, cut + cut_std)
-        kept = [peak_survival(amplitude, energy_kev, end, peak, sidebands) for end in ends]
-        low, high = (one.survival or 0.0 for one in kept)
+        passed = [peak_survival(amplitude, energy_kev, end, peak, sidebands) for end in ends]
+        low, high = (row_of.survival or 0.0 for row_of in passed)
         std = float(np.hypot(std, 0.5 * (low - high)))
-    return replace(found, survival=survival, survival_std=std)
+    return replace(estimates, survival=survival, survival_std=std)
 
 
 def sideband_survival(
@@ -347,12 +347,12 @@ def dep_scale(dep_ae: Values, seed: int = 0) -> Spread:
     seed
         Seed of the bootstraps.
     """
-    known = dep_ae[np.isfinite(dep_ae)]
-    if known.size < MIN_EVENTS:
+    finite_ae = dep_ae[np.isfinite(dep_ae)]
+    if finite_ae.size < MIN_EVENTS:
         return np.nan, np.nan
     rng = np.random.default_rng(seed)
-    drawn = [most_frequent(rng.choice(known, known.size)) for _ in range(SCALES)]
-    return most_frequent(known), float(np.std(drawn, ddof=1))
+    drawn = [most_frequent(rng.choice(finite_ae, finite_ae.size)) for _ in range(SCALES)]
+    return most_frequent(finite_ae), float(np.std(drawn, ddof=1))
 
 
 def subtracted(
@@ -367,43 +367,43 @@ def subtracted(
     ranges
         Survival by range and method, see `peak_survival`.
     """
-    found = dict(table)
+    estimates = dict(table)
     for name, methods in ranges.items():
-        kept = {
-            method: (one.survival, one.survival_std)
-            for method, one in methods.items()
-            if one.survival is not None and one.survival_std is not None
+        passed = {
+            method: (row_of.survival, row_of.survival_std)
+            for method, row_of in methods.items()
+            if row_of.survival is not None and row_of.survival_std is not None
         }
-        if "data" not in kept:
+        if "data" not in passed:
             continue
         spread = None
         if name in table and (plain := table[name].difference_std) is not None:
             # the subtraction adds the sampling of events below the line
             own = table[name].survival_std or {}
-            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in kept.items()}
+            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in passed.items()}
             spread = {
                 m: float(np.sqrt(std**2 + more[m] + more["data"]))
                 for m, std in plain.items()
-                if m in kept
+                if m in passed
             }
         row = SurvivalRow(
-            {method: one.peak for method, one in methods.items()},
-            {method: one.undefined for method, one in methods.items()},
+            {method: row_of.peak for method, row_of in methods.items()},
+            {method: row_of.undefined for method, row_of in methods.items()},
         )
-        found[name] = _against_data(row, kept, spread)
-    return found
+        estimates[name] = _against_data(row, passed, spread)
+    return estimates
 
 
 def _of_fit(dep: Values, other: Values) -> float:
     """Error of a survival in percent from those of the fit, see `survival_table`."""
-    kept = np.zeros(dep.shape[:2])
-    for axis, end in np.ndindex(*kept.shape):
+    passed = np.zeros(dep.shape[:2])
+    for axis, end in np.ndindex(*passed.shape):
         single, some = (v[axis, end][np.isfinite(v[axis, end])] for v in (dep, other))
         if min(single.size, some.size) < MIN_EVENTS:
             return 0.0
         cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
-        kept[axis, end] = 100 * (some >= cut).mean()
-    return float(np.sqrt((0.25 * (kept[:, 0] - kept[:, 1]) ** 2).sum()))
+        passed[axis, end] = 100 * (some >= cut).mean()
+    return float(np.sqrt((0.25 * (passed[:, 0] - passed[:, 1]) ** 2).sum()))
 
 
 def null_spread(
@@ -442,11 +442,11 @@ def null_spread(
 
 
 def _against_data(
-    row: SurvivalRow, found: Mapping[str, Spread], spread: Mapping[str, float] | None = None
+    row: SurvivalRow, estimates: Mapping[str, Spread], spread: Mapping[str, float] | None = None
 ) -> SurvivalRow:
     """Differences from the data, with errors as given or those of both in quadrature."""
-    (data, data_std), difference, std, sigma = found["data"], {}, {}, {}
-    for method, (survival, error) in found.items():
+    (data, data_std), difference, std, sigma = estimates["data"], {}, {}, {}
+    for method, (survival, error) in estimates.items():
         if method != "data":
             difference[method] = survival - data
             std[method] = float(np.hypot(error, data_std))
@@ -455,8 +455,8 @@ def _against_data(
             sigma[method] = difference[method] / std[method]
     return replace(
         row,
-        survival={m: survival for m, (survival, _) in found.items()},
-        survival_std={m: error for m, (_, error) in found.items()},
+        survival={m: survival for m, (survival, _) in estimates.items()},
+        survival_std={m: error for m, (_, error) in estimates.items()},
         difference=difference,
         difference_std=std,
         sigma=sigma,

@@ -155,7 +155,7 @@ def against_energy(
             method: _points(values, energy_kev[method], bands, lines)
             for method, values in amplitude.items()
         }
-        ranges = [{(p.low_kev, p.high_kev) for p in found} for found in points.values()]
+        ranges = [{(p.low_kev, p.high_kev) for p in site_fits} for site_fits in points.values()]
         common = set.intersection(*ranges)
         if len(common) >= 3:
             break
@@ -165,8 +165,8 @@ def against_energy(
             "it takes three that both sides have: give events of more energies"
         )
     methods = {
-        method: _course([p for p in found if (p.low_kev, p.high_kev) in common])
-        for method, found in points.items()
+        method: _course([p for p in site_fits if (p.low_kev, p.high_kev) in common])
+        for method, site_fits in points.items()
     }
     return AgainstEnergy(bands is all_bands, methods)
 
@@ -221,12 +221,12 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
         ``methods`` of `against_energy`.
     """
     figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
-    for method, found in methods.items():
-        colour, line = COLOURS[method], found.mean
-        energy, mean, error, sigma, sigma_error = _columns(found.points)
+    for method, site_fits in methods.items():
+        colour, line = COLOURS[method], site_fits.mean
+        energy, mean, error, sigma, sigma_error = _columns(site_fits.points)
         look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
         for axes, value, spread in (
-            (above, mean / found.scale - 1, error / found.scale),
+            (above, mean / site_fits.scale - 1, error / site_fits.scale),
             (below, sigma / mean, sigma_error / mean),
         ):
             group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
@@ -235,7 +235,7 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
         text += f"{line.per_mev_error_percent:.3f} % per MeV"
         fit = {"color": colour, "gid": GROUP + method}
         above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
-        below.plot(along, 100 * found.resolution.of(along), **fit)
+        below.plot(along, 100 * site_fits.resolution.of(along), **fit)
     above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
     below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
     above.legend()
@@ -245,21 +245,21 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
 def _points(
     amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
 ) -> list[SiteFit]:
-    beside = np.ones(len(energy_kev), bool)
+    between = np.ones(len(energy_kev), bool)
     for low, high in lines:
-        beside &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
-    found = []
+        between &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
+    site_fits = []
     about = None
     for low, high in bands:  # the double-escape peak first, if there is one
         inside = (energy_kev >= low) & (energy_kev < high)
         if (low, high) not in lines:
-            inside &= beside
+            inside &= between
         fitted = site_fit(amplitude[inside], about)
         if fitted is not None:
             about = about or (fitted[0], fitted[2])
             centre = float(energy_kev[inside].mean())
-            found.append(SiteFit(low, high, centre, *fitted))
-    return sorted(found, key=lambda point: point.energy_kev)
+            site_fits.append(SiteFit(low, high, centre, *fitted))
+    return sorted(site_fits, key=lambda point: point.energy_kev)
 
 
 def _course(points: list[SiteFit]) -> Course:

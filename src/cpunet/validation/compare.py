@@ -1,4 +1,4 @@
-"""Compare the scores of several validations: one table, and one page."""
+"""Compare the scores of several validations: a table and a page."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from cpunet.validation.verdicts import (
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-FEW = 8  # runs whose scores are printed beside each other; of more, the page has them
+FEW = 8  # runs whose scores are printed side by side; of more, the page has them
 OVER = "median ± std"  # name of the column over runs that differ in their seed only
 
 # what runs have in common that differ in their seed only
@@ -87,8 +87,10 @@ class Row(NamedTuple):
     @property
     def best(self) -> set[int]:
         """Indices of the runs with the best score; empty if fewer than two have one."""
-        known = [cell.off for cell in self.cells if cell.value is not None]
-        return {i for i, c in enumerate(self.cells) if len(known) > 1 and c.off == min(known)}
+        present = [cell.off for cell in self.cells if cell.value is not None]
+        return {
+            i for i, c in enumerate(self.cells) if len(present) > 1 and c.off == min(present)
+        }
 
     @property
     def texts(self) -> list[str]:
@@ -104,10 +106,10 @@ class Row(NamedTuple):
     @property
     def over(self) -> str:
         """Median and standard deviation over the runs."""
-        known = [cell for cell in self.cells if cell.value is not None]
-        if len(known) < 2:
+        present = [cell for cell in self.cells if cell.value is not None]
+        if len(present) < 2:
             return NO_VALUE
-        values, digits = np.array([cell.value for cell in known], float), known[0].digits
+        values, digits = np.array([cell.value for cell in present], float), present[0].digits
         spread = f"{np.std(values, ddof=1):{digits.lstrip('+')}}"
         return f"{np.median(values):{digits}} ± {spread}"
 
@@ -153,9 +155,11 @@ class Comparison:
         """Scores that any run has, ordered by peak."""
         rows = []
         for peak in _union(part(metrics, "peaks") for metrics in self.metrics.values()):
-            found = [_scores(metrics, peak, self.method) for metrics in self.metrics.values()]
-            for score in _union(found):
-                cells = [of_run.get(score, Cell()) for of_run in found]
+            collected = [
+                _scores(metrics, peak, self.method) for metrics in self.metrics.values()
+            ]
+            for score in _union(collected):
+                cells = [of_run.get(score, Cell()) for of_run in collected]
                 if any(cell.value is not None for cell in cells):
                     rows.append(Row(peak, score, cells))
         return rows
@@ -172,10 +176,12 @@ class Comparison:
     @property
     def note(self) -> str:
         """Signs that runs were not scored on the same pulses; empty if there are none."""
-        (first, known), *others = ((n, _pulses(metrics)) for n, metrics in self.metrics.items())
-        apart = {name: [k for k in known if of[k] != known[k]] for name, of in others}
-        names = ", ".join(name for name, differences in apart.items() if differences)
-        words = ", ".join(_union(apart.values()))
+        (first, present), *others = (
+            (n, _pulses(metrics)) for n, metrics in self.metrics.items()
+        )
+        differing = {name: [k for k in present if of[k] != present[k]] for name, of in others}
+        names = ", ".join(name for name, differences in differing.items() if differences)
+        words = ", ".join(_union(differing.values()))
         text = f"other pulses than those of {first} ({words}), so scores differ for that, too"
         return f"{names}: {text}" if names else ""
 
@@ -208,7 +214,9 @@ class Comparison:
         }
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
         title = f"{label(self.method)}: {len(self.metrics)} runs compared"
-        runs = [_overview(name, one, self.method) for name, one in self.metrics.items()]
+        runs = [
+            _overview(name, scores_of, self.method) for name, scores_of in self.metrics.items()
+        ]
         values = {"title": title, "comparison": self, "runs": runs, "links": links}
         page = rendered("compare.html", **values, peaks=peaks, over=OVER, far=f"{FAR:g}")
         with written_aside(path) as aside:
@@ -312,20 +320,20 @@ def compared(
     failed
         Reports to list as missing: what is in their folders is of an earlier validation.
     """
-    found: list[tuple[Path, Metrics | None, Path | None]] = []
+    collected: list[tuple[Path, Metrics | None, Path | None]] = []
     for report in reports:
         if isinstance(report, Report):
             # one in memory is named by its run
             place = report.folder or Path(report.metrics["compared"]["run"])
-            found.append((place, report.metrics, report.folder))
+            collected.append((place, report.metrics, report.folder))
             continue
         path = Path(report)
         files = (path, path / METRICS, path / "report" / METRICS)  # the last one of a demo
         file = next((f for f in files if f.is_file() and path not in failed), None)
-        found.append((path, read_metrics(file) if file else None, file and file.parent))
-    names = _names([place for place, _, _ in found])
-    folders = {name: folder for name, (_, _, folder) in zip(names, found, strict=True)}
-    each = zip(names, found, strict=True)
+        collected.append((path, read_metrics(file) if file else None, file and file.parent))
+    names = _names([place for place, _, _ in collected])
+    folders = {name: folder for name, (_, _, folder) in zip(names, collected, strict=True)}
+    each = zip(names, collected, strict=True)
     runs = {name: metrics for name, (_, metrics, _) in each if metrics is not None}
     if not runs:
         raise CpunetError(
@@ -335,10 +343,12 @@ def compared(
     missing = tuple(name for name in names if name not in runs)
     made = Comparison(method, runs, folders, missing)
     if not made.rows:
-        known = _union(methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks"))
+        present = _union(
+            methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks")
+        )
         raise CpunetError(
             f"{', '.join(runs)}: no score of the method {method}; "
-            + (f"there are {', '.join(known)}" if known else "nothing is scored there")
+            + (f"there are {', '.join(present)}" if present else "nothing is scored there")
         )
     return made
 
@@ -346,35 +356,35 @@ def compared(
 def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     """Scores of a method at a peak, by name."""
     scores, survival = part(metrics, "peaks", peak), part(metrics, "ae_survival", peak)
-    found = {}
-    for name, one in part(scores, "parameters").items():
-        ceiling = number(one, "iou", "ceiling")
+    collected = {}
+    for name, scores_of in part(scores, "parameters").items():
+        ceiling = number(scores_of, "iou", "ceiling")
         more = "" if ceiling is None else f" ({ceiling:.1f})"
-        iou, error = (number(one, key, method) for key in ("iou", "iou_std"))
+        iou, error = (number(scores_of, key, method) for key in ("iou", "iou_std"))
         title = f"{name.replace('_', ' ')}: IoU [%] (data vs data)"
-        found[title] = Cell.of(iou, error, ".1f", 100.0, more)
+        collected[title] = Cell.of(iou, error, ".1f", 100.0, more)
     auc, error, chance = (
         number(scores, "two_sample", method, key) for key in ("auc", "auc_std", "null_mean")
     )
     edge = number(scores, "paired", method, "edge_rmse")
-    apart, std = (number(survival, key, method) for key in ("difference", "difference_std"))
-    return found | {
+    differing, std = (number(survival, key, method) for key in ("difference", "difference_std"))
+    return collected | {
         "classifier: AUC": Cell.of(auc, error, ".3f", chance or 0.0),
         "edge RMSE [10⁻³]": Cell.of(None if edge is None else 1e3 * edge, None, "#.3g", 0.0),
         **_legend(metrics, peak, method),
-        "A/E survival minus data [points]": Cell.of(apart, std, "+.2f", 0.0),
+        "A/E survival minus data [points]": Cell.of(differing, std, "+.2f", 0.0),
     }
 
 
 def _legend(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     """Differences of LEGEND's quantities from the data, by name."""
-    judged, found = judged_parameters(part(metrics, "peaks", peak)), {}
+    judged, collected = judged_parameters(part(metrics, "peaks", peak)), {}
     for name in (name for name in MAIN if name in judged):
         shift, error = (number(judged[name], key, method) for key in ("shift", "shift_std"))
         unit = LABELLED[name].unit
         title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
-        found[title] = Cell.of(shift, error, "+.2g", 0.0)
-    return found
+        collected[title] = Cell.of(shift, error, "+.2g", 0.0)
+    return collected
 
 
 class Overview(NamedTuple):
@@ -401,13 +411,13 @@ def _overview(name: str, metrics: Metrics, method: str) -> Overview:
 def _pulses(metrics: Metrics) -> dict[str, Any]:
     """What distinguishes the pulses of a validation from those of another."""
     peaks, rejections = part(metrics, "peaks"), part(metrics, "rejections")
-    found: dict[str, Any] = {"detectors": part(metrics, "compared").get("detector")}
-    found["peaks"] = peaks.keys()
+    collected: dict[str, Any] = {"detectors": part(metrics, "compared").get("detector")}
+    collected["peaks"] = peaks.keys()
     for side, called in (("data", "measured"), ("sim", "simulated")):
         numbers = {peak: part(peaks, peak).get(f"n_{side}") for peak in peaks}
-        found[f"numbers of {called} pulses"] = numbers
-        found[f"rejections of {called} pulses"] = rejections.get(side)
-    return found
+        collected[f"numbers of {called} pulses"] = numbers
+        collected[f"rejections of {called} pulses"] = rejections.get(side)
+    return collected
 
 
 def _union(names: Iterable[Iterable[str]]) -> list[str]:

@@ -344,8 +344,8 @@ def _distances(
     if not drawn.any():
         return np.full(1, np.nan), np.full(1, np.nan)
     one, other = (c[:, drawn] / c[-1, drawn].astype(float) for c in below)
-    apart = np.abs(np.subtract(one, other, out=one), out=one)
-    return np.diff(positions) @ apart[:-1], apart.max(axis=0)
+    heights = np.abs(np.subtract(one, other, out=one), out=one)
+    return np.diff(positions) @ heights[:-1], heights.max(axis=0)
 
 
 def _finite(values: Values) -> Values:
@@ -538,24 +538,24 @@ def two_sample_test(a: Values, b: Values, moved: Values | None = None) -> Tested
         return Tested(np.nan, 0, np.nan)
     n_bins = min(TEST_BINS, least // EXPECTED)
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, n_bins + 1)[1:-1]))
-    apart = np.isnan(pooled).sum() * least / len(pooled) >= EXPECTED
+    heights = np.isnan(pooled).sum() * least / len(pooled) >= EXPECTED
 
     def shares(values: Values) -> Values:
-        last = len(edges) + 1 if apart else len(edges)
+        last = len(edges) + 1 if heights else len(edges)
         place = np.where(np.isnan(values), last, np.searchsorted(edges, values, side="right"))
-        return np.bincount(place, minlength=len(edges) + 1 + apart) / len(values)
+        return np.bincount(place, minlength=len(edges) + 1 + heights) / len(values)
 
     common = shares(pooled)
     covariance = (np.diag(common) - np.outer(common, common)) * (1 / len(a) + 1 / len(b))
     for low, high in () if moved is None else moved:
         change = 0.5 * (shares(low) - shares(high))
         covariance += np.outer(change, change)
-    known = np.flatnonzero(common)[1:]  # shares sum to 1
-    if not known.size:
+    usable = np.flatnonzero(common)[1:]  # shares sum to 1
+    if not usable.size:
         return Tested(0.0, 0, 1.0)
-    apart_by = (shares(a) - shares(b))[known]
-    size = float(apart_by @ np.linalg.solve(covariance[np.ix_(known, known)], apart_by))
-    return Tested(size, known.size, float(chi2.sf(size, known.size)))
+    apart_by = (shares(a) - shares(b))[usable]
+    size = float(apart_by @ np.linalg.solve(covariance[np.ix_(usable, usable)], apart_by))
+    return Tested(size, usable.size, float(chi2.sf(size, usable.size)))
 
 
 def shift(a: Values, b: Values, moved: Values | None = None) -> tuple[float, float]:
@@ -572,8 +572,8 @@ def shift(a: Values, b: Values, moved: Values | None = None) -> tuple[float, flo
     one, other = one.clip(low, high), other.clip(low, high)
     variance = sum(values.var(ddof=1) / len(values) for values in (one, other))
     if moved is not None:
-        known = np.isfinite(moved).all(axis=(0, 1))
-        means = moved[:, :, known].clip(low, high).mean(axis=2)
+        usable = np.isfinite(moved).all(axis=(0, 1))
+        means = moved[:, :, usable].clip(low, high).mean(axis=2)
         variance += (0.25 * (means[:, 0] - means[:, 1]) ** 2).sum()
     return float(other.mean() - one.mean()), float(np.sqrt(variance))
 
@@ -630,14 +630,14 @@ def compare(
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
     n_sim = max(sizes.values(), default=0)
     null = resampled_twice(n_data, n_sim, n_data, scores.bootstraps, rng)
-    known = {name: values for name, values in data.items() if np.isfinite(values).any()}
-    axes = {name: data_axis(values, scores.max_bins) for name, values in known.items()}
-    found = {name: _of_data(values, null, axes.get(name)) for name, values in data.items()}
+    usable = {name: values for name, values in data.items() if np.isfinite(values).any()}
+    axes = {name: data_axis(values, scores.max_bins) for name, values in usable.items()}
+    results = {name: _of_data(values, null, axes.get(name)) for name, values in data.items()}
     own = null[1]
     del null
     for method, values in methods.items():
         draws = (own, Resampled.of(sizes[method], sizes[method], scores.bootstraps, rng))
-        for name, one in found.items():
+        for name, one in results.items():
             both = data[name], values[name]
             one["wasserstein"][method] = wasserstein(*both)
             one["ks"][method] = kolmogorov_smirnov(*both)
@@ -651,7 +651,7 @@ def compare(
             one["shift"][method], one["shift_std"][method] = shift(*both, ends)
             tested = two_sample_test(*both, ends)
             one["chi_square"][method], one["degrees"][method], one["p"][method] = tested
-    return found
+    return results
 
 
 def _of_data(data: Values, null: Draws, axis: hist.axis.Regular | None) -> Compared:

@@ -42,28 +42,30 @@ Drawing = Callable[[], Figure]
 T = TypeVar("T")
 
 
-def drawings(found: Evaluation) -> dict[str, Drawing]:
+def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
-    if peaks := held_out(found.metrics):
-        drawn["overlap with data"] = partial(overlap_figure, found.metrics, peaks)
-    if found.ae_energy.methods:
-        drawn["A over E and energy"] = partial(ae_energy_figure, found.ae_energy.methods)
-    for peak in found.sets:
-        if peak.name in found.values:
-            of_peak = _of_peak(peak, found)
+    if peaks := held_out(evaluated.metrics):
+        drawn["overlap with data"] = partial(overlap_figure, evaluated.metrics, peaks)
+    if evaluated.ae_energy.methods:
+        drawn["A over E and energy"] = partial(ae_energy_figure, evaluated.ae_energy.methods)
+    for peak in evaluated.sets:
+        if peak.name in evaluated.values:
+            of_peak = _of_peak(peak, evaluated)
             drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak.items()}
-    if DEP in found.values and len(found.values) > 1:
+    if DEP in evaluated.values and len(evaluated.values) > 1:
         ae = {
             name: {m: v["current_amplitude"] for m, v in _shown(of_peak).items()}
-            for name, of_peak in found.values.items()
+            for name, of_peak in evaluated.values.items()
         }
         drawn["A over E survival"] = partial(roc_figure, ae, DEP)
-    fullest = max(found.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values()))
-    if any(name.startswith(f"{IREN.part}.") for name in found.run.weights):
-        drawn |= _cycles(fullest, found.run.iren)
-    if found.run.records:
-        drawn["losses"] = partial(loss_curves, found.run.records)
+    fullest = max(
+        evaluated.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values())
+    )
+    if any(name.startswith(f"{IREN.part}.") for name in evaluated.run.weights):
+        drawn |= _cycles(fullest, evaluated.run.iren)
+    if evaluated.run.records:
+        drawn["losses"] = partial(loss_curves, evaluated.run.records)
     return drawn
 
 
@@ -71,13 +73,13 @@ def _cycles(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
     """Pulses of both sides through both networks and back."""
     ren = peak.translations.ren
     drawn: dict[str, Drawing] = {}
-    for there, back, side, names in (
+    for forward, back, side, names in (
         (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
         (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
     ):
         start, rows = peak.windows(side)[:SHOWN], peak.rows[side][:SHOWN]
         kev = peak.translations.energy_kev[side][rows]
-        middle = there.apply(start, energy_kev=kev, noise=False)
+        middle = forward.apply(start, energy_kev=kev, noise=False)
         end = back.apply(middle, energy_kev=kev, noise=False)
         stages = zip(names, (start, middle, end), strict=True)
         draw = partial(cycle_figure, dict(stages), ren.dt_ns)
@@ -89,9 +91,9 @@ def _shown(by_method: Mapping[str, T], methods: Collection[str] = DRAWN) -> dict
     return {method: one for method, one in by_method.items() if method in methods}
 
 
-def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
-    name, dt_ns, bins = peak.name, found.run.dt_ns, found.run.recipe.scores.max_bins
-    scores, values = found.metrics["peaks"][name], _shown(found.values[name])
+def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
+    name, dt_ns, bins = peak.name, evaluated.run.dt_ns, evaluated.run.recipe.scores.max_bins
+    scores, values = evaluated.metrics["peaks"][name], _shown(evaluated.values[name])
     drawn: dict[str, Drawing] = {}
     further: dict[str, dict[str, Values]] = {}
     for parameter, data in values["data"].items():
@@ -105,7 +107,7 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
         else:
             further[parameter] = by_method
     drawn["further parameters"] = partial(further_histograms, further, bins, name)
-    slices = found.slices[name]
+    slices = evaluated.slices[name]
     means = {"": {method: of_method.whole for method, of_method in _shown(slices).items()}}
     title = f"{name}: mean pulse"
     drawn["mean pulse"] = partial(shape_figure, means, dt_ns, title)
@@ -127,7 +129,7 @@ def _of_peak(peak: PeakSets, found: Evaluation) -> dict[str, Drawing]:
 
 
 def _single_pulse(peak: PeakSets) -> Drawing | None:
-    """The first simulated event with an edge in every method, beside a measured pulse."""
+    """The first simulated event with an edge in every method, with a measured pulse."""
     dt_ns = peak.translations.ren.dt_ns
     for row in peak.known_to_all():
         windows = _shown(peak.translations.without_noise(row), SINGLE)
@@ -137,7 +139,7 @@ def _single_pulse(peak: PeakSets) -> Drawing | None:
             place, rms = nearest(around_half(data, dt_ns), shapes["ren"])
             shapes = {"data": around_half(data[[place]], dt_ns)[0]} | shapes
             pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
-            title = f"{peak.name}: a simulated pulse without noise, and the measured one\n"
+            title = f"{peak.name}: a simulated pulse without noise, and the measured pulse\n"
             title += f"nearest to its REN translation (RMS difference {rms:.4f})"
             return partial(shape_figure, {"": pulses}, dt_ns, title)
     return None

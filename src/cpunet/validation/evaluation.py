@@ -116,7 +116,7 @@ def evaluate(
     )
     translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
     selections = {name: parse_selection(name, recipe.peaks) for name in names}
-    sets = [PeakSets.of(name, one, translations) for name, one in selections.items()]
+    sets = [PeakSets.of(name, selected, translations) for name, selected in selections.items()]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
@@ -128,10 +128,10 @@ def evaluate(
         moved = {peak.name: values for peak, values in zip(sets, ended, strict=True)}
         work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
         scored = pool.map(work, sets, moved.values())
-        for peak, (found, peaks[peak.name]) in zip(sets, scored, strict=True):
-            if found:
-                values[peak.name] = found
-                rise = {method: v["rise_01_90"] for method, v in found.items()}
+        for peak, (by_method, peaks[peak.name]) in zip(sets, scored, strict=True):
+            if by_method:
+                values[peak.name] = by_method
+                rise = {method: v["rise_01_90"] for method, v in by_method.items()}
                 slices[peak.name] = aligned_means(peak.windows, rise, run.dt_ns)
             bar.update(1)
     if not values:
@@ -139,7 +139,7 @@ def evaluate(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    kept = survival_table(
+    survivals = survival_table(
         {
             name: {method: v["current_amplitude"] for method, v in of_peak.items()}
             for name, of_peak in values.items()
@@ -147,10 +147,10 @@ def evaluate(
         {name: of_peak["current_amplitude"] for name, of_peak in moved.items() if of_peak},
         seed=seed,
     )
-    ranges = _range_survivals(translations, kept, recipe)
-    if not isinstance(kept, Missing) and not isinstance(ranges, Missing):
-        kept = subtracted(kept, ranges)
-    known = None if run.fit is None else run.fit.tails
+    ranges = _range_survivals(translations, survivals, recipe)
+    if not isinstance(survivals, Missing) and not isinstance(ranges, Missing):
+        survivals = subtracted(survivals, ranges)
+    facts = None if run.fit is None else run.fit.tails
     ae_energy = against_energy(
         {method: translations.amplitudes[method] for method in ("data", "ren")},
         translations.energy_kev,
@@ -159,7 +159,7 @@ def evaluate(
     metrics = {
         "compared": _compared(run, sim_set, data_set),
         "peaks": peaks,
-        "ae_survival": kept,
+        "ae_survival": survivals,
         "ae_details": {"survival by energy range": ranges},
         "ae_energy": ae_energy,
         "a_over_e_scale": {method: list(spread) for method, spread in scales.items()},
@@ -171,7 +171,7 @@ def evaluate(
         },
         "training": {"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
-        "tails": None if known is None else known.model_dump(exclude_unset=True),
+        "tails": None if facts is None else facts.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,
@@ -200,11 +200,11 @@ def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
     dep = next((peak for peak in sets if peak.name == DEP), None)
     if dep is None:
         return {}
-    found = {
+    by_method = {
         method: dep_scale(dep.translations.amplitudes[method][rows], seed)
         for method, rows in dep.rows.items()
     }
-    return found if np.isfinite(list(found.values())).all() else {}
+    return by_method if np.isfinite(list(by_method.values())).all() else {}
 
 
 def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
@@ -220,7 +220,7 @@ def _range_survivals(
     ae_survival: dict[str, SurvivalRow] | Missing,
     recipe: Recipe,
 ) -> dict[str, dict[str, RangeSurvival]] | Missing:
-    """A/E survival of gamma lines, sideband-subtracted, and of continua, after known cuts."""
+    """A/E survival of gamma lines, sideband-subtracted, and of continua, after given cuts."""
     if isinstance(ae_survival, Missing):
         return Missing(f"there is no A/E cut: {ae_survival.missing}")
     cuts, errors = ae_survival[DEP].cut or {}, ae_survival[DEP].cut_std or {}  # of each method
@@ -249,7 +249,7 @@ def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
     widest = max(peak.half_width_kev for peak in recipe.peaks.values())
     if widest > near:
         raise CpunetError(
-            f"recipe {recipe.name}: sidebands from {near:g} keV beside a line overlap its "
+            f"recipe {recipe.name}: sidebands from {near:g} keV off a line overlap its "
             f"range of {widest:g} keV; give a larger scores.sideband_kev"
         )
     return {
@@ -272,12 +272,12 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
         f"{run.sim.used} simulated and {run.data.used} measured pulses",
         run.started[:10],
     )
-    known = {
+    facts = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
         "period": period_of(data.path),
     }
-    compared = {name: str(value) for name, value in known.items() if value is not None}
+    compared = {name: str(value) for name, value in facts.items() if value is not None}
     compared |= {
         "simulation": _short(sim.path),
         "data": _short(data.path),
@@ -297,8 +297,8 @@ def period_of(path: Path) -> str | None:
     >>> period_of(Path("l200-p03-r001-cal-20230318T012144Z-tier_raw.lh5"))
     'p03 r001'
     """
-    found = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
-    return None if found is None else f"{found[1]} {found[2]}"
+    by_method = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
+    return None if by_method is None else f"{by_method[1]} {by_method[2]}"
 
 
 def _short(path: Path) -> str:

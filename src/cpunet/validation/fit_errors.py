@@ -1,6 +1,6 @@
 """What the errors of a fit do to translated pulses.
 
-The parameters of a readout are known as well as their covariance says.  Some pulses are
+The parameters of a readout are as certain as their covariance says.  Some pulses are
 translated again with the parameters at both ends of each axis of the error ellipsoid, with
 the same noise: half of the difference along an axis is one standard deviation of whatever is
 calculated of them.
@@ -68,10 +68,10 @@ def moved_values(peak: PeakSets, ends: Ends, seed: int) -> dict[str, Values]:
     if not ends or not len(rows):
         return {}
     windows = peak.translations.windows["raw"][rows]
-    kev, found = peak.translations.energy_kev["ren"][rows], []
+    kev, by_end = peak.translations.energy_kev["ren"][rows], []
     for ren in (ren for pair in ends for ren in pair):
         moved = ren.apply(windows, energy_kev=kev, generator=np.random.default_rng(seed))
         pulses, recipe = Pulses.of(moved, dt_ns=ren.dt_ns), ren.recipe
-        found.append(all_parameters(pulses, recipe.preparation, recipe.scores))
+        by_end.append(all_parameters(pulses, recipe.preparation, recipe.scores))
     shape = len(ends), 2, len(rows)
-    return {name: np.reshape([one[name] for one in found], shape) for name in found[0]}
+    return {name: np.reshape([values[name] for values in by_end], shape) for name in by_end[0]}

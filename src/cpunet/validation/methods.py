@@ -1,10 +1,10 @@
 """All methods of a validation: baseline methods, fitted to the peak of the training, and REN.
 
 Each translates all simulated pulses once, with and without noise.  Of a noise-free pulse only
-its difference from the truth is kept, and a few events are translated again for display: to
+its difference from the truth is stored, and a few events are translated again for display: to
 keep all samples would double the memory.
 
-Of a virtual test stand the truth is known.  Two pulses are compared with it after both are
+A virtual test stand gives the truth.  Two pulses are compared with it after both are
 shifted to cross half of their maximum at the same time: a time shift left by the electronics or
 the alignment is not a difference of shape.
 """
@@ -63,7 +63,7 @@ def true_responses(path: Path, sim: InputSet) -> FloatArray:
     arrays = read_arrays(path)
     if "response" not in arrays:
         names = ", ".join(arrays) or "none"
-        raise CpunetError(f"{path}: has no array 'response' (found {names})")
+        raise CpunetError(f"{path}: has no array 'response' (it has {names})")
     values = arrays["response"]
     if values.ndim != 2 or values.shape[0] != sim.prepared.n_read:
         raise CpunetError(
@@ -105,7 +105,7 @@ def pair_squares(
         samples that both records of a pair have, and over the ``2 * edge_samples + 1`` samples
         around the crossing; all 0 where a pulse cannot be aligned.
     """
-    found = {method: np.zeros((len(truth), 4)) for method in methods}
+    results = {method: np.zeros((len(truth), 4)) for method in methods}
     for rows in blocks(len(truth)):
         half = truth.shape[1]
         aligned = aligned_block(truth[rows], half, half)
@@ -113,9 +113,9 @@ def pair_squares(
         for method, translated in methods.items():
             difference = aligned_block(translated[rows], half, half)
             difference -= aligned
-            found[method][rows, :2] = _squares(difference)
-            found[method][rows, 2:] = _squares(difference[:, edge])
-    return found
+            results[method][rows, :2] = _squares(difference)
+            results[method][rows, 2:] = _squares(difference[:, edge])
+    return results
 
 
 def scores_of_squares(squares: Values) -> PairedScores:
@@ -153,9 +153,9 @@ def scores_of_squares(squares: Values) -> PairedScores:
 
 def _squares(difference: Values) -> Values:
     """Sum of squares of the values that are not NaN, and their number, row by row."""
-    known = np.isfinite(difference)
-    values = np.where(known, difference, 0)
-    return np.stack([np.einsum("ij,ij->i", values, values), known.sum(axis=1)], axis=1)
+    comparable = np.isfinite(difference)
+    values = np.where(comparable, difference, 0)
+    return np.stack([np.einsum("ij,ij->i", values, values), comparable.sum(axis=1)], axis=1)
 
 
 def _root_mean(sum_and_count: Values) -> float:
@@ -214,11 +214,11 @@ def fit_baseline_methods(
     """
     config, result = recipe.preparation, FittedBaselineMethods()
     kinds = BASELINE_METHODS if fitted else {}
-    there = tails is not None and tails.law.rate_khz > 0
-    found = tails_of(data)[0] if there else None
+    with_tails = tails is not None and tails.law.rate_khz > 0
+    results = tails_of(data)[0] if with_tails else None
     try:
-        noise = noise_of(data, found)
-        result.noise = TraceNoise(noise, tails) if there else noise
+        noise = noise_of(data, results)
+        result.noise = TraceNoise(noise, tails) if with_tails else noise
     except CpunetError as error:
         result.missing["noise"] = str(error)
     fit_sim, fit_data = (
@@ -254,13 +254,13 @@ class Translations:
         cannot be prepared are NaN.
     whole, energy_kev, amplitudes
         Mask of the prepared rows, energies and current amplitudes, by method.
-    known
+    comparable
         Mask of the simulated pulses that every method can prepare without noise.
     squares
         Squared differences of the noise-free pulses from the truth by method, see
         `pair_squares`; empty if the truth is unknown.
     truth
-        Windows of the noise-free truth, if known.
+        Windows of the noise-free truth, if given.
     """
 
     ren: REN
@@ -269,20 +269,20 @@ class Translations:
     whole: dict[str, Flags]
     energy_kev: dict[str, Values]
     amplitudes: dict[str, Values]
-    known: Flags
+    comparable: Flags
     squares: dict[str, Values]
     truth: FloatArray | None
 
     def without_noise(self, row: int) -> dict[str, FloatArray]:
-        """Noise-free window of a pulse by method, with the truth if it is known."""
+        """Noise-free window of a pulse by method, with the truth if given."""
         raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
-        found = {"raw": raw}
+        results = {"raw": raw}
         for name, method in self.baselines.methods.items():
-            found[name] = method.translate_like_data(raw, config)
-        found["ren"] = self.ren.apply(
+            results[name] = method.translate_like_data(raw, config)
+        results["ren"] = self.ren.apply(
             raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
         )
-        return found if self.truth is None else found | {"truth": self.truth[[row]]}
+        return results if self.truth is None else results | {"truth": self.truth[[row]]}
 
 
 def translate_all(
@@ -302,7 +302,7 @@ def translate_all(
     sim, data
         Prepared pulses of both sides.
     responses
-        True noise-free records of the simulated pulses, if known.
+        True noise-free records of the simulated pulses, if given.
     seed
         Seed of the noise, common to all methods.
     """
@@ -315,7 +315,7 @@ def translate_all(
         for name in (*baselines.methods, "ren", "truth")  # from the simplest to the truth
         if name == "ren" or (name in others and noise is not None)
     }
-    truth, known = None, np.ones(len(pulses), bool)
+    truth, comparable = None, np.ones(len(pulses), bool)
     squares: dict[str, Values] = {}
     if responses is not None:
         truth = np.empty(shape, np.float32)
@@ -343,11 +343,11 @@ def translate_all(
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
             for windows in clean.values():
-                known[rows] &= _whole(windows)
+                comparable[rows] &= _whole(windows)
             if truth is not None:
                 truth[rows] = clean.pop("truth")
-                found = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
-                for name, of_block in found.items():
+                results = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
+                for name, of_block in results.items():
                     squares[name][rows] = of_block
             bar.update(len(block))
     measured = data.prepared.pulses
@@ -359,7 +359,7 @@ def translate_all(
         {method: _whole(windows) for method, windows in every.items()},
         {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
         {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()},
-        known,
+        comparable,
         squares,
         truth,
     )

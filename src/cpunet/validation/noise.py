@@ -65,13 +65,13 @@ def baseline_spectra(
     >>> rng = np.random.default_rng(1)
     >>> sets = {m: rng.normal(0, s, (400, 64)) for m, s in (("data", 1), ("ren", 1.1))}
     >>> begins = dict.fromkeys(sets, np.full(400, 200.0))
-    >>> found = baseline_spectra(sets, begins, samples=64, dt_ns=16)
-    >>> round(found["ren"]["rms_ratio"], 1), found["ren"]["sigma"] > 5
+    >>> spectra = baseline_spectra(sets, begins, samples=64, dt_ns=16)
+    >>> round(spectra["ren"]["rms_ratio"], 1), spectra["ren"]["sigma"] > 5
     (1.1, True)
     """
     free = {method: begins[method] - MARGIN_NS / dt_ns for method in windows}
-    known = free["data"][np.isfinite(free["data"])]
-    samples = min(samples, int(np.quantile(known, EARLY_SHARE)) if known.size else 0)
+    times = free["data"][np.isfinite(free["data"])]
+    samples = min(samples, int(np.quantile(times, EARLY_SHARE)) if times.size else 0)
     if samples < MIN_SAMPLES:
         few = f"{max(samples, 0)} samples before measured pulses begin"
         early = f"{few}; {MIN_SAMPLES} are needed"
@@ -80,15 +80,17 @@ def baseline_spectra(
     steps = 2 ** np.arange(0, np.log2(samples // 2 + 1), 1 / BANDS_PER_OCTAVE)
     edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1)).astype(float)
     frequencies = np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.5)) / (samples * dt_ns * 1e-3)
-    found: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
+    by_method: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
     for method, pulses in windows.items():
         power = _band_powers(pulses[free[method] >= samples, :samples], edges)
         if len(power) < MIN_BASELINES:
-            found[method] = {"missing": f"{len(power)} baselines; {MIN_BASELINES} are needed"}
+            by_method[method] = {
+                "missing": f"{len(power)} baselines; {MIN_BASELINES} are needed"
+            }
             continue
         n, mean, total = len(power), power.mean(axis=0), power.sum(axis=1)
         rms = float(np.sqrt(total.mean()))
-        found[method] = {
+        by_method[method] = {
             "samples": samples,
             "n": n,
             "power": mean.tolist(),
@@ -96,15 +98,15 @@ def baseline_spectra(
             "rms": rms,
             "rms_std": float(total.std(ddof=1) / np.sqrt(n) / (2 * rms)) if rms else 0.0,
         }
-    data = found["data"]
+    data = by_method["data"]
     for method in windows:
-        if method != "data" and "missing" not in data | found[method]:
-            found[method] |= _against(found[method], data)
-    return found
+        if method != "data" and "missing" not in data | by_method[method]:
+            by_method[method] |= _against(by_method[method], data)
+    return by_method
 
 
 @styled
-def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
+def spectrum_of_noise(by_method: Mapping[str, Any], peak: str) -> Figure:
     """Draw the noise power by band and method, and its ratio to that of the data.
 
     Parameters
@@ -114,12 +116,12 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
     peak
         Name of the gamma line, for the title.
     """
-    methods = [m for m, s in found.items() if m != "frequency_mhz" and "missing" not in s]
-    frequency = np.asarray(found["frequency_mhz"])
+    methods = [m for m, s in by_method.items() if m != "frequency_mhz" and "missing" not in s]
+    frequency = np.asarray(by_method["frequency_mhz"])
     figure, ((above,), (below,)) = panels((5.6, 4.4), 2, **STACKED)
-    data = np.asarray(found["data"]["power"])
+    data = np.asarray(by_method["data"]["power"])
     for method in methods:
-        power, error = (np.asarray(found[method][key]) for key in ("power", "power_std"))
+        power, error = (np.asarray(by_method[method][key]) for key in ("power", "power_std"))
         look = {"color": COLOURS[method], "marker": "o", "markersize": 3}
         group(above.errorbar(frequency, power, error, label=label(method), **look), method)
         if method != "data":
@@ -130,7 +132,7 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
             )
             group(below.errorbar(frequency, ratio, spread, **look), method)
     below.axhline(1, color="black", linewidth=0.8)
-    silent = not any(np.any(found[method]["power"]) for method in methods)
+    silent = not any(np.any(by_method[method]["power"]) for method in methods)
     above.set(
         title=f"{peak}: noise before the pulse",
         ylabel="Mean square per band\n[pulse height²]",
@@ -147,10 +149,10 @@ def spectrum_of_noise(found: Mapping[str, Any], peak: str) -> Figure:
 
 def _band_powers(baselines: FloatArray, edges: Values) -> Values:
     """Mean square of each baseline in each band, shape (baselines, bands)."""
-    known = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
+    times = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
     samples = baselines.shape[1]
     window = np.hanning(samples + 1)[:-1]
-    centred = (known - known.mean(axis=1, keepdims=True)) * window
+    centred = (times - times.mean(axis=1, keepdims=True)) * window
     power = np.abs(np.fft.rfft(centred, axis=1)) ** 2 * 2 / (samples * (window @ window))
     if samples % 2 == 0:
         power[:, -1] /= 2  # the highest frequency occurs only once

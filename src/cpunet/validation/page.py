@@ -138,12 +138,12 @@ def verdicts_html(verdicts: Mapping[str, Any]) -> Markup:
         return Markup()
     rows = [
         [
-            *(peak, label(method), called(quantity), found["numbers"]),
-            *(number(found["p"]), found["words"]),
+            *(peak, label(method), called(quantity), result["numbers"]),
+            *(number(result["p"]), result["words"]),
         ]
         for peak, methods in verdicts.get("table", {}).items()
         for method, quantities in methods.items()
-        for quantity, found in quantities.items()
+        for quantity, result in quantities.items()
     ]
     head = ["Peak", "Method", "Quantity", "Difference", "p", "Verdict"]
     table = part("table", head, rows, {0, 1, 2, 5})
@@ -172,17 +172,20 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
         head = ["Distinguished from data by a classifier", "AUC", "Null AUC"]
         pairs = (("auc", "auc_std"), ("null_mean", "null_std"))
         rows = [
-            [label(method), NO_VALUE, found["missing"]]
-            if "missing" in found
-            else [label(method), *(with_std(found[one], found[std]) for one, std in pairs)]
-            for method, found in tested.items()
+            [label(method), NO_VALUE, result["missing"]]
+            if "missing" in result
+            else [
+                label(method),
+                *(with_std(result[fit], result[std]) for fit, std in pairs),
+            ]
+            for method, result in tested.items()
         ]
         tables.append(part("table", head, rows))
     if paired := scores.get("paired", {}):
         head = ["Against the true shapes [10⁻³ of the height]", "RMSE", "RMSE of the edge"]
         rows = [
-            [label(method), _thousandths(found["rmse"]), _thousandths(found["edge_rmse"])]
-            for method, found in paired.items()
+            [label(method), _thousandths(result["rmse"]), _thousandths(result["edge_rmse"])]
+            for method, result in paired.items()
         ]
         tables.append(part("table", head, rows))
     return joined([*parts, part("grid", "beside", tables)])
@@ -195,15 +198,15 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
     if "missing" in survival:
         return part("p", f"Not scored: {survival['missing']}.")
     rows = []
-    for peak, found in survival.items():
+    for peak, result in survival.items():
         title = peak
-        for method in found.get("survival", {}):
-            kept, apart = (
-                _percent(found[key].get(method), found[f"{key}_std"].get(method))
+        for method in result.get("survival", {}):
+            share, off = (
+                _percent(result[key].get(method), result[f"{key}_std"].get(method))
                 for key in ("survival", "difference")
             )
-            sigma = _sigma(found["sigma"].get(method))
-            rows.append([title, label(method), kept, apart, sigma])
+            sigma = _sigma(result["sigma"].get(method))
+            rows.append([title, label(method), share, off, sigma])
             title = ""
     head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
     return part("table", head, rows, {0, 1})
@@ -213,13 +216,13 @@ def ranges_table(ranges: Mapping[str, Any]) -> Markup:
     """Return the survival of A/E cuts by ranges of energy and method."""
     rows = [
         [
-            *(name, label(method), str(found.get("peak", NO_VALUE))),
-            _percent(found.get("survival"), found.get("survival_std")),
-            found.get("missing", ""),
+            *(name, label(method), str(result.get("peak", NO_VALUE))),
+            _percent(result.get("survival"), result.get("survival_std")),
+            result.get("missing", ""),
         ]
         for name, methods in ranges.items()
         if name != "missing"
-        for method, found in methods.items()
+        for method, result in methods.items()
     ]
     head = ["Range", "Method", "Pulses", "Survival [%]", ""]
     return part("table", head, rows, {0, 1, 4}) if rows else Markup()
@@ -228,24 +231,24 @@ def ranges_table(ranges: Mapping[str, Any]) -> Markup:
 def noise_table(peaks: Mapping[str, Any]) -> Markup:
     """Return the RMS of the noise before the pulse by peak and method."""
     rows = [
-        [peak, label(method), *(number(found.get(key)) for key in ("n", "samples")),
-         with_std(found.get("rms"), found.get("rms_std")),
-         *(number(found.get(key)) for key in ("rms_ratio", "sigma", "spectrum_sigma"))]
+        [peak, label(method), *(number(result.get(key)) for key in ("n", "samples")),
+         with_std(result.get("rms"), result.get("rms_std")),
+         *(number(result.get(key)) for key in ("rms_ratio", "sigma", "spectrum_sigma"))]
         for peak, scores in peaks.items()
-        for method, found in scores.get("noise", {}).items()
+        for method, result in scores.get("noise", {}).items()
         if method != "frequency_mhz"
     ]  # fmt: skip
     head = ["Peak", "Method", "Pulses", "Samples", "RMS [height]", "Over the data's", "In σ"]
     return part("table", [*head, "Spectrum in σ"], rows, {0, 1}) if rows else Markup()
 
 
-def ae_energy_html(found: Mapping[str, Any]) -> Markup:
+def ae_energy_html(result: Mapping[str, Any]) -> Markup:
     """Return a table of the lines."""
-    if "methods" not in found:
-        return part("gap", found["missing"]) if found else Markup()
+    if "methods" not in result:
+        return part("gap", result["missing"]) if result else Markup()
     rows = []
-    for method, one in found["methods"].items():
-        line, law = one["mean"], one["resolution"]
+    for method, fit in result["methods"].items():
+        line, law = fit["mean"], fit["resolution"]
         rows.append(
             [
                 label(method),
@@ -275,16 +278,16 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
         title = name.replace("_", " ").capitalize() + (f" [{unit}]" if unit else "")
         for method, distance in values["wasserstein"].items():
             moved = with_std(distance, values["wasserstein_std"][method])
-            apart = with_std(values["ks"][method], values["ks_std"][method])
+            off = with_std(values["ks"][method], values["ks_std"][method])
             score = _percent(iou[method], error[method])
-            rows.append([title, label(method), score, moved, apart])
+            rows.append([title, label(method), score, moved, off])
             title = ""
         ceiling = _percent(iou["ceiling"], error["ceiling"])
-        moved, apart = (
+        moved, off = (
             with_std(values[f"{kind}_null"], values[f"{kind}_null_std"])
             for kind in ("wasserstein", "ks")
         )
-        rows.append([title, "Data vs data", ceiling, moved, apart])
+        rows.append([title, "Data vs data", ceiling, moved, off])
     head = ["Parameter", "Method", "IoU [%]", "W₁ [unit of the parameter]", "KS"]
     return part("table", head, rows, {0, 1})
 

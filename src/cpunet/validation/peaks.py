@@ -66,17 +66,19 @@ class PeakSets:
     def known_to_all(self) -> Rows:
         """Rows of the simulated events that all methods have without noise."""
         rows = self.rows["raw"]
-        return rows[self.translations.known[rows]]
+        return rows[self.translations.comparable[rows]]
 
     def paired_scores(self) -> dict[str, PairedScores] | None:
         """Paired scores by method; None if the truth is unknown."""
         rows, squares = self.known_to_all(), self.translations.squares
-        return {name: scores_of_squares(one[rows]) for name, one in squares.items()} or None
+        return {
+            name: scores_of_squares(of_scores[rows]) for name, of_scores in squares.items()
+        } or None
 
     def not_prepared(self) -> dict[str, int]:
         """Number of translated pulses that cannot be prepared like data, by method."""
         raw, whole = self.rows["raw"], self.translations.whole
-        counts = {m: int((~kept[raw]).sum()) for m, kept in whole.items() if m != "data"}
+        counts = {m: int((~usable[raw]).sum()) for m, usable in whole.items() if m != "data"}
         return {name: count for name, count in counts.items() if count}
 
     def missing(self) -> str | None:
@@ -206,8 +208,8 @@ def _normalised(
     The last axis is the error of both scales.  Parameters of the fit move A/E of both peaks;
     what is left of that is far less than the error of the scales.
     """
-    one, other = (scales[m][1] / scales[m][0] for m in ("data", method))
-    error = np.hypot(one, other)
+    of_scores, other = (scales[m][1] / scales[m][0] for m in ("data", method))
+    error = np.hypot(of_scores, other)
     return np.stack([values * (1 + error), values * (1 - error)])[np.newaxis]
 
 

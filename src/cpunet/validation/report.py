@@ -87,7 +87,7 @@ class Report:
 
     @classmethod
     def load(cls, folder: str | Path) -> Report:
-        """Open the folder of a report; its figures are the SVG files beside it.
+        """Open the folder of a report; its figures are the SVG files in it.
 
         Raises
         ------
@@ -132,9 +132,13 @@ class Report:
         return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
-        peaks = {name: name for name, one in self.metrics["peaks"].items() if one["parameters"]}
-        found: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
-        return found
+        peaks = {
+            name: name
+            for name, of_name in self.metrics["peaks"].items()
+            if of_name["parameters"]
+        }
+        selected: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
+        return selected
 
     def to_dict(self) -> Metrics:
         """A copy of the content of ``metrics.json``."""
@@ -328,9 +332,11 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:
 def as_stored(results: Any) -> Any:
     """Results ready for JSON, see `plain`, without the fields of objects that are None."""
     if is_dataclass(results):
-        results = {name: one for name, one in vars(results).items() if one is not None}
+        results = {
+            name: of_name for name, of_name in vars(results).items() if of_name is not None
+        }
     if isinstance(results, Mapping):
-        return {name: as_stored(one) for name, one in results.items()}
+        return {name: as_stored(of_name) for name, of_name in results.items()}
     return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
 
 

@@ -4,7 +4,7 @@ Only matplotlib's object-oriented interface is used.  Without global state, figu
 made in worker processes and notebooks alike.  The caller saves them.
 
 It is unknown which simulated and which measured pulses come from the same position.  A
-simulated pulse is therefore shown beside the measured one nearest to its translation.
+simulated pulse is therefore shown with the measured pulse nearest to its translation.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cpunet.validation.slices import BEFORE_NS, MeanPulse
 from cpunet.validation.verdicts import QUANTITIES, judged_parameters, methods_of
 
 AVERAGES = 50  # a moving average is over this fraction of the records
-OUTSIDE = 0.01  # share of events outside the range from which it is told
+OUTSIDE = 0.01  # share of events outside the range from which it is stated
 SIGMAS, PERCENT = 8.0, 3.0  # range of differences in standard errors, and of full charge
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
@@ -78,9 +78,9 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     for (part, name), kind in zip(drawn, kinds, strict=True):
         axes = grid[shown.index(kind)]
         # critics are not updated, and cycles not visited, in every iteration
-        there = [record for record in records if name in record.get(part, ())]
-        at = [record["iteration"] for record in there]
-        series = [record[part][name] for record in there]
+        present = [record for record in records if name in record.get(part, ())]
+        at = [record["iteration"] for record in present]
+        series = [record[part][name] for record in present]
         width = max(1, len(series) // AVERAGES)
         average = np.convolve(series, np.full(width, 1 / width), mode="valid")
         style = "--" if name.endswith("unseen") else "-"
@@ -302,11 +302,13 @@ def shape_figure(
                 mean = mean * (data.mean[-1] / mean[-1])
             line(above, time_ns, mean, method, label(method))
             if method != "data":
-                apart = mean - data.mean
-                error = np.full(len(apart), 0.01)
+                offset = mean - data.mean
+                error = np.full(len(offset), 0.01)
                 if data.n > 1:
                     error = np.hypot(pulse.error, data.error)
-                pull = np.divide(apart, error, out=np.full_like(apart, np.nan), where=error > 0)
+                pull = np.divide(
+                    offset, error, out=np.full_like(offset, np.nan), where=error > 0
+                )
                 line(below, time_ns, pull, method)
         most = max((pulse.n for method, pulse in pulses.items() if method != "data"), default=0)
         counts = f"{data.n} measured, {most} simulated pulses"
@@ -318,7 +320,7 @@ def shape_figure(
         if data.n > 1:
             sigma_panel(below)
             below.label_outer()
-        else:  # of a pulse alone no error is known
+        else:  # a pulse alone has no error
             below.set(ylabel="Method − data\n[% of full charge]", ylim=(-PERCENT, PERCENT))
     grid[0, 0].set_ylabel("Normalised charge")
     legend_above(figure, grid[0, 0], per_line, title)
@@ -352,11 +354,11 @@ def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
     >>> nearest(aligned, aligned[1])[0]
     1
     """
-    apart = np.square(aligned - target.astype(float))
-    known = np.isfinite(apart)
-    mean = np.where(known, apart, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    offset = np.square(aligned - target.astype(float))
+    is_finite = np.isfinite(offset)
+    mean = np.where(is_finite, offset, 0).sum(axis=1) / np.maximum(is_finite.sum(axis=1), 1)
     enough = np.isfinite(aligned).sum(axis=1) >= 0.5 * np.isfinite(target).sum()
-    squares = np.where(enough & known.any(axis=1), mean, np.inf)
+    squares = np.where(enough & is_finite.any(axis=1), mean, np.inf)
     row = int(squares.argmin())
     return row, float(np.sqrt(squares[row]))
 

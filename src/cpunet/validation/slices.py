@@ -2,7 +2,7 @@
 
 Pulses of one slice come from the same regions of the detector and differ by their sites
 and by noise.  Their mean, aligned at half maximum, is the slice's mean pulse.  Its standard
-error is known, so a difference between simulation and data can be distinguished from chance.
+error is determined, so a difference of simulation and data can be distinguished from chance.
 
 Pulses are ordered by their rise time from 1 to 90 % (``rise_01_90``), which starts with the
 pulse and ends while it still rises.  The paper's drift time ends at the maximum, which on a
@@ -136,5 +136,5 @@ def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
     """
     inside = (rise_time >= edges[0]) & (rise_time <= edges[-1])  # not those that are NaN
     place = np.searchsorted(edges[1:-1], rise_time, side="right")
-    found = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
-    return Slices(MeanPulse.of(aligned), found, edges)
+    means = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
+    return Slices(MeanPulse.of(aligned), means, edges)

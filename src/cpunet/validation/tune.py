@@ -187,14 +187,14 @@ def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
             f"recipe {recipe.name}: has no search space; add one, as "
             "search: {training.noise_sets: {choices: [2, 4, 8]}}"
         )
-    known = dict(flat(recipe.model_dump(mode="json")))
+    settings_by_name = dict(flat(recipe.model_dump(mode="json")))
     for key, config in recipe.search.items():
         if key.split(".")[0] not in TUNED:
             raise CpunetError(
                 f"recipe {recipe.name}: search.{key}: only settings of {', '.join(TUNED)} "
                 "can be tuned"
             )
-        if key not in known:
+        if key not in settings_by_name:
             raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
         for value in config.choices or (config.low, config.high):
             try:

@@ -54,7 +54,7 @@ def validate(
     out
         Report folder to make; without one, nothing is written.
     truth
-        Noise-free responses of the simulated pulses (.npz), if they are known.
+        Noise-free responses of the simulated pulses (.npz), if given.
     baselines
         Fit the baseline methods too, which takes most of the time.
     peak
@@ -114,13 +114,13 @@ def _report(run: Run, pair: Pair, how: Mapping[str, Any]) -> Report:
     # imported late: not needed for the help of the command
     from cpunet.validation.evaluation import evaluate
 
-    found = evaluate(run, *pair, **how)
+    evaluation = evaluate(run, *pair, **how)
 
     # nor is matplotlib while the pulses take most memory
     from cpunet.validation.drawings import drawings
 
-    notes = _notes(run, found.metrics, how["truth"])
-    return Report(found.metrics, found.values, None, drawings(found), notes)
+    notes = _notes(run, evaluation.metrics, how["truth"])
+    return Report(evaluation.metrics, evaluation.values, None, drawings(evaluation), notes)
 
 
 def _of_channels(

@@ -124,25 +124,25 @@ def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdi
         for peaks other than that which defines the cut.  ``noise``: its RMS against that of
         the data; ``noise_spectrum``: the worst frequency band.
     """
-    found: dict[str, Verdict] = {}
+    judgements: dict[str, Verdict] = {}
     scores = part(metrics, "peaks", peak)
-    for name, one in judged_parameters(scores).items():
-        p = number(one, "p", method)
-        found[name] = Verdict(p, shifted(name, one, method), "too few pulses")
+    for name, score_of in judged_parameters(scores).items():
+        p = number(score_of, "p", method)
+        judgements[name] = Verdict(p, shifted(name, score_of, method), "too few pulses")
     if tested := part(scores, "two_sample", method):
         auc, mean, std = (number(tested, key) for key in ("auc", "null_mean", "null_std"))
         p = None
         if auc is not None and mean is not None and std:
-            apart = (auc - mean) / (std * math.sqrt(1 + 1 / SHUFFLES))
-            p = float(student.sf(apart, SHUFFLES - 1))
+            distance = (auc - mean) / (std * math.sqrt(1 + 1 / SHUFFLES))
+            p = float(student.sf(distance, SHUFFLES - 1))
         numbers = f"AUC {with_std(auc, std)}, {number_text(mean)} expected"
-        found[_AUC] = Verdict(p, numbers, tested.get("missing", "no value"))
+        judgements[_AUC] = Verdict(p, numbers, tested.get("missing", "no value"))
     survival = part(metrics, "ae_survival", peak)
     if "difference" in survival:
         off, std = (number(survival, k, method) for k in ("difference", "difference_std"))
         reason = "too few events of the double-escape peak, or none of this one"
         numbers = f"{signed(off, std)} points" if std else ""
-        found[_SURVIVAL] = Verdict(two_sided(off, std), numbers, reason)
+        judgements[_SURVIVAL] = Verdict(two_sided(off, std), numbers, reason)
     own, data = part(scores, "noise", method), part(scores, "noise", "data")
     if own:
         errors = number(own, "rms_std"), number(data, "rms_std")
@@ -153,23 +153,23 @@ def method_verdicts(metrics: Metrics, peak: str, method: str) -> dict[str, Verdi
             spread = math.hypot(*filter(None, errors))
             p = two_sided((rms[0] or 0.0) - rms[1], spread)
             size = f"RMS {with_std((rms[0] or 0.0) / rms[1], spread / rms[1])} of the data's"
-        found[_NOISE] = Verdict(p, size, reason)
+        judgements[_NOISE] = Verdict(p, size, reason)
         if (worst := number(own, "spectrum_sigma")) is not None:
             numbers = "worst band of the spectrum"
-            found[_SPECTRUM] = Verdict(float(norm.sf(worst)), numbers)
-    return found
+            judgements[_SPECTRUM] = Verdict(float(norm.sf(worst)), numbers)
+    return judgements
 
 
 def judged_parameters(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Comparisons of the paper's parameters, and of those of LEGEND that the table has."""
-    known = {**part(scores, "parameters"), **part(scores, "further")}
-    return {name: known[name] for name in (*PARAMETERS, *MAIN) if name in known}
+    available = {**part(scores, "parameters"), **part(scores, "further")}
+    return {name: available[name] for name in (*PARAMETERS, *MAIN) if name in available}
 
 
 def held_out(metrics: Metrics) -> list[str]:
     """Scored peaks that took no part in the training; all scored ones if there are none."""
     peaks = part(metrics, "peaks")
-    scored = [peak for peak, one in peaks.items() if part(one, "parameters")]
+    scored = [peak for peak, score_of in peaks.items() if part(score_of, "parameters")]
     trained = str(part(metrics, "training").get("peak")).split(",")
     return [peak for peak in scored if peak not in trained] or scored
 
@@ -210,14 +210,14 @@ def main_table(metrics: Metrics, peaks: Sequence[str]) -> tuple[list[str], list[
             if name not in verdicts or (p := verdicts[name].p) is None:
                 continue
             unit = "%" if name == _SURVIVAL else LABELLED[name].unit if name in judged else ""
-            own, one = QUANTITIES[name], judged.get(name, {})
+            own, score_of = QUANTITIES[name], judged.get(name, {})
             overlap = [
-                with_std(*(number(one, key, m) for key in ("iou", "iou_std")))
+                with_std(*(number(score_of, key, m) for key in ("iou", "iou_std")))
                 for m in ("ren", "ceiling")
             ]
             rows.append([
                 *(peak, f"{own} [{unit}]" if unit else own),
-                _of_data(metrics, peak, name, one),
+                _of_data(metrics, peak, name, score_of),
                 signed(*_difference(metrics, peak, name, "ren")),
                 f"{p:.2g}" if p > SMALLEST else f"< {SMALLEST:g}",
                 *(signed(*_difference(metrics, peak, name, m)) for m in rivals),
@@ -235,15 +235,15 @@ def _difference(
         row = part(metrics, "ae_survival", peak)
         return number(row, "difference", method), number(row, "difference_std", method)
     if name == _AUC:
-        found = part(scores, "two_sample", method)
-        auc, null = number(found, "auc"), number(found, "null_mean")
-        known = None if auc is None or null is None else auc - null
-        return known, None if known is None else number(found, "null_std")
-    one = judged_parameters(scores).get(name, {})
-    return number(one, "shift", method), number(one, "shift_std", method)
+        judgements = part(scores, "two_sample", method)
+        auc, null = number(judgements, "auc"), number(judgements, "null_mean")
+        available = None if auc is None or null is None else auc - null
+        return available, None if available is None else number(judgements, "null_std")
+    score_of = judged_parameters(scores).get(name, {})
+    return number(score_of, "shift", method), number(score_of, "shift_std", method)
 
 
-def _of_data(metrics: Metrics, peak: str, name: str, one: Mapping[str, Any]) -> str:
+def _of_data(metrics: Metrics, peak: str, name: str, score_of: Mapping[str, Any]) -> str:
     """What the data have: mean of a parameter, AUC of shuffled labels, survival."""
     if name == _AUC:
         null = part(metrics, "peaks", peak, "two_sample", "ren")
@@ -251,7 +251,7 @@ def _of_data(metrics: Metrics, peak: str, name: str, one: Mapping[str, Any]) -> 
     if name == _SURVIVAL:
         row = part(metrics, "ae_survival", peak)
         return with_std(*(number(row, key, "data") for key in ("survival", "survival_std")))
-    return number_text(number(one, "mean"), "#.4g")
+    return number_text(number(score_of, "mean"), "#.4g")
 
 
 def shifted(name: str, compared: Mapping[str, Any], method: str) -> str:
@@ -365,9 +365,9 @@ def _p(value: float) -> str:
 def judged_scores(metrics: Metrics, method: str) -> tuple[int, int]:
     """Number of scores of a method that are off, and number of scores with a verdict."""
     judged = [
-        found.agrees
+        judgements.agrees
         for peak in part(metrics, "peaks")
-        for found in method_verdicts(metrics, peak, method).values()
-        if found.agrees is not None
+        for judgements in method_verdicts(metrics, peak, method).values()
+        if judgements.agrees is not None
     ]
     return judged.count(False), len(judged)

@@ -192,8 +192,8 @@ def simulate_block(
 ) -> tuple[int, int, int]:
     """Simulate until the primaries, the space for hits or the missing events run out.
 
-    An event is kept if it lies in a window that still misses events, or always if there are
-    no windows. Returns the numbers of primaries done, of events kept, and of events left out
+    An event counts if it lies in a window that still misses events, or always if there are
+    no windows. Returns the numbers of primaries done, of events chosen, and of events left out
     because they have more than `MAX_HITS` deposits.
     """
     photons, counts = np.empty((MAX_PHOTONS, 7)), np.zeros(3, np.int64)
@@ -279,7 +279,7 @@ def simulate_gammas(
     seed
         Seed of the random generator. The same seed gives the same events.
     wanted
-        Number of events requested in each energy window. Only events in a window are kept,
+        Number of events requested in each energy window. Only events in a window count,
         until each has its number.
     energy_kev
         Energy of the gammas, 50 to 2700 keV.
@@ -289,7 +289,7 @@ def simulate_gammas(
     Hits
         Events with a deposit. ``event_number`` is the number of the primary.
     int
-        Number of gammas in the cone, including those of events that were not kept.
+        Number of gammas in the cone, including those of events that were not chosen.
 
     Raises
     ------
@@ -321,13 +321,13 @@ def simulate_gammas(
     blocks: list[Hits] = [Hits.of([], [], [0])]
     done = left_out = 0
     while done < n_primaries and not (wanted and missing.sum() == 0):
-        tried, kept, large = simulate_block(
+        tried, n_chosen, large = simulate_block(
             medium, source, n_primaries - done, windows, rng, hits, offsets, primaries
         )
-        ends = offsets[: kept + 1].copy()
+        ends = offsets[: n_chosen + 1].copy()
         deposits = hits[: ends[-1]]
         blocks.append(
-            Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, ends, primaries[:kept] + done)
+            Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, ends, primaries[:n_chosen] + done)
         )
         done, left_out = done + tried, left_out + large
     if left_out:
