@@ -73,7 +73,7 @@ MISTAKES = {
         "translate run folder --out out", r"folder: is a folder; give a file of pulses"
     ),
     "file for a folder": Mistake(
-        "translate sim.lh5 sim.lh5 --out out", r"sim.lh5: no finished run .*; make one with .*"
+        "translate sim.lh5 sim.lh5 --out out", r"sim.lh5: no finished run .*; make it with .*"
     ),
     "wrong table": Mistake(f"{TRAIN} --data-table geds/no", r"data.lh5: .*geds/no.*; .*"),
     "which table": Mistake(
@@ -168,7 +168,7 @@ MISTAKES = {
     # runs and reports
     "half a run": Mistake("translate halfrun sim.lh5 --out out", r"halfrun.*; .*"),
     "a report for a run": Mistake(
-        "translate report sim.lh5 --out out", r"report: no finished run .*; make one with .*"
+        "translate report sim.lh5 --out out", r"report: no finished run .*; make it with .*"
     ),
     "damaged scores": Mistake("compare report report2", r"report2/metrics.json: .*; .*"),
     # settings

@@ -63,7 +63,7 @@ def test_a_signal_stops_between_two_iterations(
     assert stopped.out == ""
     told = stopped.err.splitlines()
     assert "stopping after this iteration; once more to stop at once" in told
-    assert "stopped after 3 of 4 iterations; resume goes on from there" in told
+    assert "stopped after 3 of 4 iterations; resume goes on from it" in told
     assert told[-1].startswith("error: interrupted")
     assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
     assert command(*words, "--resume").code == 0
