@@ -49,6 +49,7 @@ def layer(poles: tuple[float, ...]) -> ElectronicsResponse:
     )
     response = ElectronicsResponse(config, DT_NS)
     response.slow_weights[1] = 0.065
+    response.sharpness[:] = 0  # the exact chain gives means over a period
     response.decay_weights[0] = 0.04
     return response
 
@@ -79,6 +80,22 @@ def test_finely_simulated_pulses_come_out_as_from_the_exact_chain(poles, width_n
     np.testing.assert_allclose(got, wanted, atol=5e-4)
     top = slice(PADDING_BEFORE + 400, PADDING_BEFORE + 700)
     np.testing.assert_allclose(got[:, top], wanted[:, top], atol=2e-4)
+
+
+def test_at_a_sharpness_of_one_samples_are_points():
+    """Those of the exact chain at the middle of each period, up to 1 ns."""
+    pulses, chain = fine_pulses(20), layer((55.0, 35.0))
+    exact = electronics((55.0, 35.0)).model_copy(update={"dt_ns": 1.0, "length": 16 * 800})
+    fine = linear_response(pulses, exact)
+    middle = FINE_PER_SAMPLE // 2
+    points = 0.5 * (fine[:, middle - 1 :: 16] + fine[:, middle::16])
+    inside = slice(PADDING_BEFORE, PADDING_BEFORE + 600)
+    deviations = []
+    for sharpness in (0, 1):
+        chain.sharpness[:] = sharpness
+        records = chain(windows(pulses))[:, inside]
+        deviations.append(np.abs(records - points[:, inside]).max())
+    assert deviations[1] < 0.2 * deviations[0]
 
 
 def test_a_step_is_that_of_the_exact_chain_averaged_over_the_period():

@@ -340,7 +340,7 @@ def numbers(response: ElectronicsResponse) -> dict[str, float]:
 
 
 def test_what_is_known_together_has_a_small_error() -> None:
-    covariance = np.diag([0.04, 0.04, 1.0, 1.0])
+    covariance = np.diag([0.04, 0.04, 1.0, 1.0, 1.0])
     covariance[0, 1] = covariance[1, 0] = -0.0399
     found = propagated(RESPONSE, covariance.tolist(), numbers)
     assert found["sum"] == pytest.approx(np.sqrt(2e-4))
@@ -354,11 +354,11 @@ def test_a_number_that_is_not_always_defined_has_no_error() -> None:
         found = numbers(response)
         return found if response.slow_weights.item() > -0.1 else {"sum": found["sum"]}
 
-    found = propagated(RESPONSE, np.diag([0.04, 0.04, 1.0, 1.0]).tolist(), partly)
+    found = propagated(RESPONSE, np.diag([0.04, 0.04, 1.0, 1.0, 1.0]).tolist(), partly)
     assert list(found) == ["sum"]
 
 
-@pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((4, 4), np.nan).tolist()])
+@pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((5, 5), np.nan).tolist()])
 def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]]) -> None:
     assert propagated(RESPONSE, covariance, numbers) == {}
 

@@ -27,17 +27,17 @@ def test_coordinates_are_those_of_the_poles_and_back() -> None:
     place, vector = smooth.vector(), plain.vector()
     np.testing.assert_allclose(place[0], np.log(2400) / 2)
     np.testing.assert_allclose(place[1], (np.log(1.5) / 2) ** 2)
-    smooth.set(place + np.array([0, -1, 0, 0]))  # below 0 there are no real poles
+    smooth.set(place - np.eye(len(place))[1])  # below 0 there are no real poles
     np.testing.assert_allclose(np.exp(made.log_poles_ns), 2400**0.5)
     smooth.set(place)
     np.testing.assert_allclose(np.exp(made.log_poles_ns), [60, 40])
     # derivatives of the coordinates with the parameters
     slopes = []
-    for i in range(4):
-        plain.set(vector + 1e-6 * np.eye(4)[i])
+    for step in 1e-6 * np.eye(len(vector)):
+        plain.set(vector + step)
         slopes.append((smooth.vector() - place) / 1e-6)
     plain.set(vector)
-    known = np.diag([1e4, 1e6, 1e4, 1e6])
+    known = np.diag([1e4, 1e6, 1e4, 1e6, 1e2])
     by_parameters = np.array(slopes) @ known @ np.transpose(slopes)
     covariance = np.linalg.inv(by_parameters + np.diag(plain.widths**-2.0))
     np.testing.assert_allclose(smooth.covariance(known), covariance, rtol=1e-4, atol=1e-9)

@@ -126,6 +126,7 @@ def test_what_a_fit_tells(near: Told) -> None:
     assert chi_square[-1] == pytest.approx(near.fit.chi_square)
     assert chi_square[-1] < 1.1 * near.fit.moments
     labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}
+    labels |= {"sharpness.1"}
     assert set(near.fit.errors) == labels
     # those of the mean pulse are as standard deviations: a few are 2, hardly one is 4
     pulls = np.abs(list(near.fit.pulls.values()))

@@ -138,6 +138,7 @@ STEP_NS = 12_800.0  # of the response to a step whose half rise is the delay
 DEVIATION_NS = -100.0, 8400.0  # in which a step response deviates from its chain
 LATE_NS, MIN_LEFT = (4000.0, 6400.0), 0.01  # whose decay goes on later, and least part left
 DRAWS = 64  # of deviations within their errors
+SHARPNESS = 0.5  # to begin with, between means over a period (0) and points (1)
 IMAGES = 3  # images of the spectrum on either side
 
 
@@ -208,6 +209,7 @@ class ElectronicsResponse(Stored):
         self.slow_ns = np.array(config.slow_ns, float)
         self.fast_decays_us = np.array(config.fast_decays_us, float)
         self.slow_weights = np.zeros(len(self.slow_ns))
+        self.sharpness = np.array([SHARPNESS])
         self.decay_weights = np.zeros(len(self.fast_decays_us))
         self.drift = DriftClock(config.drift_terms) if config.drift_terms else None
         self.by_height = ByHeight() if config.by_height else None
@@ -257,12 +259,14 @@ class ElectronicsResponse(Stored):
         return windows if self.drift is None else self.drift(windows, dt_ns=float(self.dt_ns))
 
     def transfer(self, padded: int) -> npt.NDArray[np.complex128]:
-        """Response to a step of charge at sample 0, as a spectrum of `padded` samples.
+        r"""Response to a step of charge at sample 0, as a spectrum of `padded` samples.
 
-        The samples of a pulse are means over the sampling period, and so are those of the
-        signal.  Between samples, the collected charge is interpolated by a cubic spline, which
-        causes images of the spectrum above half the sampling rate; the part of them that passes
-        the electronics is aliased back.
+        The samples of a pulse are means over the sampling period :math:`T`, and so are those of
+        the signal at a sharpness :math:`\kappa` of 0.  At 1 they are points, as a digitiser
+        takes them: :math:`1 + \kappa (\omega T)^2 / 24` undoes the mean.  Between samples, the
+        collected charge is interpolated by a cubic spline, which causes images of the spectrum
+        above half the sampling rate; the part of them that passes the electronics is aliased
+        back.
         """
         dt_ns = float(self.dt_ns)
         frequency = np.fft.rfftfreq(padded)
@@ -271,6 +275,7 @@ class ElectronicsResponse(Stored):
             float
         )  # (images, frequencies), in units of 1/period
         passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
+        passed = passed * (1 + self.sharpness / 24 * (2 * math.pi * everywhere) ** 2)
         fast = (_spline(everywhere) * passed).sum(axis=0)
         n_after = math.ceil(padded / MIN_FACTOR) - padding(dt_ns)[0]
         decays = self.decay(1e-3 * dt_ns * np.arange(n_after, dtype=float))
@@ -335,6 +340,7 @@ class ElectronicsResponse(Stored):
         for i, (tau, weight) in enumerate(slow, 1):
             values[f"slow_{tau:g}_ns"] = f"slow_weights.{i}", weight
         values["decay_us"] = "log_decay_us.1", float(np.exp(self.log_decay_us[0]))
+        values["sharpness"] = "sharpness.1", float(self.sharpness[0])
         fast = zip(self.fast_decays_us.tolist(), self.decay_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(fast, 1):
             values[f"decay_{tau:g}_us"] = f"decay_weights.{i}", weight

@@ -36,7 +36,7 @@ from cpunet.training.verdict import FitInfo
 # fixed: a true part between two of them is split, which the errors do not contain.
 PARTS = re.compile(r"slow_|decay_|fast_decay_")
 # The parts of a chain that deviates are not what its step response consists of.
-HIDDEN = ("slow_", "pole_", "decay_", "ringing")
+HIDDEN = ("slow_", "pole_", "decay_", "ringing", "sharpness")
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over a prompt charge
 
 

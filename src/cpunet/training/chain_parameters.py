@@ -21,7 +21,7 @@ TIME_WIDTH = 1.0
 # The same for the stretch of the drift, and for its change per us.
 STRETCH, STRETCH_WIDTHS = "drift.stretch", (0.1, 0.05)
 # The same of what is no time: half of the charge may be slow, and the main decay dominates.
-SCALES = {DECAY_WEIGHTS: 0.03, "slow_weights": 0.1}
+SCALES = {DECAY_WEIGHTS: 0.03, "slow_weights": 0.1, "sharpness": 0.5}
 # Step of differences in widths of the priors, for what is computed in double precision.
 STEP = 1e-5
 

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import scipy.fft
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
@@ -28,9 +29,10 @@ from cpunet.networks.response_layer import (
     MIN_LEFT,
     ElectronicsResponse,
     deviation_lags,
+    padded_length,
 )
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.training.chain_parameters import SmoothParameters
+from cpunet.training.chain_parameters import SmoothParameters, with_settings
 
 Numbers = dict[str, float]
 
@@ -240,7 +242,12 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
         return Chain(name, whole, undecayed)
     # a sample is the mean over its period
     time_ns = np.asarray(deviation_lags(dt_ns := float(response.dt_ns)) + 0.5) * dt_ns
-    deviating = WithDeviation(whole, time_ns, response.deviation)
+    without = with_settings(response, deviations=False)
+    without.sharpness[:] = 0
+    padded = padded_length(2 * len(time_ns))
+    both = (scipy.fft.irfft(of.transfer(padded), padded) for of in (response, without))
+    deviation = np.subtract(*both)[deviation_lags(dt_ns)]
+    deviating = WithDeviation(whole, time_ns, deviation)
     draws = CubicSpline(time_ns, response.deviation_draws.T)
     return Chain(name, deviating, PoleZeroed(deviating), draws=draws)
 

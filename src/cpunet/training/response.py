@@ -53,6 +53,7 @@ ROWS = {
     r"missing_(.*)_ns": (r"not yet collected after \1 ns", "%"),
     r"overshoot": ("overshoot", "%"),
     r"decay_us": ("main decay", "µs"),
+    r"sharpness": ("samples: 0 means, 1 points", ""),
     r"fast_decay_(\d)_us": (r"fast decay \1", "µs"),
     r"fast_decay_(\d)_share": (r"share of fast decay \1", "%"),
     r"effective_decay_us": ("effective decay, tail", "µs"),
