@@ -39,7 +39,7 @@ from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
-    from iminuit import Minuit
+    from scipy.optimize import OptimizeResult
 
 # After this many decay times the tail is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
@@ -211,7 +211,6 @@ OUTLIERS = 2e-3  # fraction of traces that the law need not explain
 WORTH = 5.0
 # Maximum fraction of the noise in its wings, and minimum number of traces to determine them.
 MAX_WINGS, MIN_BELOW = 0.5, 100
-WIDTHS = 1.5, 20.0  # range of the width of the wings
 # Mean and width of the priors on the logarithms of the median energy and of the spectral width.
 MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
 
@@ -276,8 +275,10 @@ def fit_rate(
         recorded, of_recorded = likelihood.best(own)
         if gain <= of_recorded + WORTH:
             fixed, vector, gain = own, recorded, of_recorded
+    curvature = _curvature(lambda v: -likelihood.value(v, fixed), vector, likelihood.sigma)
+    variance = float(np.linalg.pinv(curvature, hermitian=True)[0, 0])
     expected = float(np.exp(vector[0]))
-    error = expected * likelihood.rate_error(vector, fixed)
+    error = expected * float(np.sqrt(max(variance, 0.0)))
     energies = _quantiles(likelihood.energies, likelihood.weights(vector, fixed))
     return RateFit(
         law=TailsLaw(1e3 * expected / decay_us, decay_us, energies),
@@ -302,7 +303,6 @@ class _Likelihood:
         self.first = self.points // 4
         self.grid = (np.arange(self.points) - self.first) * self.step
         self.wings, self.widths = _wings(kev, sigma_kev)
-        self.steps = (0.1, 0.2 * sigma_kev, 0.05, 0.1, 0.1)
         self.floor = OUTLIERS / max(float(np.ptp(kev)), self.step)
 
     def __call__(
@@ -351,28 +351,17 @@ class _Likelihood:
         if fixed is None:
             rest += [MEDIAN[0], WIDTH[0]]
         starts = ((start, *rest) for start in np.log([0.005, 0.1]))
-        fits = [
-            minimised(lambda v: -self.value(v, fixed), start, self.steps) for start in starts
-        ]
-        best = min(fits, key=lambda fit: fit.fval)
-        return np.array(best.values), -best.fval
-
-    def rate_error(self, vector: FloatArray, fixed: FloatArray | None) -> float:
-        """Relative standard error of the rate at a minimum; 0 without a curvature there."""
-        fit = minimised(lambda v: -self.value(v, fixed), vector, self.steps, descend=False)
-        return float(fit.errors[0]) if fit.fmin.has_posdef_covar else 0.0
+        fits = [_minimum(lambda v: -self.value(v, fixed), start) for start in starts]
+        best = min(fits, key=lambda fit: float(fit.fun))
+        return np.asarray(best.x, float), -float(best.fun)
 
     def without(self) -> float:
         """Maximum log-likelihood without any tails."""
         weights = np.zeros(len(self.energies))
         spread = max(float(self.kev.std()), self.sigma)
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
-        steps = self.steps[1:3]
-        fits = [
-            minimised(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), start, steps)
-            for start in starts
-        ]
-        return -min(float(fit.fval) for fit in fits)
+        fits = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
+        return -min(float(fit.fun) for fit in fits)
 
 
 def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
@@ -388,39 +377,44 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
     below = kev[kev < 0]
 
     def cost(vector: FloatArray) -> float:
-        log_sigma, share, width = vector
-        sigma = np.exp(log_sigma)
+        sigma = np.exp(vector[0])
+        share, width = MAX_WINGS / (1 + np.exp(-vector[1])), 1.5 + np.exp(vector[2])
         core, wide = below / sigma, below / (width * sigma)
         density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
         return -float(np.log(density / sigma + 1e-30).sum())
 
     if len(below) < MIN_BELOW:
         return 0.0, 1.0
-    start = np.log(sigma_kev)
-    alone = minimised(lambda v: cost(np.array([v[0], 0.0, 2.5])), (start,), (0.1,))
-    limits = (None, (0, MAX_WINGS), WIDTHS)
-    wide = minimised(cost, (start, 0.13, 2.5), (0.1, 0.05, 0.4), limits=limits)
-    return (0.0, 1.0) if wide.fval > alone.fval - WORTH else (wide.values[1], wide.values[2])
+    alone = _minimum(lambda v: cost(np.array([v[0], -50.0, 0.0])), (np.log(sigma_kev),))
+    wide_fit = _minimum(cost, (np.log(sigma_kev), -1.0, 0.0))
+    if float(wide_fit.fun) > float(alone.fun) - WORTH:
+        return 0.0, 1.0
+    _, share, width = wide_fit.x
+    return MAX_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
 
 
-def minimised(
-    cost: Function,
-    start: npt.ArrayLike,
-    steps: Sequence[float],
-    *,
-    limits: Sequence[tuple[float, float] | None] | None = None,
-    descend: bool = True,
-) -> Minuit:
-    """Minimum of a negative log-likelihood by MIGRAD, or its curvature where it stands."""
-    from iminuit import Minuit  # few channels come so far
+def _minimum(function: Function, start: Sequence[float]) -> OptimizeResult:
+    import scipy.optimize  # costs more than all the rest, and few channels come so far
 
-    begin = np.asarray(start, float)
-    fit = Minuit(cost, begin)
-    fit.errordef = Minuit.LIKELIHOOD
-    fit.errors = steps[: len(begin)]
-    if limits:
-        fit.limits = limits
-    return fit.migrad() if descend else fit.hesse()
+    steps = np.diag([0.5, *[0.4] * (len(start) - 1)])
+    simplex = np.asarray(start, float) + np.concatenate([np.zeros((1, len(start))), steps])
+    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2, "maxfev": 900}
+    return scipy.optimize.minimize(function, start, method="Nelder-Mead", options=options)
+
+
+def _curvature(function: Function, at: FloatArray, sigma_kev: float) -> FloatArray:
+    """Second derivatives by finite differences."""
+    steps = np.array([0.1, 0.2 * sigma_kev, 0.05, 0.1, 0.1])[: len(at)]
+    moves = np.diag(steps)
+    n = len(at)
+    curvature = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            corners = [function(at + a * moves[i] + b * moves[j]) for a, b in signs]
+            second = corners[0] - corners[1] - corners[2] + corners[3]
+            curvature[i, j] = curvature[j, i] = second / (4 * steps[i] * steps[j])
+    return curvature
 
 
 def _edges(energies: FloatArray) -> FloatArray:
