@@ -49,6 +49,8 @@ class Parameters:
         self.longest = self.widths.copy()
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
+        of_samples = [label == "sharpness" for label in self.labels]
+        self.low[of_samples], self.high[of_samples] = 0.0, 1.0  # from means to points
         self.stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
         self.widths[self.stretched] = STRETCH_WIDTHS[: len(self.stretched)]
 
