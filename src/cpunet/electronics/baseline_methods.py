@@ -60,8 +60,8 @@ def integrated(current: Values, tail_slope_per_ms: float, dt_ns: float) -> Value
     >>> charge.round(3).tolist()  # a decay time of 50 us
     [[0.0, 1.0, 0.368, 0.135]]
     """
-    decayed = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -decayed], current, axis=1), float)
+    remaining = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -remaining], current, axis=1), float)
 
 
 def respond(
@@ -142,9 +142,9 @@ def without_decay(
     >>> without_decay(decay[np.newaxis], -20.0, 16.0, 10)[0, [9, 10, 39]].round(6).tolist()
     [0.0, 1.0, 1.0]
     """
-    decayed = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
+    remaining = np.exp(tail_slope_per_ms * dt_ns * 1e-6)
     current = data.astype(float)
-    current[:, 1:] -= decayed * data[:, :-1]
+    current[:, 1:] -= remaining * data[:, :-1]
     steps = np.cumsum(current, axis=1)
     heights = steps[:, -tail_samples(data.shape[1], align) :].mean(axis=1, keepdims=True)
     return np.asarray(steps / heights, float)

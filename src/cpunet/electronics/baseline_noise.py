@@ -207,12 +207,12 @@ class BaselineNoise:
         return np.asarray(self._at(self.density[np.newaxis], length)[0], float)
 
     def _at(self, densities: Values, length: int) -> Values:
-        own_frequency = np.arange(densities.shape[1]) / self.samples
+        frequency = np.arange(densities.shape[1]) / self.samples
         wanted = np.arange(length // 2 + 1) / length
-        if len(wanted) == len(own_frequency):
+        if len(wanted) == len(frequency):
             return densities
         return np.asarray(
-            [np.interp(wanted, own_frequency, single) for single in densities], float
+            [np.interp(wanted, frequency, density) for density in densities], float
         )
 
     def _lines_at(self, length: int) -> Values:
@@ -272,11 +272,11 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     """
     import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
 
-    single = np.zeros(len(flat), np.intp)
+    alike = np.zeros(len(flat), np.intp)
     kinds = min(KINDS, len(flat) // MIN_BASELINES)
     bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
     if kinds < 2 or bins < BANDS:
-        return single
+        return alike
     rng = np.random.default_rng(0)
     own = _band_powers(flat)
     chance = _band_powers(mean.draw(np.ones(len(flat)), flat.shape[1], rng).astype(float))
@@ -285,7 +285,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     _, _, axes = np.linalg.svd(np.clip(own, -OUTLIER, OUTLIER), full_matrices=False)
     axes = axes[(own @ axes.T).std(axis=0) > DIFFERENT * (chance @ axes.T).std(axis=0)]
     if not len(axes):
-        return single
+        return alike
     points = np.clip(own @ axes.T, -OUTLIER, OUTLIER)
     # kmeans2 warns of an empty kind, which is harmless: it is left out below
     with warnings.catch_warnings(action="ignore"):
@@ -293,7 +293,7 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     # baselines of kinds with too few are assigned to the nearest kind with enough
     enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
     if not enough.any():
-        return single
+        return alike
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
 
 
@@ -309,8 +309,8 @@ def _band_powers(baselines: Values) -> Values:
 def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> Values:
     """Samples before the pulse in prepared units times keV, the same number for each trace."""
     energy_kev = baselines.first.energy_kev
-    own_frequency = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
-    rows = np.flatnonzero(own_frequency[baselines.prepared.index])
+    usable = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
+    rows = np.flatnonzero(usable[baselines.prepared.index])
     if len(rows) < MIN_BASELINES:
         raise CpunetError(
             f"only {len(rows)} of {len(baselines)} traces have a known energy and can be "
@@ -450,9 +450,9 @@ def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
     """
     samples, length = 2 * (len(lines) - 1), len(drift)
     frequency = np.arange(len(lines)) / samples
-    own_frequency = np.arange(len(density)) / length
-    join = own_frequency[FIRST_CLEAN_BIN]
-    fast = np.interp(frequency, own_frequency[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
+    bins = np.arange(len(density)) / length
+    join = bins[FIRST_CLEAN_BIN]
+    fast = np.interp(frequency, bins[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
     corners = np.geomspace(2 / samples, join, CORNERS)[:, np.newaxis]
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
     slow = np.maximum(slow, 0)

@@ -217,9 +217,9 @@ class RCLate(BaselineMethod):
         how = (start, np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS]), scale)
         fitted = _fitted(sim, data, dt_ns, align, _rc_late, how, charge=True)
         (tau, share, late), slope = fitted
-        fitted_method = cls(dt_ns, tau, share, late, slope)
-        own = _own_decay(fitted_method, slope, sim[:GAUSS_PULSES], align)
-        return replace(fitted_method, tail_slope_per_ms=own)
+        method = cls(dt_ns, tau, share, late, slope)
+        own = _own_decay(method, slope, sim[:GAUSS_PULSES], align)
+        return replace(method, tail_slope_per_ms=own)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
@@ -272,8 +272,8 @@ def _fitted(
             parameters: Values, sliced: Spectrum = sliced, places: Groups = places
         ) -> Values:
             response = sliced * kernel(length, dt_ns, parameters)
-            residual = _mean_currents(response, places, length, edge) - wanted
-            return np.asarray(np.cumsum(residual, axis=1) if charge else residual).ravel()
+            off = _mean_currents(response, places, length, edge) - wanted
+            return np.asarray(np.cumsum(off, axis=1) if charge else off).ravel()
 
         best = scipy.optimize.least_squares(
             residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
@@ -351,9 +351,9 @@ class SuperpulseKernel(BaselineMethod):
                 spectra * _transfer(kernel, lead, length), length, axis=1
             )
             kernel = _kernel(wanted, _superpulses(spectra, response), length, dt_ns)
-        fitted_method = cls(dt_ns, kernel, slope)
-        own = _own_decay(fitted_method, slope, sim[:FREE_PULSES], align)
-        return replace(fitted_method, tail_slope_per_ms=own)
+        method = cls(dt_ns, kernel, slope)
+        own = _own_decay(method, slope, sim[:FREE_PULSES], align)
+        return replace(method, tail_slope_per_ms=own)
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
         """Apply the kernel and the decay, see `BaselineMethod.translate`."""
@@ -373,13 +373,11 @@ class SuperpulseKernel(BaselineMethod):
         }
 
 
-def _own_decay(
-    fitted_method: BaselineMethod, slope: float, sim: FloatArray, align: int
-) -> float:
+def _own_decay(method: BaselineMethod, slope: float, sim: FloatArray, align: int) -> float:
     """Slope of the decay (1/ms) without what a kernel's late part contributes to the tail."""
-    before = padding(fitted_method.dt_ns)[0]
-    windows = fitted_method.translate(sim)[:, before : before + sim.shape[1]]
-    return slope - (fitted_tail_slope(windows, fitted_method.dt_ns, align) - slope)
+    before = padding(method.dt_ns)[0]
+    windows = method.translate(sim)[:, before : before + sim.shape[1]]
+    return slope - (fitted_tail_slope(windows, method.dt_ns, align) - slope)
 
 
 def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:

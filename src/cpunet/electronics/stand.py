@@ -388,17 +388,17 @@ def _write_data(folder: Path, side: Side, seed: int, stand: Stand) -> None:
             columns["label"].append(label)
             for name in OF_DATA:
                 columns[name].append(getattr(traces, name))
-        stored: dict[str, Any] = {n: np.concatenate(values) for n, values in columns.items()}
-        flag = stored["flag"]
+        whole: dict[str, Any] = {n: np.concatenate(values) for n, values in columns.items()}
+        flag = whole["flag"]
         saturated = int((flag & SATURATED > 0).sum())
         if 2 * saturated > len(flag):
             raise CpunetError(
                 f"electronics {electronics.name}: {saturated} of {len(flag)} traces leave the "
                 "ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
             )
-    np.savez(folder / "data_labels.npz", **stored)
+    np.savez(folder / "data_labels.npz", **whole)
     stand.n_data = len(flag)
-    stand.data_lines = _by_line(stored["label"])
+    stand.data_lines = _by_line(whole["label"])
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
         stand.flags[name] = int((flag & bit > 0).sum())
 

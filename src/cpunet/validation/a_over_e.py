@@ -251,24 +251,24 @@ def peak_survival(
     width = sum(high - low for low, high in sidebands)
     scale = (peak[1] - peak[0]) / width if width else 0.0
     undefined = int((~finite & (in_peak | aside)).sum())
-    estimates = RangeSurvival(n, passing, n_side, side_pass, scale, undefined)
+    result = RangeSurvival(n, passing, n_side, side_pass, scale, undefined)
     span = f"from {peak[0]:g} to {peak[1]:g} keV"
     if not np.isfinite(cut):
         missing = "there is no cut: too few events of the double-escape peak"
-        return replace(estimates, missing=missing)
+        return replace(result, missing=missing)
     if not n:
-        return replace(estimates, missing=f"no events {span}")
+        return replace(result, missing=f"no events {span}")
     survival, std = sideband_survival(passing, n, side_pass, n_side, scale)
     if not np.isfinite(survival):
-        return replace(estimates, missing=f"the sidebands leave no events of {n} {span}")
+        return replace(result, missing=f"the sidebands leave no events of {n} {span}")
     if not scale or not std:
         std = 100 * survival_error(passing, n)
     if cut_std:
         ends = (cut - cut_std, cut + cut_std)
-        passed = [peak_survival(amplitude, energy_kev, end, peak, sidebands) for end in ends]
-        low, high = (row_of.survival or 0.0 for row_of in passed)
+        at_ends = [peak_survival(amplitude, energy_kev, end, peak, sidebands) for end in ends]
+        low, high = (moved.survival or 0.0 for moved in at_ends)
         std = float(np.hypot(std, 0.5 * (low - high)))
-    return replace(estimates, survival=survival, survival_std=std)
+    return replace(result, survival=survival, survival_std=std)
 
 
 def sideband_survival(
@@ -367,43 +367,43 @@ def subtracted(
     ranges
         Survival by range and method, see `peak_survival`.
     """
-    estimates = dict(table)
+    rows = dict(table)
     for name, methods in ranges.items():
-        passed = {
-            method: (row_of.survival, row_of.survival_std)
-            for method, row_of in methods.items()
-            if row_of.survival is not None and row_of.survival_std is not None
+        shares = {
+            method: (survival_of.survival, survival_of.survival_std)
+            for method, survival_of in methods.items()
+            if survival_of.survival is not None and survival_of.survival_std is not None
         }
-        if "data" not in passed:
+        if "data" not in shares:
             continue
         spread = None
         if name in table and (plain := table[name].difference_std) is not None:
             # the subtraction adds the sampling of events below the line
             own = table[name].survival_std or {}
-            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in passed.items()}
+            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in shares.items()}
             spread = {
                 m: float(np.sqrt(std**2 + more[m] + more["data"]))
                 for m, std in plain.items()
-                if m in passed
+                if m in shares
             }
         row = SurvivalRow(
-            {method: row_of.peak for method, row_of in methods.items()},
-            {method: row_of.undefined for method, row_of in methods.items()},
+            {method: survival_of.peak for method, survival_of in methods.items()},
+            {method: survival_of.undefined for method, survival_of in methods.items()},
         )
-        estimates[name] = _against_data(row, passed, spread)
-    return estimates
+        rows[name] = _against_data(row, shares, spread)
+    return rows
 
 
 def _of_fit(dep: Values, other: Values) -> float:
     """Error of a survival in percent from those of the fit, see `survival_table`."""
-    passed = np.zeros(dep.shape[:2])
-    for axis, end in np.ndindex(*passed.shape):
+    percent = np.zeros(dep.shape[:2])
+    for axis, end in np.ndindex(*percent.shape):
         single, some = (v[axis, end][np.isfinite(v[axis, end])] for v in (dep, other))
         if min(single.size, some.size) < MIN_EVENTS:
             return 0.0
         cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
-        passed[axis, end] = 100 * (some >= cut).mean()
-    return float(np.sqrt((0.25 * (passed[:, 0] - passed[:, 1]) ** 2).sum()))
+        percent[axis, end] = 100 * (some >= cut).mean()
+    return float(np.sqrt((0.25 * (percent[:, 0] - percent[:, 1]) ** 2).sum()))
 
 
 def null_spread(

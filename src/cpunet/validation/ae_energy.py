@@ -221,12 +221,12 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
         ``methods`` of `against_energy`.
     """
     figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
-    for method, site_fits in methods.items():
-        colour, line = COLOURS[method], site_fits.mean
-        energy, mean, error, sigma, sigma_error = _columns(site_fits.points)
+    for method, course in methods.items():
+        colour, line = COLOURS[method], course.mean
+        energy, mean, error, sigma, sigma_error = _columns(course.points)
         look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
         for axes, value, spread in (
-            (above, mean / site_fits.scale - 1, error / site_fits.scale),
+            (above, mean / course.scale - 1, error / course.scale),
             (below, sigma / mean, sigma_error / mean),
         ):
             group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
@@ -235,7 +235,7 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
         text += f"{line.per_mev_error_percent:.3f} % per MeV"
         fit = {"color": colour, "gid": GROUP + method}
         above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
-        below.plot(along, 100 * site_fits.resolution.of(along), **fit)
+        below.plot(along, 100 * course.resolution.of(along), **fit)
     above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
     below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
     above.legend()
@@ -245,15 +245,15 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
 def _points(
     amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
 ) -> list[SiteFit]:
-    between = np.ones(len(energy_kev), bool)
+    off_lines = np.ones(len(energy_kev), bool)
     for low, high in lines:
-        between &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
+        off_lines &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
     site_fits = []
     about = None
     for low, high in bands:  # the double-escape peak first, if there is one
         inside = (energy_kev >= low) & (energy_kev < high)
         if (low, high) not in lines:
-            inside &= between
+            inside &= off_lines
         fitted = site_fit(amplitude[inside], about)
         if fitted is not None:
             about = about or (fitted[0], fitted[2])

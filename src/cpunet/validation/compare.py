@@ -176,10 +176,12 @@ class Comparison:
     @property
     def note(self) -> str:
         """Signs that runs were not scored on the same pulses; empty if there are none."""
-        (first, present), *others = (
+        (first, first_pulses), *others = (
             (n, _pulses(metrics)) for n, metrics in self.metrics.items()
         )
-        differing = {name: [k for k in present if of[k] != present[k]] for name, of in others}
+        differing = {
+            name: [k for k in first_pulses if of[k] != first_pulses[k]] for name, of in others
+        }
         names = ", ".join(name for name, differences in differing.items() if differences)
         words = ", ".join(_union(differing.values()))
         text = f"other pulses than those of {first} ({words}), so scores differ for that, too"
@@ -343,12 +345,12 @@ def compared(
     missing = tuple(name for name in names if name not in runs)
     made = Comparison(method, runs, folders, missing)
     if not made.rows:
-        present = _union(
+        methods = _union(
             methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks")
         )
         raise CpunetError(
             f"{', '.join(runs)}: no score of the method {method}; "
-            + (f"there are {', '.join(present)}" if present else "nothing is scored there")
+            + (f"there are {', '.join(methods)}" if methods else "nothing is scored there")
         )
     return made
 
@@ -357,22 +359,24 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     """Scores of a method at a peak, by name."""
     scores, survival = part(metrics, "peaks", peak), part(metrics, "ae_survival", peak)
     collected = {}
-    for name, scores_of in part(scores, "parameters").items():
-        ceiling = number(scores_of, "iou", "ceiling")
+    for name, quantity in part(scores, "parameters").items():
+        ceiling = number(quantity, "iou", "ceiling")
         more = "" if ceiling is None else f" ({ceiling:.1f})"
-        iou, error = (number(scores_of, key, method) for key in ("iou", "iou_std"))
+        iou, error = (number(quantity, key, method) for key in ("iou", "iou_std"))
         title = f"{name.replace('_', ' ')}: IoU [%] (data vs data)"
         collected[title] = Cell.of(iou, error, ".1f", 100.0, more)
     auc, error, chance = (
         number(scores, "two_sample", method, key) for key in ("auc", "auc_std", "null_mean")
     )
     edge = number(scores, "paired", method, "edge_rmse")
-    differing, std = (number(survival, key, method) for key in ("difference", "difference_std"))
+    difference, std = (
+        number(survival, key, method) for key in ("difference", "difference_std")
+    )
     return collected | {
         "classifier: AUC": Cell.of(auc, error, ".3f", chance or 0.0),
         "edge RMSE [10⁻³]": Cell.of(None if edge is None else 1e3 * edge, None, "#.3g", 0.0),
         **_legend(metrics, peak, method),
-        "A/E survival minus data [points]": Cell.of(differing, std, "+.2f", 0.0),
+        "A/E survival minus data [points]": Cell.of(difference, std, "+.2f", 0.0),
     }
 
 

@@ -538,12 +538,12 @@ def two_sample_test(a: Values, b: Values, moved: Values | None = None) -> Tested
         return Tested(np.nan, 0, np.nan)
     n_bins = min(TEST_BINS, least // EXPECTED)
     edges = np.unique(np.quantile(finite, np.linspace(0, 1, n_bins + 1)[1:-1]))
-    heights = np.isnan(pooled).sum() * least / len(pooled) >= EXPECTED
+    nan_bin = np.isnan(pooled).sum() * least / len(pooled) >= EXPECTED
 
     def shares(values: Values) -> Values:
-        last = len(edges) + 1 if heights else len(edges)
+        last = len(edges) + 1 if nan_bin else len(edges)
         place = np.where(np.isnan(values), last, np.searchsorted(edges, values, side="right"))
-        return np.bincount(place, minlength=len(edges) + 1 + heights) / len(values)
+        return np.bincount(place, minlength=len(edges) + 1 + nan_bin) / len(values)
 
     common = shares(pooled)
     covariance = (np.diag(common) - np.outer(common, common)) * (1 / len(a) + 1 / len(b))
@@ -630,8 +630,8 @@ def compare(
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
     n_sim = max(sizes.values(), default=0)
     null = resampled_twice(n_data, n_sim, n_data, scores.bootstraps, rng)
-    usable = {name: values for name, values in data.items() if np.isfinite(values).any()}
-    axes = {name: data_axis(values, scores.max_bins) for name, values in usable.items()}
+    present = {name: values for name, values in data.items() if np.isfinite(values).any()}
+    axes = {name: data_axis(values, scores.max_bins) for name, values in present.items()}
     results = {name: _of_data(values, null, axes.get(name)) for name, values in data.items()}
     own = null[1]
     del null

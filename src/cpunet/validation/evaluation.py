@@ -150,7 +150,7 @@ def evaluate(
     ranges = _range_survivals(translations, survivals, recipe)
     if not isinstance(survivals, Missing) and not isinstance(ranges, Missing):
         survivals = subtracted(survivals, ranges)
-    facts = None if run.fit is None else run.fit.tails
+    tails = None if run.fit is None else run.fit.tails
     ae_energy = against_energy(
         {method: translations.amplitudes[method] for method in ("data", "ren")},
         translations.energy_kev,
@@ -171,7 +171,7 @@ def evaluate(
         },
         "training": {"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
-        "tails": None if facts is None else facts.model_dump(exclude_unset=True),
+        "tails": None if tails is None else tails.model_dump(exclude_unset=True),
         "rejections": {
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,
@@ -200,11 +200,11 @@ def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
     dep = next((peak for peak in sets if peak.name == DEP), None)
     if dep is None:
         return {}
-    by_method = {
+    scales = {
         method: dep_scale(dep.translations.amplitudes[method][rows], seed)
         for method, rows in dep.rows.items()
     }
-    return by_method if np.isfinite(list(by_method.values())).all() else {}
+    return scales if np.isfinite(list(scales.values())).all() else {}
 
 
 def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
@@ -297,8 +297,8 @@ def period_of(path: Path) -> str | None:
     >>> period_of(Path("l200-p03-r001-cal-20230318T012144Z-tier_raw.lh5"))
     'p03 r001'
     """
-    by_method = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
-    return None if by_method is None else f"{by_method[1]} {by_method[2]}"
+    match = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
+    return None if match is None else f"{match[1]} {match[2]}"
 
 
 def _short(path: Path) -> str:

@@ -105,7 +105,7 @@ def pair_squares(
         samples that both records of a pair have, and over the ``2 * edge_samples + 1`` samples
         around the crossing; all 0 where a pulse cannot be aligned.
     """
-    results = {method: np.zeros((len(truth), 4)) for method in methods}
+    squares = {method: np.zeros((len(truth), 4)) for method in methods}
     for rows in blocks(len(truth)):
         half = truth.shape[1]
         aligned = aligned_block(truth[rows], half, half)
@@ -113,9 +113,9 @@ def pair_squares(
         for method, translated in methods.items():
             difference = aligned_block(translated[rows], half, half)
             difference -= aligned
-            results[method][rows, :2] = _squares(difference)
-            results[method][rows, 2:] = _squares(difference[:, edge])
-    return results
+            squares[method][rows, :2] = _squares(difference)
+            squares[method][rows, 2:] = _squares(difference[:, edge])
+    return squares
 
 
 def scores_of_squares(squares: Values) -> PairedScores:
@@ -215,9 +215,9 @@ def fit_baseline_methods(
     config, result = recipe.preparation, FittedBaselineMethods()
     kinds = BASELINE_METHODS if fitted else {}
     with_tails = tails is not None and tails.law.rate_khz > 0
-    results = tails_of(data)[0] if with_tails else None
+    measured_tails = tails_of(data)[0] if with_tails else None
     try:
-        noise = noise_of(data, results)
+        noise = noise_of(data, measured_tails)
         result.noise = TraceNoise(noise, tails) if with_tails else noise
     except CpunetError as error:
         result.missing["noise"] = str(error)
@@ -276,13 +276,13 @@ class Translations:
     def without_noise(self, row: int) -> dict[str, FloatArray]:
         """Noise-free window of a pulse by method, with the truth if given."""
         raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
-        results = {"raw": raw}
+        windows = {"raw": raw}
         for name, method in self.baselines.methods.items():
-            results[name] = method.translate_like_data(raw, config)
-        results["ren"] = self.ren.apply(
+            windows[name] = method.translate_like_data(raw, config)
+        windows["ren"] = self.ren.apply(
             raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
         )
-        return results if self.truth is None else results | {"truth": self.truth[[row]]}
+        return windows if self.truth is None else windows | {"truth": self.truth[[row]]}
 
 
 def translate_all(
@@ -346,8 +346,8 @@ def translate_all(
                 comparable[rows] &= _whole(windows)
             if truth is not None:
                 truth[rows] = clean.pop("truth")
-                results = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
-                for name, of_block in results.items():
+                squares_of_block = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
+                for name, of_block in squares_of_block.items():
                     squares[name][rows] = of_block
             bar.update(len(block))
     measured = data.prepared.pulses

@@ -149,10 +149,10 @@ def spectrum_of_noise(by_method: Mapping[str, Any], peak: str) -> Figure:
 
 def _band_powers(baselines: FloatArray, edges: Values) -> Values:
     """Mean square of each baseline in each band, shape (baselines, bands)."""
-    times = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
+    whole = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
     samples = baselines.shape[1]
     window = np.hanning(samples + 1)[:-1]
-    centred = (times - times.mean(axis=1, keepdims=True)) * window
+    centred = (whole - whole.mean(axis=1, keepdims=True)) * window
     power = np.abs(np.fft.rfft(centred, axis=1)) ** 2 * 2 / (samples * (window @ window))
     if samples % 2 == 0:
         power[:, -1] /= 2  # the highest frequency occurs only once

@@ -176,7 +176,7 @@ def peak_html(peak: str, scores: Mapping[str, Any]) -> Markup:
             if "missing" in result
             else [
                 label(method),
-                *(with_std(result[fit], result[std]) for fit, std in pairs),
+                *(with_std(result[value], result[std]) for value, std in pairs),
             ]
             for method, result in tested.items()
         ]

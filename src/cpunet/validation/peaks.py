@@ -72,7 +72,7 @@ class PeakSets:
         """Paired scores by method; None if the truth is unknown."""
         rows, squares = self.known_to_all(), self.translations.squares
         return {
-            name: scores_of_squares(of_scores[rows]) for name, of_scores in squares.items()
+            name: scores_of_squares(of_method[rows]) for name, of_method in squares.items()
         } or None
 
     def not_prepared(self) -> dict[str, int]:
@@ -208,8 +208,8 @@ def _normalised(
     The last axis is the error of both scales.  Parameters of the fit move A/E of both peaks;
     what is left of that is far less than the error of the scales.
     """
-    of_scores, other = (scales[m][1] / scales[m][0] for m in ("data", method))
-    error = np.hypot(of_scores, other)
+    own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
+    error = np.hypot(own, other)
     return np.stack([values * (1 + error), values * (1 - error)])[np.newaxis]
 
 

@@ -134,8 +134,8 @@ class Report:
     def __getitem__(self, peak: str) -> DataFrame:
         peaks = {
             name: name
-            for name, of_name in self.metrics["peaks"].items()
-            if of_name["parameters"]
+            for name, scores_of in self.metrics["peaks"].items()
+            if scores_of["parameters"]
         }
         selected: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
         return selected
@@ -332,11 +332,9 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:
 def as_stored(results: Any) -> Any:
     """Results ready for JSON, see `plain`, without the fields of objects that are None."""
     if is_dataclass(results):
-        results = {
-            name: of_name for name, of_name in vars(results).items() if of_name is not None
-        }
+        results = {name: result for name, result in vars(results).items() if result is not None}
     if isinstance(results, Mapping):
-        return {name: as_stored(of_name) for name, of_name in results.items()}
+        return {name: as_stored(result) for name, result in results.items()}
     return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
 
 
