@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.chain_fit import Parabola, minimum
 from cpunet.training.chain_parameters import Parameters, SmoothParameters
 from synthetic import load_recipe
 
@@ -59,3 +60,22 @@ def test_coordinates_are_those_of_the_decays_and_back() -> None:
     moved = [plain.set(vector + step) or smooth.vector() for step in steps]
     plain.set(vector)
     np.testing.assert_allclose(smooth.turn().T, (np.array(moved) - place) / 1e-6, atol=1e-5)
+
+
+def test_samples_are_no_sharper_than_points_and_no_blunter_than_means() -> None:
+    """A step that leads beyond ends at the bound, and the other coordinates make up for it."""
+    unknowns = SmoothParameters(response((60.0, 40.0), 0.05))
+    at = unknowns.labels.index("sharpness")
+    truth = unknowns.vector() + np.eye(len(unknowns.centre))[at]  # 1.5
+    rows = 100 * (np.eye(len(truth)) + 0.3)
+
+    def parabola(place: np.ndarray) -> Parabola:
+        off = (place - unknowns.centre) / unknowns.widths
+        deviation = rows @ (place - truth)
+        gradient = rows.T @ deviation + off / unknowns.widths
+        cost = float(deviation @ deviation)
+        return Parabola(place, cost, 1, rows.T @ rows, cost + float(off @ off), gradient)
+
+    end = minimum(unknowns, parabola, 20, 1e-9, lambda _: None)
+    assert end.place[at] == 1.0
+    assert abs(parabola(end.place).gradient[np.arange(len(truth)) != at]).max() < 1e-6
