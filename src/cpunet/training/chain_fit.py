@@ -235,12 +235,12 @@ def minimum(
     prior, damping = np.diag(unknowns.widths**-2.0), 0.0
     best = evaluate(unknowns.vector())
     for _ in range(steps):
-        step = _within(best, prior, low, high)
+        step = bounded_step(best, prior, low, high)
         if -(best.gradient @ step) < fall:
             break
         for _ in range(TRIES):
             damped = prior + damping * np.diag(best.information.diagonal())
-            step = _within(best, damped, low, high)
+            step = bounded_step(best, damped, low, high)
             step = np.clip(step, -unknowns.longest, unknowns.longest)
             tried = evaluate(np.clip(best.place + step, low, high))
             count(tried.chi_square)
@@ -263,7 +263,7 @@ def minimum(
     return best
 
 
-def _within(at: Parabola, prior: Values, low: Values, high: Values) -> Values:
+def bounded_step(at: Parabola, prior: Values, low: Values, high: Values) -> Values:
     """Step to the minimum; coordinates at a bound do not cross it, the others know of that."""
     free, curvature = np.ones(len(low), bool), at.information + prior
     while free.any():

@@ -18,7 +18,7 @@ import scipy.linalg
 from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.chain_fit import Fitted, chi_square
+from cpunet.training.chain_fit import Fitted, Parabola, bounded_step, chi_square
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
 from cpunet.training.comparison import Comparison, Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
@@ -126,6 +126,12 @@ class Unknowns:
         self.centre = np.r_[self.chain.centre, np.zeros(len(self.steps) - self.n)]
         self.place = np.r_[self.chain.vector(), self.by_height.vector]
 
+    @property
+    def bounds(self) -> tuple[Values, Values]:
+        """Lowest and highest values."""
+        free = np.full(len(self.steps) - self.n, np.inf)
+        return np.r_[self.chain.low, -free], np.r_[self.chain.high, free]
+
     def covariance(self, of_lag: float, of_curve: float) -> Values:
         """Of the priors."""
         return np.asarray(
@@ -179,6 +185,7 @@ def _solve(
     Returns the covariance of the chain's parameters.
     """
     unknowns, padded = Unknowns(own), bands[0].padded
+    bounds = unknowns.bounds
     best, damping, last = (LAGS[-1], CURVES[-1]), FIRST, width == STAGES[-1][1]
     precision = np.linalg.inv(unknowns.covariance(*best))
     compared = [Comparison(sides, width, least) for sides in bands]
@@ -209,14 +216,15 @@ def _solve(
         cost += of_prior(place)
         count(cost)
         information = problem.information + precision
-        right = right + precision @ unknowns.centre - information @ place
+        gradient = information @ place - precision @ unknowns.centre - right
+        here = Parabola(place, cost, 0, problem.information, cost, gradient)
         if not unknowns.by_height.lag.any() and unknowns.limited(
             lambda: problem.evaluate(own.transfer(padded), unknowns.place, anew=False)
         ):
             continue
         for _ in range(TRIES):
-            scale = damping * np.diag(information.diagonal())
-            tried = place + np.linalg.solve(information + scale, right)
+            damped = precision + damping * np.diag(information.diagonal())
+            tried = np.clip(place + bounded_step(here, damped, *bounds), *bounds)
             new = cost_at(tried) + of_prior(tried)
             if new < cost:
                 break
