@@ -221,6 +221,27 @@ def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None
         assert off < 0.15 * np.linalg.norm((wanted / error)[some]), parameters.labels[i]
 
 
+def test_derivatives_of_the_same_pulses_do_not_pull_a_fit() -> None:
+    """Derivatives that go with functions, of equal sides: on average no gradient is left."""
+    rng, n, experiments = np.random.default_rng(1), 200, 300
+    functions, covariance = 30, 2 / n * np.eye(30)
+    gradients, shared = [], []
+    for _ in range(experiments):
+        each, data = rng.standard_normal((2, n, functions))
+        slopes = (0.5 * each + rng.standard_normal((n, functions)))[..., np.newaxis]
+        off = each.mean(axis=0) - data.mean(axis=0)
+        of_parts, values = (
+            of.reshape(20, n // 20, *of.shape[1:]).mean(axis=1) for of in (slopes, each)
+        )
+        same = Difference("joint", off, covariance, slopes.mean(axis=0), (of_parts, values))
+        gradients.append(same.slopes[:, 0] @ np.linalg.solve(covariance, off))
+        shared.append(same.shared[0])
+    error = np.std(gradients) / experiments**0.5
+    assert np.mean(gradients) == pytest.approx(functions * 0.5 / 2, abs=4 * error)
+    assert np.mean(gradients) > 20 * error
+    assert np.mean(gradients) - np.mean(shared) == pytest.approx(0, abs=4 * error)
+
+
 def test_a_known_response_is_where_a_fit_starts(problem: Problem, near: Told) -> None:
     """It is left as it is, and what is found does not depend on it."""
     recipe, known = RECIPE, copy.deepcopy(near.response)

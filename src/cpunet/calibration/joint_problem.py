@@ -211,7 +211,7 @@ class JointProblem:
         return minimum(self.parameters, self._parabola, STEPS, FALL, count)
 
     def _parabola(self, place: Values) -> Parabola:
-        residuals, jacobian = self.both(place)
+        residuals, jacobian, _ = self.both(place)
         own = np.r_[: self.moments, self.moments + len(place) : len(residuals)]  # no priors
         chi_square = float(residuals[: self.moments] @ residuals[: self.moments])
         return Parabola(
@@ -232,18 +232,27 @@ class JointProblem:
         self.parameters.set(vector)
         return self._stacked(vector, self._differences())
 
-    def both(self, vector: Values) -> tuple[Values, Values]:
-        """Residuals and their derivatives, shape (residuals, parameters)."""
+    def both(self, vector: Values) -> tuple[Values, Values, tuple[Values, Values]]:
+        """Residuals, their derivatives, and both of parts of the events.
+
+        Shapes are (residuals,), (residuals, parameters), (parts, functions, parameters), and
+        (parts, functions).
+        """
         parameters = self.parameters
         parameters.set(vector)
         differences = self._differences(slopes=True)
-        rows = [
-            *(
-                scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
-                for root, difference in zip(self._roots, differences, strict=True)
-            ),
-            np.diag(1 / parameters.widths),
-        ]
+        white = []
+        for root, difference in zip(self._roots, differences, strict=True):
+            assert difference.parts is not None
+            slopes, values = difference.parts
+            both = np.moveaxis(np.concatenate([slopes, values[..., np.newaxis]], axis=2), 1, 0)
+            solved = scipy.linalg.solve_triangular(
+                root, both.reshape(len(root), -1), lower=True
+            )
+            white.append(solved.reshape(both.shape))
+        parts = np.concatenate(white).swapaxes(0, 1)  # (parts, functions, parameters + 1)
+        slopes, values = parts[..., :-1], parts[..., -1]
+        rows = [slopes.mean(axis=0), np.diag(1 / parameters.widths)]
         at, physics = parameters.coordinates, []
         for i, step in zip(parameters.free, STEP * parameters.reach, strict=True):
             moved = at + step * np.eye(len(at))[i]
@@ -252,7 +261,7 @@ class JointProblem:
         if self.held:
             columns = np.concatenate([columns, np.diag(HOLD / parameters.reach)])
         rows.append(np.pad(columns, ((0, 0), (parameters.n_chain, 0))))
-        return self._stacked(vector, differences), np.concatenate(rows)
+        return self._stacked(vector, differences), np.concatenate(rows), (slopes, values)
 
     def _stacked(self, vector: Values, differences: Sequence[Difference]) -> Values:
         parameters = self.parameters

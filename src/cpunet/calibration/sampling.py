@@ -21,7 +21,6 @@ import numpy as np
 from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Values
 
-PARTS = 8
 # Largest share of the information along a direction that is taken for noise: the parts of the
 # events do not determine a larger share well enough.
 MOST = 0.9
@@ -33,16 +32,10 @@ def of_events(problem: JointProblem, scale: float) -> tuple[Values, Values]:
     The errors of the functions are larger by `scale`, those of the priors are not.
     """
     vector, functions = problem.parameters.vector(), problem.functions
-    _, jacobian = problem.both(vector)
-    deviations, slopes = [], []
-    for k in range(PARTS):
-        part = problem.of_parts([band.of_events(slice(k, None, PARTS)) for band in functions])
-        residuals, derivatives = part.both(vector)
-        deviations.append(residuals[: problem.moments])
-        slopes.append(derivatives[: problem.moments])
+    _, jacobian, parts = problem.both(vector)
     n = sum(len(band.sides) + len(band.sides.data) for band in functions)
     factor = scale**2 * of_weights(n, problem.by_chance[0], len(vector))
-    return of_parts(jacobian, np.array(slopes), np.array(deviations), factor)
+    return of_parts(jacobian, *parts, factor)
 
 
 def of_parts(

@@ -274,7 +274,7 @@ class Search:
     def _looked(self, problem: JointProblem) -> tuple[Information, Selection]:
         """What all pulses, and each half of them, tell of the free parameters."""
         parameters, vector = problem.parameters, problem.parameters.vector()
-        residuals, jacobian = problem.both(vector)
+        residuals, jacobian, _ = problem.both(vector)
         halves = []
         for k in range(2):
             half = [functions.some(slice(k, None, 2)) for functions in problem.functions]

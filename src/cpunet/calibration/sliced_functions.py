@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cpunet.training.aligned import Aligned, Values
+from cpunet.training.aligned import Aligned, Floats, Values
 from cpunet.training.comparison import Sides
-from cpunet.training.derivatives import Changes, Derivatives
 from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
 
 # Bins of the drift time; slices of drift time; components and current amplitude bins in each.
@@ -97,14 +96,12 @@ class SlicedJoint(Joint):
             )
         return np.concatenate(columns, axis=1)
 
-    def _slopes(self, pulses: Aligned, moves: Derivatives | Changes) -> Values:
-        shape, changes = self._shape(pulses), moves.each(self.matrix)
-        changes[np.abs(shape) >= self.clipped] = 0
-        n, coordinates = len(shape), changes.shape[2]
+    def _slopes(self, pulses: Aligned, changes: Floats, of_log: Floats) -> Values:
+        shape, (n, coordinates) = self._shape(pulses), of_log.shape
         (_, density), (slices, sliding), (amplitudes, turned) = self._sliced(shape, pulses)
         drift, others = changes[:, -1], slice(-2, -2 - OTHERS, -1)
-        slopes = [n * super()._slopes(pulses, moves), density.T @ drift]
-        moved = (turned[:, :, np.newaxis] * moves.log_amplitude[:, np.newaxis]).reshape(n, -1)
+        slopes = [n * super()._slopes(pulses, changes, of_log), density.T @ drift]
+        moved = (turned[:, :, np.newaxis] * of_log[:, np.newaxis]).reshape(n, -1)
         for values, own in (
             (shape[:, others], changes[:, others].reshape(n, -1)),
             (amplitudes, moved),
@@ -113,7 +110,7 @@ class SlicedJoint(Joint):
             each = slices.T @ own + sliding.T @ along  # (slices, values * coordinates)
             each = each.reshape(len(each), -1, coordinates).swapaxes(0, 1)
             slopes.append(each.reshape(-1, coordinates))
-        return np.concatenate(slopes) / n
+        return np.asarray(np.concatenate(slopes) / n)
 
     def _sliced(self, shape: Values, pulses: Aligned) -> list[tuple[Values, Values]]:
         """Bins of density, slices of drift time, and bins of the amplitude in these."""

@@ -7,7 +7,9 @@ The differences :math:`d` of `cpunet.training.joint` are nearly linear in the co
 .. math:: \delta = -(J^T C^{-1} J + P^{-1})^{-1}
     \left[J^T C^{-1} d + P^{-1} (x - x_0)\right],
 
-damped where it leads up (Marquardt, J. SIAM 11 (1963) 431).  First steps compare some of the
+damped where it leads up (Marquardt, J. SIAM 11 (1963) 431).  Derivatives are those of the
+pulses that are compared, so that :math:`J^T C^{-1} d` does not vanish where both sides agree;
+what it is there is subtracted (`Difference.shared`).  First steps compare some of the
 pulses by wider functions, which do not saturate far from the data.
 """
 
@@ -283,9 +285,10 @@ def _parabola(
     n = len(place)
     information, gradient, chi_square, functions = np.zeros((n, n)), np.zeros(n), 0.0, 0
     for comparison in compared:
-        values, slopes = differences(parameters, comparison).white
+        difference = differences(parameters, comparison)
+        values, slopes = difference.white
         information += slopes.T @ slopes
-        gradient += slopes.T @ values
+        gradient += slopes.T @ values - difference.shared
         chi_square += float(values @ values)
         functions += len(values)
     off = (place - parameters.centre) / parameters.widths

@@ -258,12 +258,16 @@ class Difference:
         Differences, and their covariance.
     slopes
         Derivatives in the coordinates of a basis, shape (functions, coordinates).
+    parts
+        Derivatives (parts, functions, coordinates) and differences (parts, functions) of equal
+        parts of the simulated pulses.
     """
 
     name: str
     values: Values
     covariance: Values
     slopes: Values = field(default_factory=lambda: NONE)
+    parts: tuple[Values, Values] | None = None
 
     @property
     def chi_square(self) -> float:
@@ -279,6 +283,17 @@ class Difference:
         both = np.column_stack([self.values, self.slopes])
         white = scipy.linalg.solve_triangular(root, both, lower=True)
         return white[:, 0], white[:, 1:]
+
+    @property
+    def shared(self) -> Values:
+        """What :math:`J^T C^{-1} d` is on average where both sides agree, (coordinates,).
+
+        It is not zero, since derivatives and differences are of the same pulses.
+        """
+        assert self.parts is not None
+        slopes, values = self.parts
+        n, off = len(values), np.linalg.solve(self.covariance, (values - values.mean(axis=0)).T)
+        return np.asarray(np.einsum("pfk,fp->k", slopes, off) / (n * (n - 1)))
 
     @property
     def sliced(self) -> bool:

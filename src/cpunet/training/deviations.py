@@ -341,6 +341,7 @@ def _with_amplitude(own: ElectronicsResponse, bands: Sequence[Sides], modes: Bas
         slopes = scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
         information += slopes.T @ slopes
         right -= slopes.T @ scipy.linalg.solve_triangular(root, difference.values, lower=True)
+        right += difference.shared
     return np.asarray(np.linalg.solve(information, right))
 
 

@@ -10,6 +10,10 @@ generalised method of moments (Hansen, Econometrica 50 (1982) 1029).
 
 They determine the current amplitude two to four times better than `Comparison`, but trust in
 the simulated shapes, and see no small differences that all pulses share.
+
+Many functions of few pulses would pull a fit towards responses by which they vary less: the
+same pulses say how far the means are off and how they change (Newey and Smith, Econometrica 72
+(2004) 219).  Parts of the pulses tell how both go together, which is subtracted.
 """
 
 from __future__ import annotations
@@ -25,8 +29,8 @@ import scipy.linalg
 
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Aligned, Samples, Values
-from cpunet.training.comparison import NONE, Difference, Sides, Spectrum
+from cpunet.training.aligned import Aligned, Floats, Samples, Values
+from cpunet.training.comparison import Difference, Sides, Spectrum
 from cpunet.training.derivatives import Basis, Changes, Derivatives
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
@@ -41,6 +45,7 @@ PEAK_WIDTH, ABOUT_PEAK = 0.01, np.linspace(-0.03, 0.02, 10)
 FOR_PRODUCTS = 600  # pulses of a side, of which products have a covariance
 MOSTLY = 0.8  # part of the simulated pulses that is single near the data
 TINY = 1e-9  # least scale
+PARTS = 20  # of the pulses, which say how differences go with derivatives
 
 
 class Joint:
@@ -131,18 +136,29 @@ class Joint:
         # without those on the tail of another, as the data; far from the data all
         single = np.all([self.sides.single(draw) for draw in noisy], axis=0)
         single = single if single.mean() > MOSTLY else np.ones_like(single)
-        values = [self._functions(draw[single]) for draw in noisy]
-        mean = np.mean([draw.mean(axis=0) for draw in values], axis=0)
-        covariance = self.covariance(0.5 * (np.cov(values[0].T) + np.cov(self.data.T)))
-        slopes = NONE
+        each = [self._functions(draw[single]) for draw in noisy]
+        covariance = self.covariance(0.5 * (np.cov(each[0].T) + np.cov(self.data.T)))
+        values = np.mean(each, axis=0)
+        off, moves = values.mean(axis=0) - self.data.mean(axis=0), list[Derivatives | Changes]()
         if basis is not None:
-            moves = Derivatives(self.sides, self.sides.first, noisy[0], heights, basis)
-            slopes = self._slopes(noisy[0], moves)
+            moves = [Derivatives(self.sides, self.sides.first, noisy[0], heights, basis)]
         if changes:
             records = [self.sides.changed(draw, transfer, heights) for draw in changes]
-            own = self._slopes(noisy[0], Changes(self.sides, noisy[0], records))
-            slopes = np.concatenate([slopes, own], axis=1)
-        return Difference("joint", mean - self.data.mean(axis=0), covariance, slopes)
+            moves.append(Changes(self.sides, noisy[0], records))
+        if not moves:
+            return Difference("joint", off, covariance)
+        rows, drawn = np.flatnonzero(single), noisy[0]
+        of_each = np.concatenate([self._each(drawn, some) for some in moves], axis=2)
+        of_log = np.concatenate([some.log_amplitude for some in moves], axis=1)
+        folds = np.array_split(np.arange(len(rows)), PARTS)
+        slopes = np.array(
+            [
+                self._slopes(drawn[of], of_each[of], of_log[of])
+                for of in (rows[fold] for fold in folds)
+            ]
+        )
+        means = np.array([values[fold].mean(axis=0) for fold in folds])
+        return Difference("joint", off, covariance, slopes.mean(axis=0), (slopes, means))
 
     def covariance(self, of_each: Values) -> Values:
         """Covariance of a difference of means from that of single pulses."""
@@ -169,20 +185,24 @@ class Joint:
         """Bins of the amplitude, and their derivatives, shape (pulses, bins)."""
         return gaussian_bins(pulses.log_amplitude, self.places, self.widths)
 
-    def _slopes(self, pulses: Aligned, moves: Derivatives | Changes) -> Values:
-        """Derivatives of the means, shape (functions, coordinates)."""
-        shape, (bins, turned) = self._shape(pulses), self._bins(pulses)
+    def _each(self, pulses: Aligned, moves: Derivatives | Changes) -> Floats:
+        """Derivatives of segments and components, (pulses, functions, coordinates)."""
         changes = moves.each(self.matrix)
-        changes[np.abs(shape) >= self.clipped] = 0
-        n, coordinates = len(shape), changes.shape[2]
-        of_bins = turned.T @ moves.log_amplitude
+        changes[np.abs(self._shape(pulses)) >= self.clipped] = 0
+        return changes
+
+    def _slopes(self, pulses: Aligned, changes: Floats, of_log: Floats) -> Values:
+        """Derivatives of the means from those of each pulse, (functions, coordinates)."""
+        shape, (bins, turned) = self._shape(pulses), self._bins(pulses)
+        n, coordinates = of_log.shape
+        of_bins = turned.T @ of_log
         if not self.products:
-            return np.concatenate([changes.sum(axis=0), of_bins]) / n
+            return np.asarray(np.concatenate([changes.sum(axis=0), of_bins]) / n)
         own = changes[:, SEGMENTS:].reshape(n, -1)
-        sliding = shape[:, SEGMENTS:, np.newaxis] * moves.log_amplitude[:, np.newaxis]
+        sliding = shape[:, SEGMENTS:, np.newaxis] * of_log[:, np.newaxis]
         products = bins.T @ own + turned.T @ sliding.reshape(n, -1)
         parts = [changes.sum(axis=0), of_bins, products.reshape(-1, coordinates)]
-        return np.concatenate(parts) / n
+        return np.asarray(np.concatenate(parts) / n)
 
 
 class SingleSites(Joint):
@@ -206,8 +226,11 @@ class SingleSites(Joint):
     def _functions(self, pulses: Aligned) -> Values:
         return np.asarray(self._bins(pulses)[0] @ self.balance)
 
-    def _slopes(self, pulses: Aligned, moves: Derivatives | Changes) -> Values:
-        moved = self._bins(pulses)[1].T @ moves.log_amplitude / len(pulses)
+    def _each(self, pulses: Aligned, moves: Derivatives | Changes) -> Floats:
+        return np.empty((len(pulses), 0, moves.log_amplitude.shape[1]), np.float32)
+
+    def _slopes(self, pulses: Aligned, changes: Floats, of_log: Floats) -> Values:
+        moved = self._bins(pulses)[1].T @ of_log / len(pulses)
         return np.asarray(self.balance.T @ moved)
 
 
