@@ -215,7 +215,10 @@ def test_nothing_is_empty_and_the_verdict_comes_first(tmp_path):
             one |= {"ks_null": 0.1, "ks_null_std": 0.1}
     write_report(tmp_path, found, {}, [])
     html = (tmp_path / "report.html").read_text()
-    headline = "REN is off in 2 of 2 quantities of SEP; the least likely has p = 1e-05."
+    headline = (
+        "REN is off in 2 of 2 quantities of SEP: SEP T(10–90 %) (p = 1e-05), "
+        "SEP tail slope (p = 1e-05)."
+    )
     places = [html.index(text) for text in (headline, 'table class="main"', 'id="scores"')]
     assert places == sorted(places)
     assert '<td data-name="REN − data">+12.0 ± 4.0</td><td data-name="p">1e-05</td>' in html

@@ -27,6 +27,7 @@ from cpunet.tables import NO_VALUE, with_std
 ALARM = 2.7e-3  # p of three standard deviations
 SAME = 3e-5  # 1 - p of samples that agree too well
 SMALLEST = 1e-12  # p that is stated
+NAMED = 3  # quantities that a headline names
 
 Words = dict[str, float | str | None]
 Metrics = Mapping[str, Any]  # content of ``metrics.json``
@@ -176,18 +177,23 @@ def held_out(metrics: Metrics) -> list[str]:
 
 def headline(metrics: Metrics, method: str = "ren") -> tuple[bool, str]:
     """Whether nothing is off at peaks that were not trained on, and that in a sentence."""
-    peaks = held_out(metrics)
-    verdicts = [v for peak in peaks for v in method_verdicts(metrics, peak, method).values()]
-    p = [v.p for v in verdicts if v.p is not None]
-    off, where = sum(value < ALARM for value in p), " and ".join(peaks)
-    name = _SHORT.get(method, label(method))
-    if not p:
+    peaks, name = held_out(metrics), _SHORT.get(method, label(method))
+    judged = sorted(
+        (v.p, f"{peak} {called(quantity)}")
+        for peak in peaks
+        for quantity, v in method_verdicts(metrics, peak, method).items()
+        if v.p is not None
+    )
+    if not judged:
         return False, f"{name}: not judged"
+    of, off = f"quantities of {' and '.join(peaks)}", sum(p < ALARM for p, _ in judged)
+    named = judged[: min(max(off, 1), NAMED)]
+    first = ", ".join(f"{quantity} ({_p(p)})" for p, quantity in named)
     if not off:
-        text = f"{name} agrees with the data in all {len(p)} quantities of {where}"
-        return True, f"{text}; the least likely has {_p(min(p))}"
-    text = f"{name} is off in {off} of {len(p)} quantities of {where}"
-    return False, f"{text}; the least likely has {_p(min(p))}"
+        agreed = f"{name} agrees with the data in all {len(judged)} {of}"
+        return True, f"{agreed}; the least likely is {first}"
+    more = " and others" if off > NAMED else ""
+    return False, f"{name} is off in {off} of {len(judged)} {of}: {first}{more}"
 
 
 def main_table(metrics: Metrics, peaks: Sequence[str]) -> tuple[list[str], list[list[str]]]:
