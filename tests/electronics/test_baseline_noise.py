@@ -237,7 +237,8 @@ def white_traces(n: int = 300, start: int = 560, seed: int = 0) -> Pulses:
 
 def as_input(raw: Pulses) -> InputSet:
     prepared, baselines = prepare(raw, FAST, "measured"), Baselines.of([raw], FAST)
-    return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, baselines=baselines)
+    recipe = load_recipe("fast")
+    return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, recipe, baselines=baselines)
 
 
 def test_noise_of_raw_traces() -> None:

@@ -10,12 +10,22 @@ import pytest
 import torch
 
 from cpunet.errors import CpunetError
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
 from games import untrained
-from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files, write_run
+from synthetic import (
+    KEV,
+    SMALL_NETWORK,
+    Files,
+    load_recipe,
+    write_files,
+    write_pulses,
+    write_run,
+)
 
 RECIPE = load_recipe(
     "published",
@@ -68,7 +78,9 @@ def test_provenance_counts_and_fingerprints(files, sim_set):
 
 
 def test_sets_of_different_sampling(sim_set, files):
-    other = InputSet(sim_set.prepared, 10.0, Path("other.lh5"), sim_set.energies_kev)
+    other = InputSet(
+        sim_set.prepared, 10.0, Path("other.lh5"), sim_set.energies_kev, sim_set.recipe
+    )
     require_same_sampling(sim_set, sim_set)
     with pytest.raises(CpunetError) as error:
         require_same_sampling(sim_set, other)
@@ -115,3 +127,42 @@ def test_a_range_of_energies(files, tmp_path, caplog):
     assert [note for note in caplog.messages if "trained on" in note] == [told]
     assert made.peak == "1500-2200"
     assert made.sim.used == 20
+
+
+def of_late_pulses(folder: Path, first: int) -> PulseFile:
+    """Measured traces of 16 µs, in which a third of the pulses is at half height too late."""
+    n, rng = 240, np.random.default_rng(2)
+    at = first + np.linspace(0, 60, n)[:, np.newaxis]
+    time = np.arange(1000) - at
+    pulses = np.exp(-np.maximum(time, 0) / 4000) / (1 + np.exp(-np.clip(time, -50, 50)))
+    raw = 1000 + 10 * KEV[0] * pulses + rng.normal(0, 20, pulses.shape)
+    whole = Pulses.of(raw, dt_ns=16.0, energy_kev=np.full(n, KEV[0]))
+    write_pulses(folder / "late.lh5", whole, table="geds/raw", waveform_units="ADC")
+    return PulseFile(folder / "late.lh5")
+
+
+def test_windows_end_where_traces_do(tmp_path, caplog):
+    """Without its slow pulses, a set has another distribution of drift times."""
+    recipe, file = load_recipe("fast"), of_late_pulses(tmp_path, 560)
+    selection = parse_selection("FEP", recipe.peaks)
+    as_chosen = load_pulses(file, "measured", recipe, selection)
+    assert as_chosen.prepared.rejections["pulse_at_edge"] == pytest.approx(80, abs=3)
+    assert as_chosen.recipe is recipe
+    with caplog.at_level("WARNING", "cpunet"):
+        whole = load_pulses(file, "measured", recipe, selection, shorten=True)
+    assert "pulse_at_edge" not in whole.prepared.rejections
+    windows, training = whole.recipe.preparation, whole.recipe.training
+    assert windows.after_ns == training.after_ns == 6400 - 320
+    assert whole.prepared.pulses.length == 800 - 20
+    assert [record.getMessage() for record in caplog.records] == [
+        "late.lh5: 32 % of the traces end before their windows would; "
+        "these end 6080 ns after the alignment, not 6400 ns"
+    ]
+
+
+@pytest.mark.parametrize(("recipe", "first"), [("fast", 150), ("fast", 500), ("paper", 560)])
+def test_other_windows_are_those_of_the_recipe(tmp_path, recipe, first):
+    """Shorter ones do not help where traces begin too late; networks have their own."""
+    chosen = load_recipe(recipe)
+    selection, file = parse_selection("FEP", chosen.peaks), of_late_pulses(tmp_path, first)
+    assert load_pulses(file, "measured", chosen, selection, shorten=True).recipe is chosen

@@ -260,7 +260,8 @@ class _Sides:
     ) -> Self:
         """Read and prepare both sides; of the simulated side some `events`."""
         selection = parse_selection(peak, recipe.peaks)
-        data = load_pulses(pair[1], "measured", recipe, selection)
+        data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
+        recipe = data.recipe
         stored = StoredSimulation.read(pair[0].path)
         sim = load_pulses(pair[0], "simulated", recipe, selection)
         require_same_sampling(sim, data)

@@ -41,7 +41,7 @@ from cpunet.pulses.provenance import (
 )
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource, amplitude
-from cpunet.recipes.schema import PreparationConfig, Recipe
+from cpunet.recipes.schema import MatchingConfig, PreparationConfig, Recipe
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +50,8 @@ BLOCK_SIZE = 4096
 FEW = 10  # pulses of the wanted energies whose rejection is a reason
 RATE_TRACES = 512  # first traces of a file, which are checked
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
+# Windows are shorter by these if so many more of a file's first traces contain them.
+SHORTER_NS, MORE, TRIED = tuple(range(0, 3201, 320)), 0.01, 1024
 SWAPPED = "are `sim` and `data` swapped?"
 
 _REMEDIES = {
@@ -136,13 +138,15 @@ class InputSet:
     ``energies_kev`` contains the finite energies of all pulses of the file, selected or not;
     ``read_as`` the reading options, see `PulseFile.options`; ``detector`` the name of the
     simulated detector, if the file contains it; ``baselines`` what noise and pile-up tails need
-    of measured traces; ``counts`` their lowest and highest sample.
+    of measured traces; ``counts`` their lowest and highest sample; ``recipe`` that of its
+    windows.
     """
 
     prepared: Prepared
     dt_ns: float
     path: Path
     energies_kev: FloatColumn
+    recipe: Recipe
     cuts: CutWindows | None = None
     read_as: dict[str, Any] = field(default_factory=dict)
     detector: str | None = None
@@ -179,6 +183,7 @@ def load_pulses(
     *,
     max_pulses: int | None = None,
     tell: bool = True,
+    shorten: bool = False,
 ) -> InputSet:
     """Read and prepare the selected pulses of a file; measured ones have their quality cuts.
 
@@ -194,6 +199,8 @@ def load_pulses(
         Use a sample of so many pulses, if there are more.
     tell
         Whether the log has the counts.
+    shorten
+        Whether windows may be shorter than those of the recipe, if traces end before them.
 
     Raises
     ------
@@ -201,7 +208,8 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        recipe = recipe.at(source.dt_ns)
+        chosen = _within_traces(source, recipe) if shorten else recipe
+        recipe = chosen.at(source.dt_ns)
         recorded = recorded_side(source)
         refuse_other_side(recorded, file.path, side, SWAPPED)
         guess = recorded is None and not file.insist
@@ -236,9 +244,46 @@ def load_pulses(
         counts = int(low), int(high)
     kev = raw.energies_kev[np.isfinite(raw.energies_kev)]
     return InputSet(
-        prepared, source.dt_ns, file.path, kev, cuts, file.options,
+        prepared, source.dt_ns, file.path, kev, chosen, cuts, file.options,
         recorded_detector(source), baselines, counts,
     )  # fmt: skip
+
+
+def _within_traces(source: PulseSource, recipe: Recipe) -> Recipe:
+    """The recipe with windows that end as early as the traces of a file ask for.
+
+    Slow pulses are late in their traces.  Without them, the distribution of drift times would
+    be another one than that simulated.
+    """
+    training, windows = recipe.training, recipe.preparation
+    if not isinstance(training, MatchingConfig):  # networks have windows of their own
+        return recipe
+    block, outside, tried = next(source.blocks(TRIED)), [], []
+    for shorter in SHORTER_NS:
+        after, decay = windows.after_ns - shorter, windows.decay_fit_ns - shorter
+        if min(after - training.level_ns, decay) <= 0:
+            break
+        to = {"after_ns": after, "decay_fit_ns": decay}
+        within = {"after_ns": min(training.after_ns, after)}
+        changed = {
+            "preparation": windows.model_copy(update=to),
+            "training": training.model_copy(update=within),
+        }
+        tried.append(recipe.model_copy(update=changed))
+        codes = prepare(block, tried[-1].at(source.dt_ns).preparation, "measured").codes
+        edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
+        outside.append(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
+        if outside[0] <= MORE:
+            return recipe
+    if outside[0] - min(outside) <= MORE:
+        return recipe
+    best = next(i for i, share in enumerate(outside) if share <= min(outside) + 0.5 * MORE)
+    end = tried[best].preparation.after_ns
+    log.warning(
+        f"{source.path.name}: {100 * outside[0]:.2g} % of the traces end before their windows "
+        f"would; these end {end:g} ns after the alignment, not {windows.after_ns:g} ns"
+    )
+    return tried[best]
 
 
 @dataclass(frozen=True, eq=False)

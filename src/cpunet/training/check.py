@@ -241,10 +241,14 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
     selection = parse_selection(peak, recipe.peaks)
     findings: list[Finding] = []
     sets: dict[str, InputSet] = {}
-    kinds: tuple[tuple[str, Kind], ...] = (("sim", "simulated"), ("data", "measured"))
-    for (side, kind), file in zip(kinds, pair, strict=True):
+    kinds: tuple[tuple[str, Kind], ...] = (("data", "measured"), ("sim", "simulated"))
+    for (side, kind), file in zip(kinds, pair[::-1], strict=True):
         try:
-            sets[side] = load_pulses(file, kind, recipe, selection, tell=False)
+            measured = side == "data"
+            sets[side] = load_pulses(
+                file, kind, recipe, selection, tell=False, shorten=measured
+            )
+            recipe = sets[side].recipe
         except CpunetError as error:
             findings.append(_refusal(error))
     if len(sets) < 2:

@@ -103,11 +103,17 @@ class TrainingJob:
         """Read and prepare both sides, and warn of what makes a training on them doubtful."""
         selection = parse_selection(peak, recipe.peaks)
 
-        def read(energies: EnergySelection, tell: bool = True) -> tuple[InputSet, InputSet]:
-            sim = load_pulses(pair[0], "simulated", recipe, energies, tell=tell)
-            return sim, load_pulses(pair[1], "measured", recipe, energies, tell=tell)
+        data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
+        recipe = data.recipe
 
-        sim, data = read(selection)
+        def simulated(energies: EnergySelection, tell: bool = True) -> InputSet:
+            return load_pulses(pair[0], "simulated", recipe, energies, tell=tell)
+
+        def both(energies: EnergySelection) -> tuple[InputSet, InputSet]:
+            measured = load_pulses(pair[1], "measured", recipe, energies, tell=False)
+            return simulated(energies, tell=False), measured
+
+        sim = simulated(selection)
         require_same_sampling(sim, data)
         require_both_sides(sim, data, selection)
         for finding in compare_sides(sim, data, selection, recipe.preparation):
@@ -120,7 +126,7 @@ class TrainingJob:
         fewest = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
         more = None
         if fewest >= MIN_PULSES and not selection.ranges_kev:
-            more = partial(read, away, tell=False)
+            more = partial(both, away)
         how |= {"sim": sim, "data": data, "init": init, "continuum": more}
         return cls(recipe.at(data.dt_ns), peak, folder=folder, **how)
 

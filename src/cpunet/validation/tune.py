@@ -108,8 +108,9 @@ def tune(
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
     selection = parse_selection(peak, recipe.peaks)
+    measured = load_pulses(sides[1], "measured", recipe, selection, shorten=True)
+    recipe = measured.recipe  # with windows that the traces contain
     simulated = load_pulses(sides[0], "simulated", recipe, selection)
-    measured = load_pulses(sides[1], "measured", recipe, selection)
     require_same_sampling(simulated, measured)
     require_both_sides(simulated, measured, selection)
     held_out = HeldOut.of(simulated, measured, recipe, seed)
