@@ -41,6 +41,7 @@ HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
         ({"channel": HALF}, "channel=7", HALF == 7),
         ({"fch_id": HALF.astype("u2")}, "fch_id=3", HALF == 3),
         ({"chnid": HALF.astype(float)}, "chnid=7", HALF == 7),
+        ({"chnid": PAIRS}, "chnid=1", PAIRS == 1),
         ({"det_uid": HALF, "card": 0 * HALF}, "det_uid=7", HALF == 7),
         ({"card": PAIRS, "channel": HALF}, "card=1,channel=3", (HALF == 3) & (PAIRS == 1)),
         ({"rawid": 10 * PAIRS + HALF, "slot": PAIRS}, "rawid=13", (HALF == 3) & (PAIRS == 1)),
@@ -55,14 +56,16 @@ def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
         pulses = source.read()
         np.testing.assert_array_equal(pulses.waveforms, RAW[rows])
         np.testing.assert_array_equal(pulses.energy_kev, KEV[rows])
-    blocks = list(source.blocks(2))
-    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), RAW[rows])
+    for size in (2, N):
+        blocks = list(source.blocks(size))
+        np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), RAW[rows])
+        np.testing.assert_array_equal(np.concatenate([b.energy_kev for b in blocks]), KEV[rows])
     read, left_out = other_columns(source, ["waveform", "energy"])
     assert not left_out
     np.testing.assert_array_equal(read(1, 2)["baseline"].nda, np.flatnonzero(rows)[1:3])
     any_of = ",".join(f"{name}=*" for name in columns)
     assert open_pulses(path, table=any_of).n_pulses == N
-    with pytest.raises(CpunetError, match=r"no channel 4|no column channel"):
+    with pytest.raises(CpunetError, match=r"no channel 4; it holds 3, 7|no column channel"):
         open_pulses(path, table="channel=4")
 
 
@@ -87,8 +90,11 @@ def test_compressed_traces_of_one_channel(tmp_path):
     path, values = tmp_path / "raw.lh5", waveform_table(RAW)
     values["values"].attrs["compression"] = ULEB128ZigZagDiff()
     lh5.write(Table(col_dict={"waveform": values, "channel": Array(HALF)}), "raw", path)
-    found = open_pulses(path, table="channel=3").read()
-    np.testing.assert_array_equal(found.waveforms, RAW[HALF == 3])
+    for table, rows in (("raw/channel=*", slice(None)), ("channel=3", HALF == 3)):
+        found = open_pulses(path, table=table)
+        assert found.length == LENGTH
+        found = np.concatenate([block.waveforms for block in found.blocks(5)])
+        np.testing.assert_array_equal(found, RAW[rows])
 
 
 @pytest.mark.parametrize("whole", [True, False])

@@ -13,7 +13,7 @@ from lgdo import Array, Table, VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.doubts import go_down, mismatched, rolled_over, second_rate
+from cpunet.pulses.doubts import mismatched, rolled_over, second_rate
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
@@ -45,15 +45,6 @@ def written(path, waveforms, energies, numbers=None) -> PulseFile:
         path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies, event_number=numbers)
     )
     return PulseFile(path)
-
-
-def test_the_polarity_is_the_reason_and_not_the_energies(tmp_path):
-    energies = kev()
-    assert go_down(traces(energies, sign=-1).astype(np.float32))
-    assert not go_down(traces(energies).astype(np.float32))
-    file = written(tmp_path / "down.lh5", traces(energies, sign=-1), energies)
-    with pytest.raises(CpunetError, match="polarity is negative; invert them"):
-        load_pulses(file, "measured", RECIPE, FEP)
 
 
 @pytest.mark.parametrize("resolution", [0.0, 0.02])
@@ -139,50 +130,17 @@ def test_energies_of_other_events_are_refused(tmp_path):
         open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e")
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.uint16])
-def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, kind, caplog):
+def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, caplog):
+    """Ragged pulses of a digitiser are refused: test_lh5.py."""
     caplog.set_level(logging.INFO)
-    parts = [np.array([0, 1, 3], kind), np.array([0, 5], kind), np.array([0, 1, 2, 7], kind)]
-    values = VectorOfVectors(
-        cumulative_length=Array(np.cumsum([len(part) for part in parts])),
-        flattened_data=Array(np.concatenate(parts)),
-    )
+    values = VectorOfVectors([[0, 1, 3], [0, 5], [0, 1, 2, 7]], dtype=np.float32)
     columns = {"waveform": waveform_table(values)}
     lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
     source = open_pulses(tmp_path / "sim.lh5")
-    if kind is np.uint16:  # as a digitiser has them
-        with pytest.raises(CpunetError, match="3 samples, others have 4; split the file"):
-            source.read()
-        return
     expected = [[0, 1, 3, 3], [0, 5, 5, 5], [0, 1, 2, 7]]
     np.testing.assert_array_equal(source.read().waveforms, expected)
     np.testing.assert_array_equal(next(source.blocks(2)).waveforms, expected[:2])
     assert any("2 to 4 samples are continued" in message for message in caplog.messages)
-
-
-@pytest.mark.parametrize(("table", "n_first"), [("sim/chnid=2", 50), ("chnid=2", 3)])
-def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
-    path, energies, values = tmp_path / "sim.lh5", kev(), traces(kev())
-    contacts = np.repeat([1, 2], [n_first, N - n_first])
-    energy = Array(energies, attrs={"units": "keV"})
-    columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform_table(values)}
-    lh5.write(Table(col_dict=columns), "sim", path)
-    with pytest.raises(CpunetError, match=r"chnid=1, chnid=2.*`table` chnid=1"):
-        open_pulses(path)
-    with pytest.raises(CpunetError, match=r"no chnid 3; it holds 1, 2"):
-        open_pulses(path, table="chnid=3")
-    with open_pulses(path, table=table) as source:
-        assert source.n_pulses == N - n_first
-        for size in (7, N):
-            blocks = list(source.blocks(size))
-            found = np.concatenate([block.waveforms for block in blocks])
-            np.testing.assert_array_equal(found, values[n_first:])
-            kev_found = np.concatenate([block.energy_kev for block in blocks])
-            np.testing.assert_array_equal(kev_found, energies[n_first:])
-    with h5py.File(path, "a") as file:
-        file["sim/chnid"][...] = np.arange(N) % 2
-    mixed = open_pulses(path, table="chnid=1").read()
-    np.testing.assert_array_equal(mixed.waveforms, values[1::2])
 
 
 @pytest.mark.parametrize("bits", [12, 14, 16])
@@ -247,12 +205,6 @@ def test_arrays_that_could_be_traces_are_named(tmp_path):
         file["mc/pos"] = np.zeros((50, 3))
     with pytest.raises(CpunetError, match="no waveforms in it; it holds mc; give a file of"):
         open_pulses(tmp_path / "hits.lh5")
-    with h5py.File(tmp_path / "dsp.lh5", "w") as file:
-        file["ch1/dsp/blsub"] = np.zeros((3, 50))
-    with pytest.raises(
-        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*`table`"
-    ):
-        open_pulses(tmp_path / "dsp.lh5")
 
 
 TIME = np.arange(800)
