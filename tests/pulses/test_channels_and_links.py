@@ -6,10 +6,8 @@ import re
 from pathlib import Path
 
 import h5py
-import lh5
 import numpy as np
 import pytest
-from lgdo import Array, Table
 from lh5.compression import ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
@@ -17,7 +15,7 @@ from cpunet.pulses.channels import channels_of
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile, table_sizes
 from cpunet.pulses.row_columns import other_columns
-from synthetic import one_line, waveform_table
+from synthetic import one_line, waveform_table, write_table
 
 N, LENGTH = 12, 40
 RAW = np.random.default_rng(1).integers(0, 60000, (N, LENGTH), dtype=np.uint16)
@@ -25,11 +23,7 @@ KEV = np.linspace(100, 2000, N)
 
 
 def write(path: Path, table: str = "raw", traces=RAW, kev=KEV, **columns) -> Path:
-    content = {"waveform": waveform_table(traces), "energy": Array(kev, attrs={"units": "keV"})}
-    content |= {name: Array(np.asarray(values)) for name, values in columns.items()}
-    mode = "append" if path.exists() else "overwrite_file"
-    lh5.write(Table(col_dict=content), table, path, wo_mode=mode)
-    return path
+    return write_table(path, table, traces, kev, **columns)
 
 
 HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
@@ -87,9 +81,9 @@ def test_channels_that_are_text_and_arrays_of_numpy(tmp_path):
 
 
 def test_compressed_traces_of_one_channel(tmp_path):
-    path, values = tmp_path / "raw.lh5", waveform_table(RAW)
+    values = waveform_table(RAW)
     values["values"].attrs["compression"] = ULEB128ZigZagDiff()
-    lh5.write(Table(col_dict={"waveform": values, "channel": Array(HALF)}), "raw", path)
+    path = write_table(tmp_path / "raw.lh5", "raw", values, channel=HALF)
     for table, rows in (("raw/channel=*", slice(None)), ("channel=3", HALF == 3)):
         found = open_pulses(path, table=table)
         assert found.length == LENGTH
@@ -101,9 +95,8 @@ def test_compressed_traces_of_one_channel(tmp_path):
 def test_energies_of_another_file_are_those_of_the_channel(tmp_path, whole):
     path = write(tmp_path / "raw.lh5", channel=HALF, eventnumber=np.arange(N) // 2)
     rows = slice(None) if whole else HALF == 7
-    hits = {"E_cal": Array(KEV[rows] + 1), "eventnumber": Array((np.arange(N) // 2)[rows])}
-    lh5.write(Table(col_dict=hits), "hit", tmp_path / "hit.lh5")
-    energy = f"{tmp_path}/hit.lh5:hit/E_cal"
+    hits = {"E_cal": KEV[rows] + 1, "eventnumber": (np.arange(N) // 2)[rows]}
+    energy = f"{write_table(tmp_path / 'hit.lh5', 'hit', **hits)}:hit/E_cal"
     assert list(channels_of(PulseFile(path, "all", energy))) == ["channel_3", "channel_7"]
     source = open_pulses(path, table="channel=7", energy=energy)
     np.testing.assert_array_equal(source.read().energy_kev, KEV[HALF == 7] + 1)

@@ -6,10 +6,9 @@ import logging
 import re
 
 import h5py
-import lh5
 import numpy as np
 import pytest
-from lgdo import Array, Table, VectorOfVectors
+from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
@@ -20,7 +19,7 @@ from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
-from synthetic import load_recipe, waveform_table, write_pulses
+from synthetic import load_recipe, waveform_table, write_pulses, write_table
 
 RECIPE = load_recipe("fast")
 FEP = parse_selection("FEP", RECIPE.peaks)
@@ -109,34 +108,25 @@ def test_energies_of_another_file_are_joined_by_the_events_of_both(tmp_path, key
     """Rows in another order, and fewer of them."""
     caplog.set_level(logging.INFO)
     numbers, energies = np.arange(100, 100 + N), kev()
-    raw = {key: Array(numbers), "waveform": waveform_table(traces(energies))}
-    lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
+    raw = write_table(tmp_path / "raw.lh5", "ch1/raw", traces(energies), **{key: numbers})
     order = np.random.default_rng(2).permutation(N)[: N - 10]
-    hit = {key: Array(numbers[order]), "e": Array(energies[order], attrs={"units": "keV"})}
-    lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
-    found = open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e").read()
+    hit = tmp_path / "hit.lh5"
+    write_table(hit, "ch1/hit", kev=energies[order], **{key: numbers[order]})
+    found = open_pulses(raw, energy=f"{hit}:ch1/hit/energy").read()
     wanted = energies.copy()
     wanted[np.setdiff1d(np.arange(N), order)] = np.nan
     np.testing.assert_array_equal(found.energy_kev, wanted)
     assert any(f"joined by {key}, 10 of {N}" in message for message in caplog.messages)
-
-
-def test_energies_of_other_events_are_refused(tmp_path):
-    raw = {"event_number": Array(np.arange(N)), "waveform": waveform_table(traces(kev()))}
-    lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
-    hit = {"event_number": Array(np.arange(N) + N), "e": Array(kev(), attrs={"units": "keV"})}
-    lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
+    write_table(hit, "ch1/other", kev=energies, **{key: numbers + N})
     with pytest.raises(CpunetError, match="of other events"):
-        open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e")
+        open_pulses(raw, energy=f"{hit}:ch1/other/energy")
 
 
 def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, caplog):
     """Ragged pulses of a digitiser are refused: test_lh5.py."""
     caplog.set_level(logging.INFO)
     values = VectorOfVectors([[0, 1, 3], [0, 5], [0, 1, 2, 7]], dtype=np.float32)
-    columns = {"waveform": waveform_table(values)}
-    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
-    source = open_pulses(tmp_path / "sim.lh5")
+    source = open_pulses(write_table(tmp_path / "sim.lh5", "sim", waveform_table(values)))
     expected = [[0, 1, 3, 3], [0, 5, 5, 5], [0, 1, 2, 7]]
     np.testing.assert_array_equal(source.read().waveforms, expected)
     np.testing.assert_array_equal(next(source.blocks(2)).waveforms, expected[:2])
@@ -188,11 +178,7 @@ def test_reversed_dimensions_are_named(tmp_path, suffix):
 
 
 def test_units_in_an_array_of_one(tmp_path):
-    columns = {
-        "energy": Array(kev(), attrs={"units": "MeV"}),
-        "waveform": waveform_table(traces(kev())),
-    }
-    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
+    write_table(tmp_path / "sim.lh5", "sim", traces(kev()), kev())
     with h5py.File(tmp_path / "sim.lh5", "a") as file:
         file["sim/energy"].attrs["units"] = np.array(["MeV"], h5py.string_dtype())
         file["sim/waveform/dt"].attrs["units"] = np.array([b"ns"])
