@@ -126,9 +126,8 @@ def test_noise_without_energies_is_refused(ren, sim, tensor: bool) -> None:
 
 @pytest.mark.parametrize("energies", [np.ones(N - 1), np.ones((N, 2))])
 def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) -> None:
-    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .* for {N} pulses") as error:
+    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .* for {N} pulses"):
         ren.translate(sim, energy_kev=energies)
-    assert "\n" not in str(error.value)
 
 
 def test_the_inverse_adds_no_tails(iren) -> None:

@@ -38,10 +38,10 @@ from synthetic import (
     in_traces,
     load_recipe,
     nearly_full_disk,
-    waveform_table,
     write_chain,
     write_pulses,
     write_run,
+    write_table,
 )
 
 DT_NS, N = 16.0, 40
@@ -105,15 +105,10 @@ def network(tmp_path_factory):
 def sim_file(path, n=N, seed=1, **others):
     """An LH5 file by the LH5 library, with columns of many kinds."""
     rng = np.random.default_rng(seed)
-    content = {
-        "waveform": waveform_table(charge(n, seed)),
-        "energy": Array(rng.uniform(500, 2600, n), attrs={"units": "keV"}),
-        "event_number": Array(7 + 2 * np.arange(n)),
-    }
-    lh5.write(
-        Table(col_dict=content | others), "sim", path, group="geds", wo_mode="overwrite_file"
+    numbers = {"event_number": 7 + 2 * np.arange(n)}
+    return write_table(
+        path, "geds/sim", charge(n, seed), rng.uniform(500, 2600, n), **numbers | others
     )
-    return path
 
 
 def many_columns(n=N):
@@ -337,11 +332,8 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     bad, out = tmp_path / "bad.lh5", tmp_path / "out"
     bad.write_bytes(many[0].path.read_bytes()[:3000])
     sources = [PulseFile(bad), *many]
-    with pytest.raises(
-        CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"
-    ) as error:
+    with pytest.raises(CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"):
         translate(run, sources, out, jobs=jobs)
-    assert "\n" not in str(error.value)
     assert sum("bad.lh5" in note for note in caplog.messages) == 1
     assert names(out) == names(sequential[0])
     for path in sequential[0].iterdir():

@@ -111,6 +111,5 @@ def test_another_sampling_period_is_refused(ren, sim):
 
 @pytest.mark.parametrize("shape", [(), (2, 3, 225), (3, 0)])
 def test_shapes_that_are_no_pulses(ren, shape):
-    with pytest.raises(CpunetError) as error:
+    with pytest.raises(CpunetError):
         ren.translate(np.zeros(shape, np.float32))
-    assert "\n" not in str(error.value)
