@@ -52,6 +52,22 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(f"the {minutes:g} minutes for slow tests are over")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def every_error_is_one_line() -> Iterator[None]:
+    """Of all that any test provokes."""
+    from cpunet.errors import CpunetError
+
+    begin = CpunetError.__init__
+
+    def checked(error: CpunetError, *given: Any, **options: Any) -> None:
+        begin(error, *given, **options)
+        assert "\n" not in str(error), error
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CpunetError, "__init__", checked)
+        yield
+
+
 @pytest.fixture
 def stages(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float | None]]:
     """Total and steps of each stage of the work, by title."""

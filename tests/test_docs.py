@@ -225,7 +225,7 @@ def test_the_distribution_is_not_the_authors():
     assert citation["version"] == cpunet.__version__
 
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = ROOT / "docs"
 HOOKS = DOCS / "hooks"
 NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
 BASH = "%%bash\n"
@@ -321,7 +321,7 @@ def test_notebooks_run_from_top_to_bottom(notebook, tmp_path, monkeypatch):
     assert (tmp_path / "report" / "report.html").exists()
 
 
-PAGE = ROOT / "docs" / "troubleshooting.md"
+PAGE = DOCS / "troubleshooting.md"
 QUOTED = re.findall(r"^\| `(.+?)` \|", PAGE.read_text(), re.MULTILINE)
 
 

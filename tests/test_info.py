@@ -64,7 +64,11 @@ def test_tails_of_a_bench_detector(reference_data: Path):
     tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
     lines = info(path, read=FileOptions(kev_per_adc=calibrated), quality=True).lines
     assert lines[-2:] == tails.describe().in_words()
+    assert tails.fit.recorded
+    assert tails.decay_us == pytest.approx(85, rel=0.04)
     assert tails.describe().rate_khz == pytest.approx(1.4, abs=0.3)
+    for share in tails.describe().percent_above.values():  # of a thousand traces
+        assert share["measured"] == pytest.approx(share["law"], abs=3)
     assert len(tails.kev) == 1000
     assert np.nanmean(tails.kev > 10) == pytest.approx(0.3, abs=0.03)
 
@@ -164,16 +168,7 @@ def test_the_properties_are_those_that_were_made():
         trace_properties(Pulses.of(np.ones((n, 200)), dt_ns=16), RECIPE.preparation)
 
 
-def test_a_simulation_tells_how_it_was_made(stand_of_one_detector: Path):
-    told = dict(info(stand_of_one_detector).lines)
-    assert told["made by"].startswith("cpunet simulate")
-    assert told["detector"].startswith("ppc, 2500 V, 90 K, charge clouds of 0.1")
-    assert told["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
-
-
-@pytest.fixture
-def stand_of_one_detector(tmp_path: Path) -> Path:
-    """A file with the attributes of ``cpunet simulate``."""
+def test_a_simulation_tells_how_it_was_made(tmp_path: Path):
     made = {
         "detector": {"name": "ppc", "bias_V": 2500.0, "temperature_K": 90.0},
         "settings": {"cloud_fwhm_mm": 0.1},
@@ -185,7 +180,10 @@ def stand_of_one_detector(tmp_path: Path) -> Path:
     attrs = {"made_by": "cpunet simulate 0.1.0", "simulation": json.dumps(made)}
     path = tmp_path / "sim.lh5"
     write_pulses(path, Pulses.of(np.tile(np.arange(300.0), (3, 1)), dt_ns=16), attrs=attrs)
-    return path
+    told = dict(info(path).lines)
+    assert told["made by"].startswith("cpunet simulate")
+    assert told["detector"].startswith("ppc, 2500 V, 90 K, charge clouds of 0.1")
+    assert told["hits"] == "hits.npz, origin [0.0, 0.0, 0.0] mm"
 
 
 def test_traces_that_are_no_numbers(tmp_path):

@@ -181,9 +181,8 @@ def test_values_are_overridden_in_turn():
     assert load_recipe("published").training.batch_size == 32
 
 
-@pytest.mark.parametrize(
-    ("override", "part"),
-    [
+WRONG = {
+    "published": [
         ("training.batch_siez=16", "batch_siez: no such setting; did you mean batch_size?"),
         ("training.batch_size", "expected KEY=VALUE"),
         ("training.batch_size=[", "not YAML"),
@@ -192,14 +191,7 @@ def test_values_are_overridden_in_turn():
         ("preparation.before_ns=4800", "the loss windows cover 12800 ns"),
         ("preparation.baseline_ns=6400", "baseline_ns must be less than before_ns"),
     ],
-)
-def test_wrong_settings_are_named(override, part):
-    one_line(lambda: load_recipe("published", [override]), part)
-
-
-@pytest.mark.parametrize(
-    ("override", "part"),
-    [
+    "fast": [
         ("training.method=cyclegan", "training"),
         ("training.start_factors=[a, 1]", "training.start_factors.0: "),
         ("generator.slow_ns=[100, 100.0]", "times must differ"),
@@ -208,9 +200,15 @@ def test_wrong_settings_are_named(override, part):
         ("search={a: {low: 1, choices: [1, 2]}}", "give either low and high, or choices"),
         ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),
     ],
+}
+
+
+@pytest.mark.parametrize(
+    ("recipe", "override", "part"),
+    [(name, *row) for name, rows in WRONG.items() for row in rows],
 )
-def test_wrong_settings_of_a_matching_are_named(override, part):
-    one_line(lambda: load_recipe("fast", [override]), part)
+def test_wrong_settings_are_named(recipe, override, part):
+    one_line(lambda: load_recipe(recipe, [override]), part)
 
 
 @pytest.mark.parametrize("dt_ns", [1, 2, 4, 8, 10, 12.5, 16])

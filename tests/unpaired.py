@@ -109,22 +109,7 @@ def edge_errors(response: ElectronicsResponse) -> np.ndarray:
 
 
 def crossing(records: Floats, level: float, last: Ints) -> tuple[Floats, Ints]:
-    """Last upward crossing of a level before a sample, by linear interpolation.
-
-    Parameters
-    ----------
-    records
-        Shape (pulses, samples).
-    level
-        Level that is crossed.
-    last
-        Sample of each pulse from which the search goes backward, shape (pulses,).
-
-    Returns
-    -------
-    tuple of arrays
-        Time of each crossing in samples, and the sample before it.
-    """
+    """Last upward crossing of a level before a sample, and the sample before it."""
     index = np.arange(records.shape[1] - 1)
     below = (records[:, :-1] < level) & (index < last[:, None])
     before = np.maximum((below * (index + 1)).max(axis=1) - 1, 0)
@@ -136,24 +121,9 @@ def crossing(records: Floats, level: float, last: Ints) -> tuple[Floats, Ints]:
 def at_half_maximum(
     records: Floats, level: float, last: int, config: MatchingConfig, tail_level: float
 ) -> Floats:
-    """Align records, subtract the baseline and scale.
+    """Records aligned at a level that is crossed, without baseline, scaled to the tail's level.
 
-    Parameters
-    ----------
-    records
-        Shape (pulses, samples), of about the height of prepared pulses.
-    level
-        Half of the maximum of the data's mean pulse, the same number for all sets.
-    last
-        Sample from which the crossing is searched for backward.
-    config, tail_level
-        Ranges of baseline and level, and the value that the level is scaled to.
-
-    Returns
-    -------
-    array
-        Windows of ``before + after`` samples around the crossing, shifted by fractions of a
-        sample.
+    Windows of ``before + after`` samples around the crossing, moved by fractions of a sample.
     """
     _, sample = crossing(records, level, np.full(len(records), last))
     first, stop = config.baseline

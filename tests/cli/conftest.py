@@ -9,13 +9,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import lh5
 import numpy as np
 import numpy.typing as npt
 import pytest
-from lgdo import Array, Table
 
-from synthetic import after_pole_and_decay, in_traces, status_of, waveform_table
+from synthetic import after_pole_and_decay, in_traces, status_of, waveform_table, write_table
 
 DT_NS = 16.0
 PEAKS_KEV = {"DEP": 1592.511, "SEP": 2103.511, "FEP": 2614.511}
@@ -82,17 +80,10 @@ def write(
     dt_ns: float = DT_NS,
 ) -> Path:
     """An LH5 table as LEGEND's software writes it, not by this package's writer."""
-    n = len(waveforms)
-    content = Table(
-        col_dict={
-            "waveform": waveform_table(waveforms, dt_ns, samples=units),
-            "energy": Array(np.asarray(kev, float), attrs={"units": "keV"}),
-            "event_number": Array(1000 + 3 * np.arange(n)),
-        }
-    )
-    group, name = table.split("/")
-    lh5.write(content, name, str(path), group=group, wo_mode="overwrite_file")
-    return path
+    path.unlink(missing_ok=True)
+    traces = waveform_table(waveforms, dt_ns, samples=units)
+    numbers = 1000 + 3 * np.arange(len(waveforms))
+    return write_table(path, table, traces, np.asarray(kev, float), event_number=numbers)
 
 
 @dataclass(frozen=True)

@@ -93,15 +93,6 @@ def test_a_window_shorter_than_the_drift_is_named_with_the_setting_that_mends_it
     assert "another detector" not in done.out
 
 
-def test_another_peak(sides, check):
-    sim, data = sides.write_sim(), sides.write_data(kev=sides.kev - 1000)
-    told = first(check(sim, data))
-    assert "energy_outside_selection" in told
-    assert "Energies there: 1614 to 1615 keV" in told
-    assert "--peak 1600- takes 240 pulses" in told
-    assert "outside" not in first(check(sim, data, "--peak", "1600-"))
-
-
 def test_a_calibration_that_is_off(sides, check):
     sim, data = sides.write_sim(), sides.write_data(kev=sides.kev * 0.99)
     told = next(

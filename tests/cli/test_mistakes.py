@@ -62,6 +62,8 @@ def without(package: str) -> Patch:
 
 
 DESCRIBE = "cpunet.inspection.look"
+NAMES = ("INT", "TERM", "HUP", "QUIT", "USR1", "USR2", "XCPU")  # some of batch systems
+SIGNALS = [getattr(signal, f"SIG{name}") for name in NAMES]
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 MISTAKES = {
     # files
@@ -163,8 +165,12 @@ MISTAKES = {
         r"sim.lh5: No space left on device; make room, or choose another place",
         failing(DESCRIBE, FULL),
     ),
-    "killed": Mistake(WRITE, r"interrupted; .*", signalled(signal.SIGTERM), 143),
-    "Ctrl-C": Mistake(WRITE, r"interrupted; .*", signalled(signal.SIGINT), 130),
+    **{
+        f"stopped by {number.name}": Mistake(
+            WRITE, r"interrupted; .*", signalled(number), 128 + number
+        )
+        for number in SIGNALS
+    },
     # runs and reports
     "half a run": Mistake("translate halfrun sim.lh5 --out out", r"halfrun.*; .*"),
     "a report for a run": Mistake(

@@ -146,27 +146,6 @@ def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     np.testing.assert_allclose(steps[0, lead + 8 : 60], shifted[lead + 8 :], atol=0.01)
 
 
-@pytest.mark.slow
-def test_free_kernel_comes_closest_to_the_truth() -> None:
-    sim_fine, other_fine = ideal(1600, seed=1), ideal(1600, seed=2)
-    sim, kernel = simulated(sim_fine), two_pole_kernel()
-    data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    truth = finish(
-        decayed(sampled(convolved(sim_fine, kernel)), DT_NS), CONFIG, dt_ns=DT_NS
-    ).windows
-    untranslated = finish(padded(sim), CONFIG, dt_ns=DT_NS).windows
-    edge = {"raw": paired_scores(untranslated, truth, 100)["edge_rmse"]}
-    for name, kind in BASELINE_METHODS.items():
-        method = kind.fit(sim, data, DT_NS, ALIGN)
-        windows = method.translate_like_data(sim, CONFIG)
-        assert windows.shape == sim.shape
-        assert np.isfinite(windows).all()
-        edge[name] = paired_scores(windows, truth, 100)["edge_rmse"]
-    assert edge["superpulse"] < edge["gauss_exp"] < edge["raw"]
-    assert edge["rc"] < edge["raw"]
-    assert edge["superpulse"] < 1.5e-3
-
-
 @settings(max_examples=8)
 @given(sigma_ns=st.floats(16, 50), tau_ns=st.floats(16, 150))
 def test_windows_are_those_of_the_true_response(sigma_ns: float, tau_ns: float) -> None:

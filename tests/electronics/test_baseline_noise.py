@@ -241,12 +241,6 @@ def as_input(raw: Pulses) -> InputSet:
     return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, recipe, baselines=baselines)
 
 
-def test_noise_of_raw_traces() -> None:
-    noise = noise_of(as_input(white_traces()))
-    assert noise.rms == pytest.approx(WANTED, rel=0.03)
-    assert noise.n_baselines > 250
-
-
 def test_energies_that_are_not_known_do_not_matter() -> None:
     raw = white_traces(400)
     raw.energy_kev[::4] = np.nan
@@ -257,10 +251,11 @@ def test_energies_that_are_not_known_do_not_matter() -> None:
     assert noise.n_baselines <= 200
 
 
-@pytest.mark.parametrize("start", [300, 240])
+@pytest.mark.parametrize("start", [560, 300, 240])
 def test_short_baselines_tell_the_noise(start: int) -> None:
     noise = noise_of(as_input(white_traces(1200, start=start)))
-    assert noise.rms == pytest.approx(WANTED, rel=0.05)
+    assert noise.rms == pytest.approx(WANTED, rel=0.03 if start == 560 else 0.05)
+    assert noise.n_baselines > 1000
 
 
 def test_prepared_windows_tell_the_noise() -> None:
@@ -268,9 +263,3 @@ def test_prepared_windows_tell_the_noise() -> None:
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
     drawn = noise.draw(np.full(300, 2000.0), 1400, np.random.default_rng(2))
     assert drawn.std() == pytest.approx(WANTED / 2000, rel=0.05)
-
-
-def test_without_energies_there_is_no_noise() -> None:
-    raw = Pulses.of(white_traces(60).waveforms, dt_ns=DT_NS)
-    with pytest.raises(CpunetError, match="only 0 of 60 traces have a known energy"):
-        noise_of(as_input(raw))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,10 +71,8 @@ def made(
     return content
 
 
-@pytest.mark.parametrize("shift", [(), ("default",)])
-def test_the_same_seed_gives_the_same_stand_and_another_another(
-    tmp_path: Path, shift: tuple[str, ...]
-) -> None:
+def test_the_same_seed_gives_the_same_stand_and_another_another(tmp_path: Path) -> None:
+    shift = ("default",)
     first, again = made(tmp_path / "a", 5, shift), made(tmp_path / "b", 5, shift)
     assert first.keys() == again.keys()
     for name, values in first.items():
@@ -91,7 +90,8 @@ def test_the_same_seed_gives_the_same_stand_and_another_another(
 
 def test_the_folder_is_read_and_prepared(tmp_path: Path) -> None:
     made = tmp_path / "stand"
-    make_stand(made, electronics="ornl", events="FEP=40,DEP=20", shift=("default",))
+    coarse = {"electronics": "ornl", "settings": {"grid_mm": 0.5}}
+    make_stand(made, **coarse, events="FEP=40,DEP=20", shift=("default",))
     recipe = load_recipe("fast")
     chosen = parse_selection("FEP,DEP", recipe.peaks)
     sim = load_pulses(PulseFile(made / "sim.lh5"), "simulated", recipe, chosen)
@@ -156,7 +156,7 @@ def test_a_stand_of_any_period_is_the_same_stand(tmp_path: Path) -> None:
             np.testing.assert_allclose(values, same, atol=1e-4)
 
 
-@pytest.mark.parametrize("preset", ["ornl", "legend200", "mjd"])
+@pytest.mark.parametrize("preset", ["legend200", "mjd"])
 def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None:
     values = {"self_repulsion": 0.3, "hole_velocity_low_factor": 0.95}
     settings = SimulationSettings(**values)
@@ -206,9 +206,8 @@ def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
         ({"earlier_pulses.rate_kHz": 1e300}, "earlier_pulses.rate_kHz: Input should be less"),
         ({"bias": 3}, "bias: no such setting"),
     ):
-        with pytest.raises(CpunetError, match=said) as raised:
+        with pytest.raises(CpunetError, match=said):
             make_stand(tmp_path / "a", **SMALL, settings=settings)
-        assert "\n" not in str(raised.value)
     with pytest.raises(CpunetError, match="`events` FEP=0: give at least 1 event"):
         make_stand(tmp_path / "a", events="FEP=0")
     assert list(tmp_path.iterdir()) == []
@@ -231,9 +230,8 @@ def test_a_file_that_cannot_be_made_again_says_why(
     make_stand(tmp_path / "a", **(SMALL | {"events": "FEP=3"}))
     with h5py.File(tmp_path / "a" / "sim.lh5", "r+") as file:
         damage(file)
-    with pytest.raises(CpunetError) as raised:
+    with pytest.raises(CpunetError, match=re.escape(said)):
         StoredSimulation.read(tmp_path / "a" / "sim.lh5")
-    assert said in str(raised.value)
 
 
 def _set(file: h5py.File, name: str, rows: Any, value: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -126,10 +127,8 @@ def test_a_width_without_noise_is_not_exported(chain, tmp_path, caplog) -> None:
 def test_other_reports_are_refused(
     chain: Path, tmp_path: Path, changes: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(CpunetError) as error:
+    with pytest.raises(CpunetError, match=re.escape(words)):
         export_legend(chain, tmp_path / "pars", report=report(tmp_path / "report", **changes))
-    assert words in str(error.value)
-    assert "\n" not in str(error.value)
     assert not (tmp_path / "pars").exists()
 
 

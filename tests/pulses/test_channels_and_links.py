@@ -6,10 +6,8 @@ import re
 from pathlib import Path
 
 import h5py
-import lh5
 import numpy as np
 import pytest
-from lgdo import Array, Table
 from lh5.compression import ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
@@ -17,7 +15,7 @@ from cpunet.pulses.channels import channels_of
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile, table_sizes
 from cpunet.pulses.row_columns import other_columns
-from synthetic import one_line, waveform_table
+from synthetic import one_line, waveform_table, write_table
 
 N, LENGTH = 12, 40
 RAW = np.random.default_rng(1).integers(0, 60000, (N, LENGTH), dtype=np.uint16)
@@ -25,11 +23,7 @@ KEV = np.linspace(100, 2000, N)
 
 
 def write(path: Path, table: str = "raw", traces=RAW, kev=KEV, **columns) -> Path:
-    content = {"waveform": waveform_table(traces), "energy": Array(kev, attrs={"units": "keV"})}
-    content |= {name: Array(np.asarray(values)) for name, values in columns.items()}
-    mode = "append" if path.exists() else "overwrite_file"
-    lh5.write(Table(col_dict=content), table, path, wo_mode=mode)
-    return path
+    return write_table(path, table, traces, kev, **columns)
 
 
 HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
@@ -41,6 +35,7 @@ HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
         ({"channel": HALF}, "channel=7", HALF == 7),
         ({"fch_id": HALF.astype("u2")}, "fch_id=3", HALF == 3),
         ({"chnid": HALF.astype(float)}, "chnid=7", HALF == 7),
+        ({"chnid": PAIRS}, "chnid=1", PAIRS == 1),
         ({"det_uid": HALF, "card": 0 * HALF}, "det_uid=7", HALF == 7),
         ({"card": PAIRS, "channel": HALF}, "card=1,channel=3", (HALF == 3) & (PAIRS == 1)),
         ({"rawid": 10 * PAIRS + HALF, "slot": PAIRS}, "rawid=13", (HALF == 3) & (PAIRS == 1)),
@@ -55,14 +50,16 @@ def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
         pulses = source.read()
         np.testing.assert_array_equal(pulses.waveforms, RAW[rows])
         np.testing.assert_array_equal(pulses.energy_kev, KEV[rows])
-    blocks = list(source.blocks(2))
-    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), RAW[rows])
+    for size in (2, N):
+        blocks = list(source.blocks(size))
+        np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), RAW[rows])
+        np.testing.assert_array_equal(np.concatenate([b.energy_kev for b in blocks]), KEV[rows])
     read, left_out = other_columns(source, ["waveform", "energy"])
     assert not left_out
     np.testing.assert_array_equal(read(1, 2)["baseline"].nda, np.flatnonzero(rows)[1:3])
     any_of = ",".join(f"{name}=*" for name in columns)
     assert open_pulses(path, table=any_of).n_pulses == N
-    with pytest.raises(CpunetError, match=r"no channel 4|no column channel"):
+    with pytest.raises(CpunetError, match=r"no channel 4; it holds 3, 7|no column channel"):
         open_pulses(path, table="channel=4")
 
 
@@ -84,20 +81,22 @@ def test_channels_that_are_text_and_arrays_of_numpy(tmp_path):
 
 
 def test_compressed_traces_of_one_channel(tmp_path):
-    path, values = tmp_path / "raw.lh5", waveform_table(RAW)
+    values = waveform_table(RAW)
     values["values"].attrs["compression"] = ULEB128ZigZagDiff()
-    lh5.write(Table(col_dict={"waveform": values, "channel": Array(HALF)}), "raw", path)
-    found = open_pulses(path, table="channel=3").read()
-    np.testing.assert_array_equal(found.waveforms, RAW[HALF == 3])
+    path = write_table(tmp_path / "raw.lh5", "raw", values, channel=HALF)
+    for table, rows in (("raw/channel=*", slice(None)), ("channel=3", HALF == 3)):
+        found = open_pulses(path, table=table)
+        assert found.length == LENGTH
+        found = np.concatenate([block.waveforms for block in found.blocks(5)])
+        np.testing.assert_array_equal(found, RAW[rows])
 
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_energies_of_another_file_are_those_of_the_channel(tmp_path, whole):
     path = write(tmp_path / "raw.lh5", channel=HALF, eventnumber=np.arange(N) // 2)
     rows = slice(None) if whole else HALF == 7
-    hits = {"E_cal": Array(KEV[rows] + 1), "eventnumber": Array((np.arange(N) // 2)[rows])}
-    lh5.write(Table(col_dict=hits), "hit", tmp_path / "hit.lh5")
-    energy = f"{tmp_path}/hit.lh5:hit/E_cal"
+    hits = {"E_cal": KEV[rows] + 1, "eventnumber": (np.arange(N) // 2)[rows]}
+    energy = f"{write_table(tmp_path / 'hit.lh5', 'hit', **hits)}:hit/E_cal"
     assert list(channels_of(PulseFile(path, "all", energy))) == ["channel_3", "channel_7"]
     source = open_pulses(path, table="channel=7", energy=energy)
     np.testing.assert_array_equal(source.read().energy_kev, KEV[HALF == 7] + 1)

@@ -6,21 +6,20 @@ import logging
 import re
 
 import h5py
-import lh5
 import numpy as np
 import pytest
-from lgdo import Array, Table, VectorOfVectors
+from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.doubts import go_down, mismatched, rolled_over, second_rate
+from cpunet.pulses.doubts import mismatched, rolled_over, second_rate
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
-from synthetic import load_recipe, waveform_table, write_pulses
+from synthetic import load_recipe, waveform_table, write_pulses, write_table
 
 RECIPE = load_recipe("fast")
 FEP = parse_selection("FEP", RECIPE.peaks)
@@ -45,15 +44,6 @@ def written(path, waveforms, energies, numbers=None) -> PulseFile:
         path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies, event_number=numbers)
     )
     return PulseFile(path)
-
-
-def test_the_polarity_is_the_reason_and_not_the_energies(tmp_path):
-    energies = kev()
-    assert go_down(traces(energies, sign=-1).astype(np.float32))
-    assert not go_down(traces(energies).astype(np.float32))
-    file = written(tmp_path / "down.lh5", traces(energies, sign=-1), energies)
-    with pytest.raises(CpunetError, match="polarity is negative; invert them"):
-        load_pulses(file, "measured", RECIPE, FEP)
 
 
 @pytest.mark.parametrize("resolution", [0.0, 0.02])
@@ -118,71 +108,29 @@ def test_energies_of_another_file_are_joined_by_the_events_of_both(tmp_path, key
     """Rows in another order, and fewer of them."""
     caplog.set_level(logging.INFO)
     numbers, energies = np.arange(100, 100 + N), kev()
-    raw = {key: Array(numbers), "waveform": waveform_table(traces(energies))}
-    lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
+    raw = write_table(tmp_path / "raw.lh5", "ch1/raw", traces(energies), **{key: numbers})
     order = np.random.default_rng(2).permutation(N)[: N - 10]
-    hit = {key: Array(numbers[order]), "e": Array(energies[order], attrs={"units": "keV"})}
-    lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
-    found = open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e").read()
+    hit = tmp_path / "hit.lh5"
+    write_table(hit, "ch1/hit", kev=energies[order], **{key: numbers[order]})
+    found = open_pulses(raw, energy=f"{hit}:ch1/hit/energy").read()
     wanted = energies.copy()
     wanted[np.setdiff1d(np.arange(N), order)] = np.nan
     np.testing.assert_array_equal(found.energy_kev, wanted)
     assert any(f"joined by {key}, 10 of {N}" in message for message in caplog.messages)
-
-
-def test_energies_of_other_events_are_refused(tmp_path):
-    raw = {"event_number": Array(np.arange(N)), "waveform": waveform_table(traces(kev()))}
-    lh5.write(Table(col_dict=raw), "ch1/raw", tmp_path / "raw.lh5")
-    hit = {"event_number": Array(np.arange(N) + N), "e": Array(kev(), attrs={"units": "keV"})}
-    lh5.write(Table(col_dict=hit), "ch1/hit", tmp_path / "hit.lh5")
+    write_table(hit, "ch1/other", kev=energies, **{key: numbers + N})
     with pytest.raises(CpunetError, match="of other events"):
-        open_pulses(tmp_path / "raw.lh5", energy=f"{tmp_path}/hit.lh5:ch1/hit/e")
+        open_pulses(raw, energy=f"{hit}:ch1/other/energy")
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.uint16])
-def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, kind, caplog):
+def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, caplog):
+    """Ragged pulses of a digitiser are refused: test_lh5.py."""
     caplog.set_level(logging.INFO)
-    parts = [np.array([0, 1, 3], kind), np.array([0, 5], kind), np.array([0, 1, 2, 7], kind)]
-    values = VectorOfVectors(
-        cumulative_length=Array(np.cumsum([len(part) for part in parts])),
-        flattened_data=Array(np.concatenate(parts)),
-    )
-    columns = {"waveform": waveform_table(values)}
-    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
-    source = open_pulses(tmp_path / "sim.lh5")
-    if kind is np.uint16:  # as a digitiser has them
-        with pytest.raises(CpunetError, match="3 samples, others have 4; split the file"):
-            source.read()
-        return
+    values = VectorOfVectors([[0, 1, 3], [0, 5], [0, 1, 2, 7]], dtype=np.float32)
+    source = open_pulses(write_table(tmp_path / "sim.lh5", "sim", waveform_table(values)))
     expected = [[0, 1, 3, 3], [0, 5, 5, 5], [0, 1, 2, 7]]
     np.testing.assert_array_equal(source.read().waveforms, expected)
     np.testing.assert_array_equal(next(source.blocks(2)).waveforms, expected[:2])
     assert any("2 to 4 samples are continued" in message for message in caplog.messages)
-
-
-@pytest.mark.parametrize(("table", "n_first"), [("sim/chnid=2", 50), ("chnid=2", 3)])
-def test_a_contact_of_one_table_is_chosen(tmp_path, table, n_first):
-    path, energies, values = tmp_path / "sim.lh5", kev(), traces(kev())
-    contacts = np.repeat([1, 2], [n_first, N - n_first])
-    energy = Array(energies, attrs={"units": "keV"})
-    columns = {"chnid": Array(contacts), "energy": energy, "waveform": waveform_table(values)}
-    lh5.write(Table(col_dict=columns), "sim", path)
-    with pytest.raises(CpunetError, match=r"chnid=1, chnid=2.*`table` chnid=1"):
-        open_pulses(path)
-    with pytest.raises(CpunetError, match=r"no chnid 3; it holds 1, 2"):
-        open_pulses(path, table="chnid=3")
-    with open_pulses(path, table=table) as source:
-        assert source.n_pulses == N - n_first
-        for size in (7, N):
-            blocks = list(source.blocks(size))
-            found = np.concatenate([block.waveforms for block in blocks])
-            np.testing.assert_array_equal(found, values[n_first:])
-            kev_found = np.concatenate([block.energy_kev for block in blocks])
-            np.testing.assert_array_equal(kev_found, energies[n_first:])
-    with h5py.File(path, "a") as file:
-        file["sim/chnid"][...] = np.arange(N) % 2
-    mixed = open_pulses(path, table="chnid=1").read()
-    np.testing.assert_array_equal(mixed.waveforms, values[1::2])
 
 
 @pytest.mark.parametrize("bits", [12, 14, 16])
@@ -230,11 +178,7 @@ def test_reversed_dimensions_are_named(tmp_path, suffix):
 
 
 def test_units_in_an_array_of_one(tmp_path):
-    columns = {
-        "energy": Array(kev(), attrs={"units": "MeV"}),
-        "waveform": waveform_table(traces(kev())),
-    }
-    lh5.write(Table(col_dict=columns), "sim", tmp_path / "sim.lh5")
+    write_table(tmp_path / "sim.lh5", "sim", traces(kev()), kev())
     with h5py.File(tmp_path / "sim.lh5", "a") as file:
         file["sim/energy"].attrs["units"] = np.array(["MeV"], h5py.string_dtype())
         file["sim/waveform/dt"].attrs["units"] = np.array([b"ns"])
@@ -247,12 +191,6 @@ def test_arrays_that_could_be_traces_are_named(tmp_path):
         file["mc/pos"] = np.zeros((50, 3))
     with pytest.raises(CpunetError, match="no waveforms in it; it holds mc; give a file of"):
         open_pulses(tmp_path / "hits.lh5")
-    with h5py.File(tmp_path / "dsp.lh5", "w") as file:
-        file["ch1/dsp/blsub"] = np.zeros((3, 50))
-    with pytest.raises(
-        CpunetError, match=r"array of two dimensions \(ch1/dsp/blsub\); .*`table`"
-    ):
-        open_pulses(tmp_path / "dsp.lh5")
 
 
 TIME = np.arange(800)

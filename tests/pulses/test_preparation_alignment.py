@@ -15,11 +15,7 @@ from cpunet.pulses.preparation import Kind, Prepared, Rejection, prepare
 from synthetic import PREPARATION
 
 Array = npt.NDArray[np.float64]
-BEFORE_NS, AFTER_NS, FIT_NS = (
-    PREPARATION.before_ns,
-    PREPARATION.after_ns,
-    PREPARATION.decay_fit_ns,
-)
+AFTER_NS, FIT_NS = PREPARATION.after_ns, PREPARATION.decay_fit_ns
 # white up to the bandwidth, and eleven times as much power at low frequencies, as in presets
 SPECTRUM = NoiseSpectrum(corner_MHz=8.5, order=3, excess=10, excess_corner_kHz=30)
 PERIODS = [1.0, 4.0, 8.0, 10.0, 16.0]
@@ -110,7 +106,7 @@ def test_simulated_pulses_are_aligned_at_half_of_their_charge(dt_ns: float) -> N
 def test_noise_moves_the_alignment_as_it_must_and_no_further(
     snr: float, slow: bool, decay_us: float
 ) -> None:
-    n, rng = 2000, np.random.default_rng(0)
+    n, rng = 1000, np.random.default_rng(0)
     rise = rng.uniform(10, 60, (n, 1))
     pulses = smooth_pulses(n, rise, 1e3 * decay_us / 16, rng)
     clean = prepared_of(pulses)

@@ -203,7 +203,10 @@ def test_content_counts_more_than_the_name(tmp_path):
     assert open_pulses(tmp_path / "pulses.npz").format == "LH5"
 
 
-def write_all(folder: Path) -> list[Path]:
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> list[Path]:
+    """A file of each format."""
+    folder = tmp_path_factory.mktemp("whole")
     values = np.random.default_rng(3).normal(size=(30, 40)).astype("<f4")
     pulses = Pulses.of(values, dt_ns=16, energy_kev=np.arange(30.0))
     write_pulses(folder / "a.lh5", pulses)
@@ -216,11 +219,10 @@ def write_all(folder: Path) -> list[Path]:
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(fraction=st.floats(0, 0.99), which=st.integers(0, 4))
-def test_any_truncation_is_one_line_naming_the_file(tmp_path_factory, fraction, which):
-    folder = tmp_path_factory.mktemp("cut")
-    path = write_all(folder)[which]
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(fraction * len(whole))])
+def test_any_truncation_is_one_line_naming_the_file(whole, fraction, which):
+    content = whole[which].read_bytes()
+    path = whole[which].with_stem("cut")
+    path.write_bytes(content[: int(fraction * len(content))])
     dt_ns = None if path.suffix == ".lh5" else 16
     with pytest.raises(CpunetError, match=r"^[^\n]+; [^\n]+$") as error:
         open_pulses(path, dt_ns=dt_ns).read()

@@ -34,12 +34,11 @@ def significance(result):
     return (result.auc - result.null_mean) / result.null_std
 
 
-@pytest.mark.parametrize("draws", [30, pytest.param(80, marks=pytest.mark.slow)])
-def test_equal_distributions_cannot_be_told_apart(draws):
+def test_equal_distributions_cannot_be_told_apart():
     """Over many draws the AUC is 0.5 within its errors, and so is the null."""
     rng = np.random.default_rng(0)
     results = [
-        classifier_auc(edges(rng, 120), edges(rng, 120), seed=draw) for draw in range(draws)
+        classifier_auc(edges(rng, 120), edges(rng, 120), seed=draw) for draw in range(30)
     ]
     aucs = np.array([r.auc for r in results])
     assert aucs.mean() == pytest.approx(0.5, abs=0.015)
@@ -49,18 +48,6 @@ def test_equal_distributions_cannot_be_told_apart(draws):
     assert np.mean([abs(significance(r)) < 2 for r in results]) > 0.85
     within = [abs(r.auc - 0.5) < 2 * r.auc_std for r in results]
     assert np.mean(within) > 0.85
-
-
-@pytest.mark.parametrize("draws", [30, pytest.param(60, marks=pytest.mark.slow)])
-@pytest.mark.thorough
-def test_error_is_the_spread_over_repeated_samples(draws):
-    rng = np.random.default_rng(17)
-    results = [
-        classifier_auc(windows(rng, 100), windows(rng, 100, mean=1.0), seed=draw)
-        for draw in range(draws)
-    ]
-    spread = np.std([r.auc for r in results])
-    assert spread == pytest.approx(np.mean([r.auc_std for r in results]), rel=0.3)
 
 
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])

@@ -79,11 +79,8 @@ def test_the_examples_are_depleted(name: str) -> None:
 
 
 def test_an_undepleted_detector_is_refused() -> None:
-    with pytest.raises(
-        CpunetError, match=r"bias_V = 2000 .*depletion voltage, 32\d\d V"
-    ) as caught:
+    with pytest.raises(CpunetError, match=r"bias_V = 2000 .*depletion voltage, 32\d\d V"):
         compute_fields(read_detector("icpc", [*COARSE, "bias_V=2000"]))
-    assert "\n" not in str(caught.value)
     with pytest.raises(CpunetError, match="impurity_z0"):
         compute_fields(read_detector("icpc", [*COARSE, "impurity_z0_1e10_per_cm3=-90"]))
 
@@ -141,20 +138,24 @@ def test_any_bias_and_impurity_from_one_solution(
 ) -> None:
     detector = read_detector("ppc", [*COARSE, *more])
     solution = solve(detector)
-    for bias, scale in ((2500.0, 1.0), (3100.0, 1.2), (2200.0, 0.6)):
-        wanted = {"bias_V": bias, "impurity_scale": scale, "temperature_K": 80}
-        fields = superposed_fields(solution, detector.model_copy(update=wanted))
+    for bias, scale, tilt in ((2500.0, 1.0, 0.0), (3000.0, 1.1, 0.03), (2200.0, 0.6, 0.0)):
+        values = {"bias_V": bias, "impurity_scale": scale, "impurity_tilt_1e10_per_cm4": tilt}
+        wanted = detector.model_copy(update=values)
+        fields = superposed_fields(solution, wanted.model_copy(update={"temperature_K": 80}))
         # solved for on its own, the impurities written down as they are
-        changed = {"impurity_z0_1e10_per_cm3": -0.8, "impurity_gradient_1e10_per_cm4": 0.08}
-        changed = {key: scale * value for key, value in changed.items()} | {"bias_V": bias}
-        alone = compute_fields(detector.model_copy(update=changed), cache=False)
+        z0 = scale * detector.impurity_z0_1e10_per_cm3 - tilt * detector.crystal_length / 20
+        gradient = scale * detector.impurity_gradient_1e10_per_cm4 + tilt
+        written = {"impurity_z0_1e10_per_cm3": z0, "impurity_gradient_1e10_per_cm4": gradient}
+        alone = detector.model_copy(update=written | {"bias_V": bias})
+        expected = compute_fields(alone, cache=False)
         for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm", "weighting_potential"):
-            np.testing.assert_allclose(getattr(fields, name), getattr(alone, name), atol=1e-6)
-        assert fields.depletion_V == pytest.approx(alone.depletion_V, abs=1)
-        changed = {"bias_V": bias, "impurity_scale": scale}
+            np.testing.assert_allclose(
+                getattr(fields, name), getattr(expected, name), atol=1e-6
+            )
+        assert fields.depletion_V == pytest.approx(expected.depletion_V, abs=1)
         with caplog.at_level("DEBUG", "cpunet"):
-            again = compute_fields(detector.model_copy(update=changed))
-        np.testing.assert_array_equal(again.potential_V, fields.potential_V)
+            again = compute_fields(wanted)
+        assert same(again, fields)
     assert not caplog.messages
 
 
@@ -219,28 +220,3 @@ def test_a_detector_that_no_scale_depletes_at_the_measured_voltage() -> None:
     values = {"measured_depletion_V": 2000.0, **pure}
     with pytest.raises(CpunetError, match=r"even with 1000 times .* correct .* impurity_z0"):
         scaled_to_depletion(detector.model_copy(update=values))
-
-
-@pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
-def test_any_tilt_of_the_impurities_from_the_same_solution(more: list[str]) -> None:
-    detector = read_detector("ppc", [*COARSE, *more])
-    solution = solve(detector)
-    scale, tilt = 1.1, 0.03
-    keyed = {"impurity_scale": scale, "impurity_tilt_1e10_per_cm4": tilt, "bias_V": 3000.0}
-    wanted = detector.model_copy(update=keyed)
-    tilted = superposed_fields(solution, wanted)
-    # solved for on its own, the impurities written down as they are
-    middle_cm = detector.crystal_length / 20
-    z0 = scale * detector.impurity_z0_1e10_per_cm3 - tilt * middle_cm
-    gradient = scale * detector.impurity_gradient_1e10_per_cm4 + tilt
-    written = {"impurity_z0_1e10_per_cm3": z0, "impurity_gradient_1e10_per_cm4": gradient}
-    alone = detector.model_copy(update=written | {"bias_V": 3000.0})
-    expected = compute_fields(alone, cache=False)
-    read = compute_fields(wanted)
-    for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm"):
-        np.testing.assert_allclose(getattr(tilted, name), getattr(expected, name), atol=1e-6)
-        np.testing.assert_array_equal(getattr(tilted, name), getattr(read, name))
-    assert tilted.depletion_V == pytest.approx(expected.depletion_V, abs=1)
-    flat = wanted.model_copy(update={"impurity_tilt_1e10_per_cm4": 0.0})
-    plain = superposed_fields(solution, flat)
-    assert np.abs(plain.potential_V - tilted.potential_V).max() > 10

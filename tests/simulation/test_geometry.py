@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -148,13 +149,6 @@ def test_the_bore_ends_in_a_hemisphere(angle: float, distance: float) -> None:
     assert not ICPC.inside(r * 4.99 / distance, centre + (z - centre) * 4.99 / distance)
 
 
-def test_a_bullet_rounds_the_edge() -> None:
-    ppc = read_detector("ppc")
-    edge = (ppc.crystal_radius - 0.1, ppc.crystal_length - 0.1)
-    assert not ppc.inside(*edge)
-    assert ppc.inside(ppc.crystal_radius - 0.4, ppc.crystal_length - 0.4)
-
-
 def test_the_ditch_is_no_germanium() -> None:
     assert not ICPC.inside(12.5, 1)
     assert ICPC.inside(12.5, 2.1)
@@ -287,10 +281,8 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
     ],
 )
 def test_bad_shifts_are_named(part: str, said: str) -> None:
-    with pytest.raises(CpunetError) as raised:
+    with pytest.raises(CpunetError, match=re.escape(said)):
         Shift.of([part])
-    assert said in str(raised.value)
-    assert "\n" not in str(raised.value)
 
 
 def test_impossible_detectors_and_settings_are_refused() -> None:

@@ -74,24 +74,16 @@ def test_cylinders() -> None:
         np.testing.assert_allclose(total, expected, atol=0.05)
     wp = np.log(OUTER / r) / np.log(OUTER / INNER)
     np.testing.assert_allclose(found.point_contact[inside, 5], wp, atol=3e-4)
-    capacitance = 2 * np.pi * EPSILON_GERMANIUM * epsilon_0 * 1e9 * 9  # 9 mm high
-    capacitance /= np.log(OUTER / INNER)
-    assert found.capacitance_pF == pytest.approx(capacitance, rel=1e-3)
-
-
-def test_the_field_of_cylinders() -> None:
-    detector = Cylinders(**values())
-    grid = make_grid(detector)
-    found = solve_potentials(detector, grid)
     e_r, e_z = electric_field(500 * found.bias + found.impurities, grid, mirror=True)
-    inside = grid.free[:, 0]
-    r = grid.r_mm[inside]
     log = (500 - CURVATURE / 4 * (OUTER**2 - INNER**2)) / np.log(OUTER / INNER)
     expected = -10 * (CURVATURE / 2 * r + log / r)
     np.testing.assert_allclose(e_r[inside, 20][1:-1], expected[1:-1], rtol=5e-3)
     np.testing.assert_allclose(e_r[inside, 20], expected, rtol=0.1)
     assert np.abs(e_z).max() < 1e-6
     assert not e_r[~grid.free].any()
+    capacitance = 2 * np.pi * EPSILON_GERMANIUM * epsilon_0 * 1e9 * 9  # 9 mm high
+    capacitance /= np.log(OUTER / INNER)
+    assert found.capacitance_pF == pytest.approx(capacitance, rel=1e-3)
 
 
 def test_hemispheres_and_the_axis() -> None:

@@ -87,10 +87,6 @@ def sim() -> FloatArray:
     return simulated(N, seed=2)
 
 
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt((values**2).mean()))
-
-
 def edge_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """RMS before the alignment, which two ways of rounding may put a sample apart."""
     shifts = [np.roll(found, k, axis=1) - truth for k in (-1, 0, 1)]
@@ -128,34 +124,15 @@ def test_noise_without_energies_is_refused(ren, sim, tensor: bool) -> None:
         ren.apply(windows)
 
 
-def test_noise_goes_as_one_over_energy(ren, sim) -> None:
-    energies = np.where(np.arange(N) < N // 2, 1000.0, 3000.0)
-    noisy = ren.translate(sim, energy_kev=energies, seed=1)
-    for kev in (1000.0, 3000.0):
-        # the first 200 samples have lost their mean, as those of data
-        found = rms(noisy[energies == kev, :200])
-        assert found == pytest.approx(NOISE_KEV / kev, rel=0.05)
-
-
 @pytest.mark.parametrize("energies", [np.ones(N - 1), np.ones((N, 2))])
 def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) -> None:
-    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .* for {N} pulses") as error:
+    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .* for {N} pulses"):
         ren.translate(sim, energy_kev=energies)
-    assert "\n" not in str(error.value)
 
 
 def test_the_inverse_adds_no_tails(iren) -> None:
     with pytest.raises(CpunetError, match="leave out tails_kev"):
         iren.translate(responded(5, seed=3), tails_kev=100.0)
-
-
-def test_seeds(ren, sim) -> None:
-    first, again, other = (ren.translate(sim, energy_kev=KEV, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    # two decks of noise have nothing in common
-    clean = ren.translate(sim, noise=False)
-    noises = [(deck - clean)[:, :200].ravel() for deck in (first, other)]
-    assert abs(np.corrcoef(*noises)[0, 1]) < 0.05
 
 
 def test_pulses_without_energy_are_counted(ren, sim) -> None:

