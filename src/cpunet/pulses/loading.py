@@ -51,7 +51,7 @@ FEW = 10  # pulses of the wanted energies whose rejection is a reason
 RATE_TRACES = 512  # first traces of a file, which are checked
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 # Windows are shorter by these if so many more of a file's first traces contain them.
-SHORTER_NS, MORE, TRIED = tuple(range(0, 3201, 320)), 0.01, 1024
+SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
 SWAPPED = "are `sim` and `data` swapped?"
 
 _REMEDIES = {
@@ -255,35 +255,36 @@ def _within_traces(source: PulseSource, recipe: Recipe) -> Recipe:
     Slow pulses are late in their traces.  Without them, the distribution of drift times would
     be another one than that simulated.
     """
-    training, windows = recipe.training, recipe.preparation
+    windows, training = recipe.preparation, recipe.training
     if not isinstance(training, MatchingConfig):  # networks have windows of their own
         return recipe
-    block, outside, tried = next(source.blocks(TRIED)), [], []
-    for shorter in SHORTER_NS:
-        after, decay = windows.after_ns - shorter, windows.decay_fit_ns - shorter
-        if min(after - training.level_ns, decay) <= 0:
-            break
-        to = {"after_ns": after, "decay_fit_ns": decay}
-        within = {"after_ns": min(training.after_ns, after)}
-        changed = {
-            "preparation": windows.model_copy(update=to),
-            "training": training.model_copy(update=within),
-        }
-        tried.append(recipe.model_copy(update=changed))
-        codes = prepare(block, tried[-1].at(source.dt_ns).preparation, "measured").codes
+    block = next(source.blocks(TRIED))
+
+    def outside(recipe: Recipe) -> float:
+        codes = prepare(block, recipe.at(source.dt_ns).preparation, "measured").codes
         edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
-        outside.append(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
-        if outside[0] <= MORE:
-            return recipe
-    if outside[0] - min(outside) <= MORE:
+        return float(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
+
+    if (share := outside(recipe)) <= MORE:
         return recipe
-    best = next(i for i, share in enumerate(outside) if share <= min(outside) + 0.5 * MORE)
-    end = tried[best].preparation.after_ns
+    tried = []
+    for by in SHORTER_NS:
+        after, decay = windows.after_ns - by, windows.decay_fit_ns - by
+        if min(after - training.level_ns, decay) > 0:
+            to = {"after_ns": after, "decay_fit_ns": decay}
+            within = training.model_copy(update={"after_ns": min(training.after_ns, after)})
+            changed = {"preparation": windows.model_copy(update=to), "training": within}
+            tried.append(recipe.model_copy(update=changed))
+    shares = np.array([outside(shorter) for shorter in tried])
+    if share - shares.min(initial=share) <= MORE:
+        return recipe
+    best = tried[int(np.argmax(shares <= shares.min() + 0.5 * MORE))]
+    end = best.preparation.after_ns
     log.warning(
-        f"{source.path.name}: {100 * outside[0]:.2g} % of the traces end before their windows "
+        f"{source.path.name}: {100 * share:.2g} % of the traces end before their windows "
         f"would; these end {end:g} ns after the alignment, not {windows.after_ns:g} ns"
     )
-    return tried[best]
+    return best
 
 
 @dataclass(frozen=True, eq=False)
