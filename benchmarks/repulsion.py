@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.drift import FWHM_PER_SIGMA, cloud_after_step, repulsion_constant
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.simulator import cluster_hits
 from cpunet.simulation.velocity import HOLE, carrier_velocity, velocity_table
 
 Values = npt.NDArray[np.float64]

@@ -26,9 +26,8 @@ from cpunet.electronics.tails_law import (
     fit_rate,
 )
 from cpunet.errors import CpunetError
-from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
+from cpunet.pulses.preparation import Baselines, apply_cuts, fit_cuts, prepare
 from cpunet.pulses.reading.files import open_pulses
 from synthetic import load_recipe, mean_kev
 

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.readout import SATURATED, of_energy, read_out
+from cpunet.electronics.readout import SATURATED, linear_response, of_energy, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import Pulses

@@ -17,7 +17,7 @@ from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise
-from cpunet.validation.peaks import PeakSets
+from cpunet.validation.peaks import MeanPulse, PeakSets, around_half
 from cpunet.validation.run_figures import (
     cycle_figure,
     further_histograms,
@@ -28,7 +28,6 @@ from cpunet.validation.run_figures import (
     roc_figure,
     shape_figure,
 )
-from cpunet.validation.slices import MeanPulse, around_half
 from cpunet.validation.verdicts import held_out, judged_parameters
 
 # methods in the figures; a reader may hide some

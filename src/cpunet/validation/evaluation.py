@@ -37,16 +37,23 @@ from cpunet.validation.a_over_e import (
 )
 from cpunet.validation.ae_energy import AgainstEnergy, against_energy
 from cpunet.validation.comparisons import Missing
-from cpunet.validation.fit_errors import fit_ends, moved_values
 from cpunet.validation.methods import (
     Translations,
     fit_baseline_methods,
     translate_all,
     true_responses,
 )
-from cpunet.validation.peaks import ByMethod, PeakScores, PeakSets, score_peak
+from cpunet.validation.peaks import (
+    ByMethod,
+    PeakScores,
+    PeakSets,
+    Slices,
+    aligned_means,
+    fit_ends,
+    moved_values,
+    score_peak,
+)
 from cpunet.validation.report import as_stored
-from cpunet.validation.slices import Slices, aligned_means
 from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
