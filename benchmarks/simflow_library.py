@@ -27,8 +27,7 @@ import numpy as np
 from reboost import units
 from reboost.hpge import psd, utils
 
-from cpunet.legend.currents import PEAK, currents_about_peak
-from cpunet.legend.translate_library import TemplateTranslator
+from cpunet.legend.translate_library import PEAK, TemplateTranslator, currents_about_peak
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits

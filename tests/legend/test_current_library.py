@@ -14,20 +14,21 @@ import pytest
 from lgdo import Array, Scalar, Struct
 
 from cpunet.errors import CpunetError
-from cpunet.legend.currents import (
-    PEAK,
-    continued,
-    currents_about_peak,
-    most_frequent,
-    with_rings,
-)
 from cpunet.legend.library_files import (
     chosen_libraries,
     known_detector,
     make_library,
     merge_libraries,
 )
-from cpunet.legend.translate_library import TemplateTranslator, translate_library
+from cpunet.legend.translate_library import (
+    PEAK,
+    TemplateTranslator,
+    continued,
+    currents_about_peak,
+    most_frequent,
+    translate_library,
+    with_rings,
+)
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses

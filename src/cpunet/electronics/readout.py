@@ -75,7 +75,19 @@ def linear_response(
     >>> trace.shape, bool(trace[: chain.n_pre].any())
     ((1400,), False)
     """
-    per_sample = _fine_per_sample(pulses, electronics)
+    where, poles = f"electronics {electronics.name}", electronics.bandwidth_poles_ns
+    ratio = electronics.dt_ns / pulses.dt_ns
+    if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
+        raise CpunetError(
+            f"{where}: dt_ns = {electronics.dt_ns:g} is no multiple of the pulses' "
+            f"{pulses.dt_ns:g} ns; simulate them with a period that divides it"
+        )
+    if min(poles) < pulses.dt_ns:
+        raise CpunetError(
+            f"{where}: bandwidth_poles_ns means {min(poles):.3g} ns, faster than the pulses' "
+            f"grid of {pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
+        )
+    per_sample = round(ratio)
     n, dt, fine = len(pulses), electronics.dt_ns, pulses.dt_ns
     shift = np.broadcast_to(0.0 if shift_ns is None else np.asarray(shift_ns, float), (n,))
     start = electronics.n_pre * dt + shift
@@ -98,22 +110,6 @@ def linear_response(
         traces,
     )
     return traces
-
-
-def _fine_per_sample(pulses: Pulses, electronics: Electronics) -> int:
-    where, poles = f"electronics {electronics.name}", electronics.bandwidth_poles_ns
-    ratio = electronics.dt_ns / pulses.dt_ns
-    if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
-        raise CpunetError(
-            f"{where}: dt_ns = {electronics.dt_ns:g} is no multiple of the pulses' "
-            f"{pulses.dt_ns:g} ns; simulate them with a period that divides it"
-        )
-    if min(poles) < pulses.dt_ns:
-        raise CpunetError(
-            f"{where}: bandwidth_poles_ns means {min(poles):.3g} ns, faster than the pulses' "
-            f"grid of {pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
-        )
-    return round(ratio)
 
 
 def _steps(poles: ComplexArray, h_ns: FloatArray) -> ComplexArray:
@@ -290,33 +286,27 @@ def draw_other_pulses(
         tails at the first sample of each, in keV; piled-up pulses in the traces.
     """
     tails, within = rng.spawn(2)
-    added_kev = _tails(len(pulses), electronics, tails)
-    # before piled-up pulses are added
-    tails_kev = added_kev[:, 0].copy()
-    others = electronics.pile_up.rate_kHz, electronics.other_pulses_kev, electronics.dt_ns
-    record = electronics.n_pre, electronics.length
-    piled = DrawnPileUp(*others).draw(len(pulses), *record, within)
-    # with shapes of randomly chosen pulses
-    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
-    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
-    return added_kev, tails_kev, piled
-
-
-def _tails(n: int, electronics: Electronics, rng: np.random.Generator) -> FloatArray:
-    """Pile-up tails in keV, with all decays of the chain, shape ``(n, length)``."""
-    transfer = electronics.transfer
+    # pile-up tails with all decays of the chain: a step response is a sum of exponentials, and
+    # so is the sum of many tails
+    n, transfer = len(pulses), electronics.transfer
     longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
-    row, kev, before_us = earlier_pulses(
-        n, electronics.earlier_pulses.rate_kHz, longest_us, electronics.other_pulses_kev, rng
-    )
-    # a step response is a sum of exponentials, and so is the sum of many tails
+    rate_khz, energies_kev = electronics.earlier_pulses.rate_kHz, electronics.other_pulses_kev
+    row, kev, before_us = earlier_pulses(n, rate_khz, longest_us, energies_kev, tails)
     weights = transfer.residues / transfer.poles
     modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
     heights = np.zeros((n, len(weights)), np.complex128)
     np.add.at(heights, row, modes * weights)
     centres_ns = (np.arange(electronics.length) + 0.5) * electronics.dt_ns
     decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
-    return np.ascontiguousarray((heights @ decays).real)
+    added_kev = np.ascontiguousarray((heights @ decays).real)
+    # before piled-up pulses are added
+    tails_kev = added_kev[:, 0].copy()
+    others = DrawnPileUp(electronics.pile_up.rate_kHz, energies_kev, electronics.dt_ns)
+    piled = others.draw(n, electronics.n_pre, electronics.length, within)
+    # with shapes of randomly chosen pulses
+    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
+    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
+    return added_kev, tails_kev, piled
 
 
 DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4

@@ -23,8 +23,8 @@ from scipy.special import log_ndtr, ndtr
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.legend.currents import WINDOW, WINDOWS
 from cpunet.legend.library_files import known_detector
+from cpunet.legend.translate_library import WINDOW, WINDOWS
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json, yaml_text

@@ -11,7 +11,6 @@ from pydantic import Field, field_validator, model_validator
 from cpunet.settings import Config, Set, checked, words_and_files
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.velocity import VelocityFactors
 
 _Factor = Annotated[float, Field(ge=0.2, le=5)]
 _Nanoseconds = Annotated[float, Field(ge=0.01, le=1e6)]
@@ -111,7 +110,7 @@ class SimulationSettings(Config):
         return round(self.dt_ns / self.step_ns)
 
     @property
-    def velocity_factors(self) -> VelocityFactors:
+    def velocity_factors(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Speed factors at low and high fields, of electrons and of holes."""
         return (
             (self.electron_velocity_low_factor, self.electron_velocity_high_factor),

@@ -25,12 +25,18 @@ from cpunet.simulation.drift import (
     repulsion_constant,
     smear_and_sample,
 )
-from cpunet.simulation.field_lookup import DriftMaps, drift_maps, in_active_volume
+from cpunet.simulation.field_lookup import (
+    ELECTRON,
+    HOLE,
+    DriftMaps,
+    FloatArray,
+    drift_maps,
+    in_active_volume,
+)
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import FARTHEST_MM, Hits, OpenHits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.velocity import ELECTRON, HOLE, FloatArray
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -273,7 +279,7 @@ class Simulator:
 
     >>> from types import SimpleNamespace
     >>> from cpunet.simulation.geometry_readers import read_detector
-    >>> from cpunet.simulation.velocity import carrier_velocity, velocity_table
+    >>> from cpunet.simulation.field_lookup import carrier_velocity, velocity_table
     >>> height = np.tile(np.arange(11.0), (11, 1))  # z in mm
     >>> planar = SimpleNamespace(
     ...     grid_mm=1.0, potential_V=100 * height, weighting_potential=1 - height / 10,

@@ -219,18 +219,6 @@ class PeakSets:
             name: scores_of_squares(of_method[rows]) for name, of_method in squares.items()
         } or None
 
-    def not_prepared(self) -> dict[str, int]:
-        """Number of translated pulses that cannot be prepared like data, by method."""
-        raw, whole = self.rows["raw"], self.translations.whole
-        counts = {m: int((~usable[raw]).sum()) for m, usable in whole.items() if m != "data"}
-        return {name: count for name, count in counts.items() if count}
-
-    def missing(self) -> str | None:
-        """Reason why the peak cannot be scored; None if it can."""
-        sides = (("simulated", self.rows["raw"]), ("measured", self.rows["data"]))
-        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
-        return f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)" if few else None
-
 
 @dataclass(frozen=True, eq=False)
 class PeakScores:
@@ -299,8 +287,17 @@ def score_peak(
     scores
         Scores of the peak.
     """
-    counted = PeakScores(len(peak.rows["raw"]), len(peak.rows["data"]), peak.not_prepared())
-    if (missing := peak.missing()) is not None:
+    raw, data = peak.rows["raw"], peak.rows["data"]
+    lost = {
+        method: int((~whole[raw]).sum())
+        for method, whole in peak.translations.whole.items()
+        if method != "data"
+    }
+    counted = PeakScores(len(raw), len(data), {m: n for m, n in lost.items() if n})
+    sides = (("simulated", raw), ("measured", data))
+    few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
+    if few:
+        missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
         return {}, replace(counted, missing=missing)
     dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
     values = {
@@ -315,16 +312,29 @@ def score_peak(
     }
     ends = {"ren": dict(moved)} | {m: {} for m in values if m not in ("data", "ren")}
     for method, of_method in values.items() if scales else ():
-        scale, _ = scales[method]
-        of_method[A_OVER_E] = of_method["current_amplitude"] / scale
+        a_over_e = of_method[A_OVER_E] = of_method["current_amplitude"] / scales[method][0]
         if method != "data":
-            ends[method][A_OVER_E] = _normalised(of_method[A_OVER_E], method, scales)
-    chief, further = (
+            # both ends of the axis of its error, that of both positions of the peak
+            own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
+            error = np.hypot(own, other)
+            moved_by = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
+            ends[method][A_OVER_E] = moved_by[np.newaxis]
+    chief, others = (
         {
             m: {name: v for name, v in of.items() if (name in PARAMETERS) is chosen}
             for m, of in values.items()
         }
         for chosen in (True, False)
+    )
+    parameters, further = (
+        compare(
+            of["data"],
+            {m: of_method for m, of_method in of.items() if m != "data"},
+            recipe.scores,
+            seed,
+            ends,
+        )
+        for of in (chief, others)
     )
     noise = baseline_spectra(
         {method: peak.windows(method)[:, :samples].copy() for method in values},
@@ -334,34 +344,12 @@ def score_peak(
     )
     return values, replace(
         counted,
-        parameters=_compared(chief, recipe, seed, ends),
-        further=_compared(further, recipe, seed, ends),
+        parameters=parameters,
+        further=further,
         two_sample=classifier_tests(peak, chief, seed),
         noise=noise,
         paired=peak.paired_scores(),
     )
-
-
-def _normalised(
-    values: Values,
-    method: str,
-    scales: Mapping[str, tuple[float, float]],
-) -> Values:
-    """A/E over that of the double-escape peak at both ends of each axis of its errors.
-
-    The last axis is the error of both scales.  Parameters of the fit move A/E of both peaks;
-    what is left of that is far less than the error of the scales.
-    """
-    own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
-    error = np.hypot(own, other)
-    return np.stack([values * (1 + error), values * (1 - error)])[np.newaxis]
-
-
-def _compared(
-    values: ByMethod, recipe: Recipe, seed: int, moved: Mapping[str, Mapping[str, Values]]
-) -> dict[str, Compared]:
-    methods = {method: of_method for method, of_method in values.items() if method != "data"}
-    return compare(values["data"], methods, recipe.scores, seed, moved)
 
 
 def classifier_tests(

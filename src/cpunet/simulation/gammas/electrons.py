@@ -118,8 +118,23 @@ def electron_table() -> ElectronTable:
     stopping = _collision_loss(middle) + np.array([_soft_radiation(t) for t in middle])
     step = energy * _LOSS_PER_STEP / stopping
     hard, quantiles = zip(*map(_hard_photons, middle), strict=True)
-    turned = 1 - np.exp(-step * _transport_per_mm(middle))
-    scale = np.array([_scale_of(mean) for mean in turned])
+    # inverse of the first transport mean free path: -d<cos>/ds at s = 0
+    momentum = np.sqrt(middle * (middle + 2 * ELECTRON_MASS))
+    beta = momentum / (middle + ELECTRON_MASS)
+    angle = _ALPHA * ELECTRON_MASS / momentum * _Z ** (1 / 3) / 0.885
+    screening = angle**2 / 4 * (1.13 + 3.76 * (_ALPHA * _Z / beta) ** 2)
+    size = 2 * np.pi * _RADIUS**2 * _Z * (_Z + 1) * (ELECTRON_MASS / (momentum * beta)) ** 2
+    transport = _ATOMS / 10 * size * (np.log(1 + 1 / screening) - 1 / (1 + screening))
+    turned = 1 - np.exp(-step * transport)
+    # scale b for which exp(-x/b) on 0 < x < 2 has this mean (below 1)
+    scale = np.array(
+        [brentq(lambda b, m=m: b - 2 / np.expm1(2 / b) - m, 3e-3, 1e4) for m in turned]
+    )
+    # of positrons in flight, per mm
+    gamma = 1 + middle / ELECTRON_MASS
+    root = np.sqrt(gamma**2 - 1)
+    bracket = (gamma**2 + 4 * gamma + 1) / root**2 * np.log(gamma + root) - (gamma + 3) / root
+    annihilation = np.pi * _RADIUS**2 / (gamma + 1) * bracket * _ATOMS * _Z / 10
     return ElectronTable(
         log_top=float(np.log(_TOP)),
         log_ratio=float(np.log(ratio)),
@@ -128,7 +143,7 @@ def electron_table() -> ElectronTable:
         scattering=scale,
         scattering_cut=1 - np.exp(-2 / scale),
         brems=1 - np.exp(-step * np.array(hard)),
-        annihilation=1 - np.exp(-step * _annihilation_per_mm(middle)),
+        annihilation=1 - np.exp(-step * annihilation),
         photon_share=np.stack(quantiles),
     )
 
@@ -146,23 +161,6 @@ def _collision_loss(kinetic: Array) -> Array:
     logarithm = np.log(tau**2 * (tau + 2) / (2 * (_EXCITATION / ELECTRON_MASS) ** 2))
     scale = 2 * np.pi * _RADIUS**2 * ELECTRON_MASS * _ATOMS * _Z / 10
     return np.asarray(scale / beta2 * (logarithm + form - density))
-
-
-def _transport_per_mm(kinetic: Array) -> Array:
-    """Inverse of the first transport mean free path: -d<cos>/ds at s = 0."""
-    momentum = np.sqrt(kinetic * (kinetic + 2 * ELECTRON_MASS))
-    beta = momentum / (kinetic + ELECTRON_MASS)
-    angle = _ALPHA * ELECTRON_MASS / momentum * _Z ** (1 / 3) / 0.885
-    screening = angle**2 / 4 * (1.13 + 3.76 * (_ALPHA * _Z / beta) ** 2)
-    size = 2 * np.pi * _RADIUS**2 * _Z * (_Z + 1) * (ELECTRON_MASS / (momentum * beta)) ** 2
-    return np.asarray(
-        _ATOMS / 10 * size * (np.log(1 + 1 / screening) - 1 / (1 + screening)), float
-    )
-
-
-def _scale_of(mean: float) -> float:
-    """Scale b for which exp(-x/b) on 0 < x < 2 has this mean (below 1)."""
-    return float(brentq(lambda b: b - 2 / np.expm1(2 / b) - mean, 3e-3, 1e4))
 
 
 def _radiation(kinetic: float, photon: Array) -> Array:
@@ -193,13 +191,6 @@ def _hard_photons(kinetic: float) -> tuple[float, Array]:
     wanted = np.linspace(0, cumulative[-1], _BREMS_NODES)
     quantiles = np.exp(np.interp(wanted, cumulative, log)) / kinetic
     return float(np.trapezoid(density, log)), quantiles
-
-
-def _annihilation_per_mm(kinetic: Array) -> Array:
-    gamma = 1 + kinetic / ELECTRON_MASS
-    root = np.sqrt(gamma**2 - 1)
-    bracket = (gamma**2 + 4 * gamma + 1) / root**2 * np.log(gamma + root) - (gamma + 3) / root
-    return np.asarray(np.pi * _RADIUS**2 / (gamma + 1) * bracket * _ATOMS * _Z / 10)
 
 
 class UnitVector(NamedTuple):
