@@ -32,11 +32,10 @@ import scipy.fft
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.finishing import finish, padding, record_length
+from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.parameters import current_amplitude, last_below, tail_slope
-from cpunet.recipes.schema import PreparationConfig
 
 Values = npt.NDArray[np.float64]
 Spectrum = npt.NDArray[np.complex128]
@@ -229,16 +228,6 @@ class BaselineMethod(ABC):
     def describe(self) -> Mapping[str, float]:
         """Fitted values by name. Each name ends with the unit."""
         return {name: value for name, value in asdict(self).items() if name != "dt_ns"}
-
-    def translate_like_data(
-        self, waveforms: FloatArray, config: PreparationConfig
-    ) -> FloatArray:
-        """Windows translated and prepared like the data; a row that cannot be is NaN."""
-        windows = np.empty((len(waveforms), config.at(self.dt_ns).length), np.float32)
-        for rows in blocks(len(waveforms)):
-            records = self.translate(waveforms[rows])
-            windows[rows] = finish(records, config, dt_ns=self.dt_ns).windows
-        return windows
 
 
 LONGEST_NS = 1024.0  # maximum sigma and tau

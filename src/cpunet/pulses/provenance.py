@@ -33,6 +33,7 @@ SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
 )  # fmt: skip
 TRANSLATION = "cpunet_translation"
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
+_NETWORKS = {REN: "REN", IREN: "IREN"}
 
 _FIRST_PULSES = 256  # pulses
 _MIN_SAMPLES = 100  # per trace; a shorter one has no baseline and tail to inspect
@@ -101,9 +102,9 @@ def recorded_side(source: PulseSource) -> Recognised | None:
     """Side recorded in a file that this program wrote; None for other files."""
     side, made_by = source.attrs.get(SIDE), source.attrs.get(MADE_BY, "")
     translated_by = source.attrs.get(TRANSLATED_BY)
-    if translated_by in (REN, IREN):
+    if translated_by in _NETWORKS:
         kind: Kind = "measured" if translated_by == REN else "simulated"
-        why = f"were translated by {_network(translated_by)} already"
+        why = f"were translated by {_NETWORKS[translated_by]} already"
         return Recognised(kind, why, certain=True)
     if made_by.startswith(SIMULATE) or side == "simulated":
         return Recognised("simulated", f"were simulated by {made_by}", certain=True)
@@ -112,10 +113,6 @@ def recorded_side(source: PulseSource) -> Recognised | None:
             "measured", f"are traces behind electronics ({made_by})", certain=True
         )
     return None
-
-
-def _network(translated_by: str) -> str:
-    return translated_by.rpartition(" ")[2].upper()
 
 
 def recorded_detector(source: PulseSource) -> str | None:
@@ -182,7 +179,8 @@ def provenance(source: PulseSource) -> dict[str, str]:
     words = {"made by": attrs.get(MADE_BY, ""), "side": attrs.get(SIDE, "")}
     if translated_by := attrs.get(TRANSLATED_BY):
         run = attrs.get(RUN) or "an unknown run"
-        words["translated"] = f"by the {_network(translated_by)} of {run}"
+        network = _NETWORKS.get(translated_by, translated_by)
+        words["translated"] = f"by the {network} of {run}"
     # other programs may have attributes of these names
     with suppress(ValueError, LookupError, TypeError, AttributeError):
         made = json.loads(attrs[SIMULATION])

@@ -263,15 +263,13 @@ def describe_hits(
             continue
         lines = label_peaks(hits.energy_kev, peaks)
         places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
-        extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
+        extents = (
+            f"{axis} {span([values.min(), values.max()], 2)}" for axis, values in places.items()
+        )
         detectors[name] = [
             ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
-            ("energy", f"{span(_ends(hits.energy_kev))} keV an event"),
+            ("energy", f"{span([hits.energy_kev.min(), hits.energy_kev.max()])} keV an event"),
             ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
             ("extents", f"{', '.join(extents)} mm"),
         ]
     return detectors
-
-
-def _ends(values: FloatArray) -> list[float]:
-    return [float(values.min()), float(values.max())]

@@ -62,27 +62,21 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
         evaluated.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values())
     )
     if any(name.startswith(f"{IREN.part}.") for name in evaluated.run.weights):
-        drawn |= _cycles(fullest, evaluated.run.iren)
+        # pulses of both sides through both networks and back
+        iren, ren = evaluated.run.iren, fullest.translations.ren
+        for forward, back, side, names in (
+            (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
+            (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
+        ):
+            start, rows = fullest.windows(side)[:SHOWN], fullest.rows[side][:SHOWN]
+            kev = fullest.translations.energy_kev[side][rows]
+            middle = forward.apply(start, energy_kev=kev, noise=False)
+            end = back.apply(middle, energy_kev=kev, noise=False)
+            stages = dict(zip(names, (start, middle, end), strict=True))
+            draw = partial(cycle_figure, stages, ren.dt_ns)
+            drawn[f"{fullest.name} cycle of {names[0].lower()}"] = draw
     if evaluated.run.records:
         drawn["losses"] = partial(loss_curves, evaluated.run.records)
-    return drawn
-
-
-def _cycles(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
-    """Pulses of both sides through both networks and back."""
-    ren = peak.translations.ren
-    drawn: dict[str, Drawing] = {}
-    for forward, back, side, names in (
-        (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
-        (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
-    ):
-        start, rows = peak.windows(side)[:SHOWN], peak.rows[side][:SHOWN]
-        kev = peak.translations.energy_kev[side][rows]
-        middle = forward.apply(start, energy_kev=kev, noise=False)
-        end = back.apply(middle, energy_kev=kev, noise=False)
-        stages = zip(names, (start, middle, end), strict=True)
-        draw = partial(cycle_figure, dict(stages), ren.dt_ns)
-        drawn[f"{peak.name} cycle of {names[0].lower()}"] = draw
     return drawn
 
 

@@ -271,7 +271,7 @@ class Translations:
         raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
         windows = {"raw": raw}
         for name, method in self.baselines.methods.items():
-            windows[name] = method.translate_like_data(raw, config)
+            windows[name] = finish(method.translate(raw), config, dt_ns=self.ren.dt_ns).windows
         windows["ren"] = self.ren.apply(
             raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
         )

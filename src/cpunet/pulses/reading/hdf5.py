@@ -25,7 +25,6 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import (
     is_column,
-    is_text,
     item_at,
     lh5_rows,
     members,
@@ -289,11 +288,12 @@ def _is_lh5(item: object) -> bool:
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
-    return {
-        name: _stored(path, item)
-        for name, item in members(group).items()
-        if _is_numeric(item) or (divides(name) and is_text(item))
-    }
+    columns = {}
+    for name, item in members(group).items():
+        is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
+        if _is_numeric(item) or (divides(name) and is_text):
+            columns[name] = _stored(path, item)
+    return columns
 
 
 def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
