@@ -320,22 +320,11 @@ def _integration(current: Values, rate: float) -> Values:
 
 
 Groups = list[npt.NDArray[np.int64]]
+Superpulses = tuple[Spectrum, Values]  # see `superpulses`
 
 SLICES = 8
 SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is used
 RISE_START, RISE_END = 0.02, 0.95  # above the noise at the start, below the slow top
-
-
-@dataclass(frozen=True, eq=False)
-class Superpulses:
-    """Spectra of the mean currents, shape ``(slices, frequencies)``.
-
-    ``error`` is the squared standard error of the mean. It includes noise and the differences
-    between pulses within a slice.
-    """
-
-    spectra: Spectrum
-    error: Values
 
 
 def crossing(steps: Values, fraction: float) -> Values:
@@ -390,7 +379,7 @@ def slices(current: Values) -> Groups:
     ]
 
 
-def superpulses(spectra: Spectrum, steps: Values, groups: Groups) -> Superpulses:
+def superpulses(spectra: Spectrum, response: Values) -> Superpulses:
     r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
 
     .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
@@ -401,17 +390,22 @@ def superpulses(spectra: Spectrum, steps: Values, groups: Groups) -> Superpulses
     ----------
     spectra
         Spectra of the currents, shape ``(n, length // 2 + 1)``.
-    steps
-        The pulses, of unit height; their half maxima are finite in all groups.
-    groups
-        Rows of each slice.
+    response
+        The currents that slice and align the pulses.
+
+    Returns
+    -------
+    means, error
+        Shape ``(slices, frequencies)``; the error is the squared standard error of the mean,
+        with noise and the differences between pulses within a slice.
     """
+    groups = slices(response)
     means = np.empty((len(groups), spectra.shape[1]), complex)
     error = np.empty(means.shape)
-    for k, moved in enumerate(_aligned(spectra, steps, groups)):
+    for k, moved in enumerate(_aligned(spectra, np.cumsum(response, axis=1), groups)):
         means[k] = moved.mean(axis=0)
         error[k] = moved.var(axis=0) / max(1, len(moved) - 1)
-    return Superpulses(means, error)
+    return means, error
 
 
 def _aligned(spectra: Spectrum, steps: Values, groups: Groups) -> Iterator[Spectrum]:
@@ -620,7 +614,7 @@ class SuperpulseKernel(BaselineMethod):
         slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
         length, lead = record_length(sim.shape[1], dt_ns), round(LEAD_NS / dt_ns)
         current = currents(steps, dt_ns)
-        wanted = _superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
+        wanted = superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
 
         spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES], dt_ns), axis=1))
         kernel = np.zeros(lead + round(LAG_NS / dt_ns))
@@ -631,7 +625,7 @@ class SuperpulseKernel(BaselineMethod):
             response = scipy.fft.irfft(
                 spectra * _transfer(kernel, lead, length), length, axis=1
             )
-            kernel = _kernel(wanted, _superpulses(spectra, response), length, dt_ns)
+            kernel = _kernel(wanted, superpulses(spectra, response), length, dt_ns)
         method = cls(dt_ns, kernel, slope)
         own = _own_decay(method, slope, sim[:FREE_PULSES], align)
         return replace(method, tail_slope_per_ms=own)
@@ -661,17 +655,12 @@ def _own_decay(method: BaselineMethod, slope: float, sim: FloatArray, align: int
     return slope - (fitted_tail_slope(windows, method.dt_ns, align) - slope)
 
 
-def _superpulses(spectra: Spectrum, response: Values) -> Superpulses:
-    """Superpulses of currents, aligned and sliced by their responses."""
-    return superpulses(spectra, np.cumsum(response, axis=1), slices(response))
-
-
 def _kernel(data: Superpulses, sim: Superpulses, length: int, dt_ns: float) -> Values:
     """Regularised ratio as weights around zero delay with a sum of 1."""
-    power = (np.abs(data.spectra) ** 2).sum(axis=0)
-    wiener = np.clip(1 - data.error.sum(axis=0) / power, 0, 1)
-    below = (np.abs(sim.spectra) ** 2 + sim.error).sum(axis=0)
-    ratio = wiener * (data.spectra * sim.spectra.conj()).sum(axis=0) / below
+    (measured, data_error), (simulated, sim_error) = data, sim
+    wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
+    below = (np.abs(simulated) ** 2 + sim_error).sum(axis=0)
+    ratio = wiener * (measured * simulated.conj()).sum(axis=0) / below
     lead, lag, fade_in, fade_out = (
         round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
     )
