@@ -27,14 +27,14 @@ import cpunet
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, named, titled
 from cpunet.calibration.search import Search
-from cpunet.electronics.measured import noise_of
+from cpunet.electronics.finishing import noise_of
 from cpunet.plotting import styled
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes import load_recipe
-from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulate import StoredSimulation
 from cpunet.training.pulse_sets import PulseSets
 
 # All that may become free, in groups that are fitted together.

@@ -14,13 +14,12 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator
+from cpunet.simulation.simulator import Simulator, merge_hits
 
 PICTURE = Path(__file__).parents[1] / "pictures" / "one-pulse.png"
 EVENT = 5  # one with several sites, of which pulses can be told apart

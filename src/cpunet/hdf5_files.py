@@ -136,11 +136,6 @@ def is_column(item: object) -> bool:
     return item.ndim <= 1 and item.dtype.kind in "iufb"
 
 
-def is_text(item: object) -> bool:
-    """Whether an object of a file is a one-dimensional array of texts."""
-    return isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
-
-
 def reading(path: Path, item: h5py.Group | h5py.Dataset, read: Read) -> Read:
     """A function that reads rows of an item, whose file stays open; see `one_line`."""
 

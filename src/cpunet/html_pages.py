@@ -79,7 +79,25 @@ def figure_html(
 
     `shows` says what it shows to who cannot see it.
     """
-    svg = figure_svg(figure, salt=caption)
+    stream = io.StringIO()
+    # equal figures give equal text
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": caption}):
+        FigureCanvasSVG(figure).print_svg(  # type: ignore[no-untyped-call]
+            stream, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        )
+    FigureCanvasBase(figure)
+    across, down, content = re.search(  # type: ignore[union-attr]
+        r'<svg[^>]* viewBox="0 0 (\S+) (\S+)"[^>]*>(.*)</svg>', stream.getvalue(), re.DOTALL
+    ).groups()
+    content = re.sub(r"<(style|metadata).*?</\1>|<!--.*?-->", "", content, flags=re.S)
+    content = re.sub(_NEEDLESS, "", content)
+    content = re.sub(rf'<g id="{GROUP}', '<g data-method="', content)
+    content = re.sub(r'<g id="[^"]*"', "<g", content)
+    # digits that are seen: to 0.01 points, or 0.1 beyond 100
+    content = re.sub(
+        r"<[^>]*>", lambda tag: re.sub(r"(\d{3}\.\d|\.\d\d)\d+", r"\1", tag[0]), content
+    )
+    svg = f'<svg viewBox="0 0 {across} {down}" role="img">{content}</svg>'
     width, height = figure.get_size_inches()
     if file is not None:
         size = f'width="{width:g}in" height="{height:g}in"'
@@ -94,38 +112,3 @@ def notebook_picture(figure: Figure) -> Markup:
     # without the program's name and version, equal figures give equal bytes
     figure.savefig(stream, format="png", dpi=NOTEBOOK_DPI, metadata={"Software": None})
     return Markup(base64.b64encode(stream.getvalue()).decode("ascii"))
-
-
-def figure_svg(figure: Figure, salt: str) -> str:
-    """Draw a figure as an element of a page; equal figures give equal text.
-
-    What is drawn of a method has its name as ``data-method``.
-
-    Parameters
-    ----------
-    figure
-        The figure.
-    salt
-        Text that differs between the figures of a page, so that their ids differ.
-    """
-    stream = io.StringIO()
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
-        FigureCanvasSVG(figure).print_svg(  # type: ignore[no-untyped-call]
-            stream, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        )
-    FigureCanvasBase(figure)
-    text = stream.getvalue()
-    width, height, content = re.search(  # type: ignore[union-attr]
-        r'<svg[^>]* viewBox="0 0 (\S+) (\S+)"[^>]*>(.*)</svg>', text, re.DOTALL
-    ).groups()
-    content = re.sub(r"<(style|metadata).*?</\1>|<!--.*?-->", "", content, flags=re.S)
-    content = re.sub(_NEEDLESS, "", content)
-    content = re.sub(rf'<g id="{GROUP}', '<g data-method="', content)
-    content = re.sub(r'<g id="[^"]*"', "<g", content)
-    content = re.sub(r"<[^>]*>", _shortened, content)
-    return f'<svg viewBox="0 0 {width} {height}" role="img">{content}</svg>'
-
-
-def _shortened(tag: re.Match[str]) -> str:
-    """Digits of an element that are seen: to 0.01 points, or 0.1 beyond 100."""
-    return re.sub(r"(\d{3}\.\d|\.\d\d)\d+", r"\1", tag[0])

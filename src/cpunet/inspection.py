@@ -13,7 +13,6 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
 from cpunet.settings import Set, key_values
-from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import holds_detector, read_detector
 from cpunet.tables import Lines, aligned, text_table
 
@@ -188,7 +187,19 @@ def look(
         except CpunetError as error:
             no_pulses = error
     if holds_detector(path):
-        return _detector(read_detector(path, settings), str(path))
+        detector = read_detector(path, settings)
+        from cpunet.progress import stage
+        from cpunet.simulation.fields import compute_fields, fields_in_words
+
+        with stage(f"Fields of {detector.name}"):
+            fields = compute_fields(detector)
+
+        def draw() -> Figure:
+            from cpunet.simulation.detector_figure import detector_figure
+
+            return detector_figure(detector, fields)
+
+        return InfoResult(str(path), fields_in_words(detector, fields), _draw=draw)
     if settings:
         raise CpunetError(f"{path}: is no detector", "leave out `settings`")
     if place.is_dir():
@@ -204,21 +215,6 @@ def look(
             lines += [("detector", name), *topics]
         return InfoResult(str(path), lines)
     raise no_pulses or CpunetError(f"{path}: no such file; check the name")
-
-
-def _detector(detector: Detector, path: str) -> InfoResult:
-    from cpunet.progress import stage
-    from cpunet.simulation.fields import compute_fields, fields_in_words
-
-    with stage(f"Fields of {detector.name}"):
-        fields = compute_fields(detector)
-
-    def draw() -> Figure:
-        from cpunet.simulation.detector_figure import detector_figure
-
-        return detector_figure(detector, fields)
-
-    return InfoResult(path, fields_in_words(detector, fields), _draw=draw)
 
 
 def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
@@ -257,8 +253,8 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
 def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
     """Describe the pulses of one table; of measured traces also their quality, on request."""
     from cpunet.pulses import provenance
-    from cpunet.pulses.description import describe_pulses, left_out, trace_properties
     from cpunet.pulses.doubts import rolled_over
+    from cpunet.pulses.provenance import describe_pulses, left_out, trace_properties
 
     with file.open() as source:
         blocks = source.blocks()
@@ -277,7 +273,7 @@ def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
         if not quality:
             return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
         from cpunet.electronics.pile_up_tails import PileUpTails
-        from cpunet.pulses.baselines import Baselines
+        from cpunet.pulses.preparation import Baselines
 
         lines.append(("left out", left_out(first, recipe)))
         try:

@@ -13,16 +13,17 @@ from scipy import signal
 
 from cpunet.electronics.chain import (
     Electronics,
+    Exponentials,
     NoiseSpectrum,
+    moved_apart,
     read_electronics,
 )
-from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.finishing import record_length, with_room
 from cpunet.electronics.readout import (
     by_height,
     coloured_noise,
     draw_other_pulses,
+    linear_response,
     noise_power,
     read_out,
 )

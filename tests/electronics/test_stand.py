@@ -20,9 +20,9 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.simulation.again import SameHits, StoredSimulation
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import Shift, SimulationSettings
+from cpunet.simulation.simulate import SameHits, StoredSimulation
 from cpunet.training.chain_fit import POOR
 from cpunet.training.train import train
 from synthetic import load_recipe, prepared_truth

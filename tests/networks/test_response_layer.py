@@ -8,7 +8,7 @@ import pytest
 import scipy.fft
 
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.exact_response import linear_response
+from cpunet.electronics.readout import linear_response
 from cpunet.networks.response_layer import (
     DriftClock,
     ElectronicsResponse,

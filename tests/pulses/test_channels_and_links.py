@@ -14,7 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.channels import channels_of
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile, table_sizes
-from cpunet.pulses.row_columns import other_columns
+from cpunet.pulses.writing import other_columns
 from synthetic import one_line, waveform_table, write_table
 
 N, LENGTH = 12, 40

@@ -17,8 +17,7 @@ from lgdo import Array, Table, VectorOfVectors, WaveformTable
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.row_columns import other_columns
-from cpunet.pulses.writing import PulseWriter
+from cpunet.pulses.writing import PulseWriter, other_columns
 from synthetic import waveform_table, write_pulses, write_table
 
 RNG = np.random.default_rng(1)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from cpunet.pulses import loading
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.description import describe_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.preparation import Kind, Prepared, Rejection, prepare
+from cpunet.pulses.provenance import describe_pulses
 from cpunet.pulses.reading.files import PulseFile
 from synthetic import PREPARATION as CONFIG
 from synthetic import load_recipe, one_line

@@ -9,12 +9,12 @@ import numpy.typing as npt
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from cpunet.simulation import again
-from cpunet.simulation.again import SameHits
+from cpunet.simulation import simulate
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulate import SameHits
 from cpunet.simulation.simulator import EventPulses, Simulator
 
 DETECTOR = read_detector("ppc", ["grid_mm=0.5"])
@@ -57,8 +57,8 @@ def test_it_is_a_new_simulation_from_one_solution(
     hits: Hits, monkeypatch: pytest.MonkeyPatch, physics: list[dict[str, float]]
 ) -> None:
     solved: list[Detector] = []
-    solve = again.solve
-    monkeypatch.setattr(again, "solve", lambda d: solved.append(d) or solve(d))
+    solve = simulate.solve
+    monkeypatch.setattr(simulate, "solve", lambda d: solved.append(d) or solve(d))
     same = SameHits(hits)
     first = same.simulate(DETECTOR, SHORT)
     for values in physics:

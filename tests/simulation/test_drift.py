@@ -10,11 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.simulation.fields import FieldMaps
-from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator
-from cpunet.simulation.velocity import (
+from cpunet.simulation.field_lookup import (
     ELECTRON,
     HOLE,
     VelocityTable,
@@ -23,6 +19,10 @@ from cpunet.simulation.velocity import (
     velocity_factor,
     velocity_table,
 )
+from cpunet.simulation.fields import FieldMaps
+from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import Simulator
 
 STEPS = SimulationSettings(dt_ns=1, length_ns=3000)
 

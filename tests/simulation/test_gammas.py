@@ -10,16 +10,16 @@ import numpy.typing as npt
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.gammas.electrons import (
     HITS,
     LOST,
     Event,
     UnitVector,
     compton_energy,
+    electron_table,
+    photon_table,
     put_photon,
 )
-from cpunet.simulation.gammas.germanium import electron_table, photon_table
 from cpunet.simulation.gammas.sample import (
     TL208_KEV,
     EnergyWindow,
@@ -30,6 +30,7 @@ from cpunet.simulation.gammas.sample import (
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.simulator import cluster_hits
 
 
 def crystal(**changed: float) -> Detector:

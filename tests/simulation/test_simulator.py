@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
+from cpunet.simulation.field_lookup import ELECTRON, HOLE, carrier_velocity, velocity_table
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator
-from cpunet.simulation.velocity import ELECTRON, HOLE, carrier_velocity, velocity_table
 
 PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
 SIGGEN = PLAIN.model_copy(

@@ -15,8 +15,8 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.training.figures import sides_figure
 from cpunet.validation import run_figures
 from cpunet.validation.comparisons import compare
+from cpunet.validation.peaks import MeanPulse, around_half
 from cpunet.validation.run_figures import nearest, shape_figure
-from cpunet.validation.slices import MeanPulse, around_half
 from synthetic import LOSS_NAMES, load_recipe, require_drawn
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})

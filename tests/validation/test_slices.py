@@ -12,14 +12,14 @@ from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
 from cpunet.validation.methods import true_responses
-from cpunet.validation.run_figures import shape_figure
-from cpunet.validation.slices import (
+from cpunet.validation.peaks import (
     BEFORE_NS,
     Slices,
     around_half,
     slice_edges,
     sliced,
 )
+from cpunet.validation.run_figures import shape_figure
 from synthetic import paired_scores, require_drawn
 
 DT = 16.0

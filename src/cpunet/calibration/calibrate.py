@@ -34,7 +34,7 @@ from cpunet.calibration.nuisances import (
 )
 from cpunet.calibration.result import described
 from cpunet.calibration.search import Search
-from cpunet.electronics.measured import drawn_like, noise_of, tails_of
+from cpunet.electronics.finishing import drawn_like, noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
@@ -52,11 +52,10 @@ from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed, yaml_text
-from cpunet.simulation.again import StoredSimulation
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulate import simulate
+from cpunet.simulation.simulate import StoredSimulation, simulate
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.job import TrainingJob, train_chain
 from cpunet.training.pulse_sets import MIN_PULSES, PulseSets

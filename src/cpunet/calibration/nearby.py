@@ -24,8 +24,8 @@ from numba import prange
 
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.kernels import kernel
-from cpunet.simulation.again import SameHits
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.simulate import SameHits
 
 FloatArray = npt.NDArray[np.float32]
 # Factors by which the sampling period is divided for alignment; the first possible is used.

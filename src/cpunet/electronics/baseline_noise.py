@@ -19,11 +19,11 @@ import scipy.ndimage
 import scipy.optimize
 from scipy.stats import median_abs_deviation
 
-from cpunet.electronics.exponentials import FloatArray as Values
+from cpunet.electronics.chain import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
-from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray
+from cpunet.pulses.preparation import SHORTEST_SHARE, Baselines
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
@@ -117,7 +117,26 @@ class BaselineNoise:
         """
         if chosen is None:
             chosen = np.ones(len(baselines), bool)
-        values, dt_ns = _in_prepared_units(baselines, chosen), baselines.first.dt_ns
+        # samples before the pulse in prepared units times keV, the same number for each trace
+        energy_kev = baselines.first.energy_kev
+        usable = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
+        rows = np.flatnonzero(usable[baselines.prepared.index])
+        if len(rows) < MIN_BASELINES:
+            raise CpunetError(
+                f"only {len(rows)} of {len(baselines)} traces have a known energy and can be "
+                f"prepared; give {MIN_BASELINES} or more to take the noise from"
+            )
+        before = baselines.before[rows]
+        length = min(int(np.quantile(before, SHORTEST_SHARE)), baselines.first.length)
+        if (known_ns := max(length, 0) * baselines.first.dt_ns) < MIN_NS:
+            raise CpunetError(
+                f"the traces have {known_ns:.0f} ns before the pulse; the noise needs "
+                f"{MIN_NS:.0f} or more, so give traces with a longer baseline"
+            )
+        used = baselines.prepared[rows[before >= length]]
+        samples = baselines.first.waveforms[used.index, :length].astype(float)
+        kev, dt_ns = used.pulses.energy_kev / used.scale, baselines.first.dt_ns
+        values = (samples - used.baseline[:, np.newaxis]) * kev[:, np.newaxis]
         flat = values[_flat(values)] if len(values) else values
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
@@ -136,12 +155,16 @@ class BaselineNoise:
             spectrum(flat[which == kind], record_samples(dt_ns)) for kind in range(len(counts))
         ]
         kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
+        # standard error of an RMS that is partly extrapolated beyond the baselines
+        power = flat.var(axis=1)
+        seen = float(np.sqrt(power.mean()))
+        chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5) if seen else 0.0
         return replace(
             mean,
             kinds=kinds,
             lines=kinds_lines,
             shares=counts / counts.sum(),
-            rms_error=_rms_error(flat, mean.rms),
+            rms_error=float(np.hypot(chance, mean.rms - seen)),
         )
 
     @property
@@ -196,7 +219,11 @@ class BaselineNoise:
             kind = rng.choice(len(size), size=len(bins), p=self.shares)
             bins *= size[kind]
             if lines is not None:
-                _add_lines(bins, lines[kind], rng)
+                # sines of random phase: of fixed amplitude, the RMS modulus of a Gaussian bin
+                trace, column = np.nonzero(lines[kind])
+                phase = rng.uniform(0, 2 * np.pi, len(trace))
+                heights = np.sqrt(2) * lines[kind][trace, column]
+                bins[trace, column] += heights * np.exp(1j * phase)
             traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
             noise[rows] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
         noise *= (rng.choice((-1.0, 1.0), n) / energy_kev)[:, np.newaxis]
@@ -246,24 +273,6 @@ def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
         )
 
 
-def _rms_error(flat: Values, rms: float) -> float:
-    """Standard error of an RMS that is partly extrapolated beyond the baselines."""
-    power = flat.var(axis=1)
-    seen = float(np.sqrt(power.mean()))
-    chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5) if seen else 0.0
-    return float(np.hypot(chance, rms - seen))
-
-
-def _add_lines(
-    bins: npt.NDArray[np.complex64], lines: FloatArray, rng: np.random.Generator
-) -> None:
-    """Add sines of fixed amplitude and random phase to spectra, shape ``(traces, bins)``."""
-    trace, column = np.nonzero(lines)
-    phase = rng.uniform(0, 2 * np.pi, len(trace))
-    # the RMS modulus of a Gaussian bin; that of a sine is constant
-    bins[trace, column] += np.sqrt(2) * lines[trace, column] * np.exp(1j * phase)
-
-
 def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     """Cluster baselines into kinds; all are of kind 0 if they differ only statistically.
 
@@ -304,29 +313,6 @@ def _band_powers(baselines: Values) -> Values:
     power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
     bands = np.array_split(power[:, FIRST_OF_BANDS:], BANDS, axis=1)
     return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
-
-
-def _in_prepared_units(baselines: Baselines, chosen: npt.NDArray[np.bool_]) -> Values:
-    """Samples before the pulse in prepared units times keV, the same number for each trace."""
-    energy_kev = baselines.first.energy_kev
-    usable = chosen & np.isfinite(energy_kev) & (energy_kev > 0)
-    rows = np.flatnonzero(usable[baselines.prepared.index])
-    if len(rows) < MIN_BASELINES:
-        raise CpunetError(
-            f"only {len(rows)} of {len(baselines)} traces have a known energy and can be "
-            f"prepared; give {MIN_BASELINES} or more to take the noise from"
-        )
-    before = baselines.before[rows]
-    length = min(int(np.quantile(before, SHORTEST_SHARE)), baselines.first.length)
-    if (known_ns := max(length, 0) * baselines.first.dt_ns) < MIN_NS:
-        raise CpunetError(
-            f"the traces have {known_ns:.0f} ns before the pulse; the noise needs {MIN_NS:.0f} "
-            "or more, so give traces with a longer baseline"
-        )
-    used = baselines.prepared[rows[before >= length]]
-    samples = baselines.first.waveforms[used.index, :length].astype(float)
-    kev = used.pulses.energy_kev / used.scale
-    return np.asarray((samples - used.baseline[:, np.newaxis]) * kev[:, np.newaxis], float)
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
@@ -377,13 +363,12 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     >>> bool(abs(continuum[1000:].mean() - 4) < 0.1), bool(lines.any())
     (True, False)
     """
-    density = _periodogram(baselines)
-    continuum, lines = _without_lines(density, baselines.shape[1], samples)
-    return _with_slow_part(continuum, lines, _structure_function(baselines)), lines
-
-
-def _without_lines(density: Values, length: int, samples: int) -> tuple[Values, Values]:
-    """Split a periodogram into its continuum and its lines on the grid of the records."""
+    length = baselines.shape[1]
+    window = np.hanning(length + 1)[:-1]
+    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
+    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+    density = np.asarray(power.mean(axis=0) / (window @ window), float)
+    # split a periodogram into its continuum and its lines on the grid of the records
     around = scipy.ndimage.median_filter(density, 2 * LINE_AROUND + 1, mode="nearest")
     lines = np.zeros(samples // 2 + 1)
     continuum = density.copy()
@@ -398,15 +383,7 @@ def _without_lines(density: Values, length: int, samples: int) -> tuple[Values, 
         # the bins of the periodogram are wider than those of the records
         lines[round(centre * samples)] += excess.sum() * samples / length
         continuum[near] = np.minimum(continuum[near], around[near])
-    return continuum, lines
-
-
-def _periodogram(baselines: Values) -> Values:
-    samples = baselines.shape[1]
-    window = np.hanning(samples + 1)[:-1]
-    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
-    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
-    return np.asarray(power.mean(axis=0) / (window @ window), float)
+    return _with_slow_part(continuum, lines, _structure_function(baselines)), lines
 
 
 def _structure_function(baselines: Values) -> Values:

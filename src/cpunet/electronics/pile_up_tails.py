@@ -18,12 +18,12 @@ import numpy.typing as npt
 from pydantic import Field
 from scipy.stats import median_abs_deviation
 
-from cpunet.electronics.exponentials import FloatArray
+from cpunet.electronics.chain import FloatArray
 from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
 from cpunet.errors import CpunetError
-from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InfoPart
+from cpunet.pulses.preparation import Baselines
 
 MIN_BASELINES = 30  # minimum number of baselines
 SIGMA_PER_MAD = 1.4826  # of a normal distribution
@@ -315,7 +315,13 @@ class PileUpTails:
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
         fit = fit_rate(kev[quiet], guess, decay, baselines.first.energy_kev)
-        _require_empty(fit)
+        # no curvature despite a rate: the fit did not find the level of empty baselines
+        blind = fit.law.expected > MIN_EXPECTED and not fit.rate_error_khz > 0
+        if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
+            raise CpunetError(
+                "nearly all traces lie on pile-up tails, so that the level of an empty "
+                "baseline is not seen and they cannot be measured; measure at a lower rate"
+            )
         return cls(
             kev=np.where(quiet, kev - fit.level_kev, np.nan),
             error_kev=fit.sigma_kev,
@@ -389,14 +395,3 @@ def _read(
     sigma = float(median_abs_deviation(finite, scale="normal"))
     broadest = centre + max(DISTURBED * sigma, 0.1 * centre)
     return mean, left, width <= broadest, broadest
-
-
-def _require_empty(fit: RateFit) -> None:
-    """Raise a `CpunetError` if no baseline is empty, so that there is no reference level."""
-    # no curvature despite a rate: the fit did not find the level of empty baselines
-    blind = fit.law.expected > MIN_EXPECTED and not fit.rate_error_khz > 0
-    if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
-        raise CpunetError(
-            "nearly all traces lie on pile-up tails, so that the level of an empty "
-            "baseline is not seen and they cannot be measured; measure at a lower rate"
-        )

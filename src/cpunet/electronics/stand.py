@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.exact_response import linear_response
-from cpunet.electronics.readout import SATURATED, of_energy, read_out
+from cpunet.electronics.readout import SATURATED, linear_response, of_energy, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import Pulses
@@ -249,7 +248,12 @@ class Side:
             pulses = events.pulses()
             if len(pulses):
                 untrapped = pulses.energy_kev + events.trapped_kev[detected]
-                labels = labels_of(untrapped, self.source.events)
+                labels = np.full(len(untrapped), OTHER)
+                for window in self.source.events:
+                    # sums of deposits are rounded
+                    low, high = window.low_kev - 1e-6, window.high_kev + 1e-6
+                    inside = (untrapped >= low) & (untrapped <= high)
+                    labels[inside] = LABELS.get(window.name, OTHER)
                 share, lines = untrapped / pulses.energy_kev, labels != OTHER
                 gain = gain or float(np.median(share[lines] if lines.any() else share))
                 calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
@@ -333,16 +337,6 @@ def _fine_ns(dt_ns: float, step_ns: float) -> float:
     )
 
 
-def labels_of(energy_kev: npt.NDArray[np.float64], windows: Iterable[EnergyWindow]) -> Labels:
-    """Labels by energy window: 0 DEP, 1 SEP, 2 FEP, 3 other; collected energies in keV."""
-    labels = np.full(len(energy_kev), OTHER)
-    for window in windows:
-        # sums of deposits are rounded
-        inside = (energy_kev >= window.low_kev - 1e-6) & (energy_kev <= window.high_kev + 1e-6)
-        labels[inside] = LABELS.get(window.name, OTHER)
-    return labels
-
-
 def _write_sim(folder: Path, side: Side, stand: Stand) -> None:
     """Write ``sim.lh5`` and the truth of its pulses."""
     labels: list[Labels] = []
@@ -355,7 +349,16 @@ def _write_sim(folder: Path, side: Side, stand: Stand) -> None:
         PulseWriter(folder / "sim.lh5", attrs=MADE | {SIDE: "simulated"}) as writer,
     ):
         for fine, label, hits in side.blocks("Simulated events"):
-            writer.append(_block_means(fine, per_sample))
+            # each sample is the mean over the digitiser's period
+            whole = fine.length // per_sample * per_sample
+            parts = fine.waveforms[:, :whole].reshape(len(fine), -1, per_sample)
+            means = Pulses.of(
+                parts.mean(axis=2),
+                dt_ns=fine.dt_ns * per_sample,
+                energy_kev=fine.energy_kev,
+                event_number=fine.event_number,
+            )
+            writer.append(means)
             writer.append_rows(HIT_TABLE, hit_columns(hits))
             true = of_energy(linear_response(fine, electronics), fine.energy_kev, electronics)
             truth.write(true.astype(np.float32).tobytes())
@@ -401,19 +404,6 @@ def _write_data(folder: Path, side: Side, seed: int, stand: Stand) -> None:
     stand.data_lines = _by_line(whole["label"])
     for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
         stand.flags[name] = int((flag & bit > 0).sum())
-
-
-def _block_means(pulses: Pulses, per_sample: int) -> Pulses:
-    """Pulses at a period `per_sample` times as long; each sample is the mean over it."""
-    n, length = pulses.waveforms.shape
-    whole = length // per_sample * per_sample
-    blocks = pulses.waveforms[:, :whole].reshape(n, -1, per_sample)
-    return Pulses.of(
-        blocks.mean(axis=2),
-        dt_ns=pulses.dt_ns * per_sample,
-        energy_kev=pulses.energy_kev,
-        event_number=pulses.event_number,
-    )
 
 
 def _by_line(labels: Labels) -> Counter[str]:

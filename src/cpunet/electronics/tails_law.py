@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.exponentials import FloatArray
+from cpunet.electronics.chain import FloatArray
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:
@@ -91,7 +91,9 @@ class TailsLaw:
         >>> bool(abs(law.share_above(300.0 / np.e) - (1 - np.exp(-0.1))) < 1e-12)
         True
         """
-        ratio = _some(self.energies_kev) / np.asarray(kev, float)[..., np.newaxis]
+        # of equally probable energies that represent the spectrum
+        energies = energies_at((np.arange(_ENERGIES) + 0.5) / _ENERGIES, self.energies_kev)
+        ratio = energies / np.asarray(kev, float)[..., np.newaxis]
         lives = np.log(np.maximum(ratio, 1)).mean(axis=-1)
         return np.asarray(-np.expm1(-self.expected * lives), float)
 
@@ -188,11 +190,6 @@ def energies_at(share: FloatArray, energies_kev: Sequence[float]) -> FloatArray:
     logs = np.log(np.maximum(np.asarray(energies_kev, float), _MIN_KEV))
     at = np.linspace(0, 1, len(logs))
     return np.asarray(np.exp(np.interp(share, at, logs)), float)
-
-
-def _some(energies_kev: Sequence[float]) -> FloatArray:
-    """Equally probable energies that represent the spectrum."""
-    return energies_at((np.arange(_ENERGIES) + 0.5) / _ENERGIES, energies_kev)
 
 
 Function = Callable[[FloatArray], float]
@@ -296,7 +293,11 @@ class _Likelihood:
     def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
         self.kev, self.sigma, self.energies = kev, sigma_kev, energies
         self.step = sigma_kev / STEPS_OF_SIGMA
-        self.points = _points(kev, sigma_kev, float(energies[-1]), self.step)
+        # number of grid points for tails and their noise; the first quarter is below 0
+        above = max(2 * float(energies[-1]), float(kev.max())) + ROOM * sigma_kev
+        below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
+        points = max(4 * above / 3, 4 * below) / self.step
+        self.points = int(np.clip(2 ** np.ceil(np.log2(points)), LEAST_GRID, MOST_GRID))
         self.u = np.asarray(2 * np.pi * np.fft.rfftfreq(self.points, self.step), float)
         exponents = np.conj(characteristic_exponents(self.u, energies)).T
         self.exponents = np.ascontiguousarray(exponents).view(np.float64)  # (energies, 2 of u)
@@ -362,14 +363,6 @@ class _Likelihood:
         starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
         fits = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
         return -min(float(fit.fun) for fit in fits)
-
-
-def _points(kev: FloatArray, sigma_kev: float, highest_kev: float, step_kev: float) -> int:
-    """Number of grid points for tails and their noise; the first quarter is below 0."""
-    above = max(2 * highest_kev, float(kev.max())) + ROOM * sigma_kev
-    below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
-    points = max(4 * above / 3, 4 * below) / step_kev
-    return int(np.clip(2 ** np.ceil(np.log2(points)), LEAST_GRID, MOST_GRID))
 
 
 def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:

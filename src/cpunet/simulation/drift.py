@@ -12,8 +12,14 @@ import math
 import numpy as np
 
 from cpunet.kernels import kernel
-from cpunet.simulation.field_lookup import DriftMaps, in_ditch, look_up
-from cpunet.simulation.velocity import HOLE, FloatArray, carrier_velocity
+from cpunet.simulation.field_lookup import (
+    HOLE,
+    DriftMaps,
+    FloatArray,
+    carrier_velocity,
+    in_ditch,
+    look_up,
+)
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 # siggen's rounded value, used in its formulas

@@ -64,7 +64,21 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
     """
     file = Path(path)
     with step_tables(file) as tables:
-        table, label = _chosen(file, tables, options.hits_detector)
+        detectors, detector = _by_detector(tables), options.hits_detector
+        names = ", ".join(detectors)
+        if detector is None and len(detectors) > 1:
+            raise CpunetError(
+                f"{file}: holds detectors {names}; choose one with `hits_detector`"
+            )
+        if detector is not None and not names:
+            raise CpunetError(
+                f"{file}: its hits name no detector to pick {detector} by; leave out "
+                "`hits_detector`"
+            )
+        if detector is not None and detector not in detectors:
+            raise CpunetError(f"{file}: no detector {detector}; it holds {names}")
+        only = next(iter(detectors.values()))
+        table, label = only if detector is None else detectors[detector]
         steps = table.steps(options, label)
         origin = table.origin_mm(label or table.name)
     hits = _to_hits(file, steps, origin, options)
@@ -100,24 +114,6 @@ def _by_detector(tables: list[StepTable]) -> dict[str, tuple[StepTable, str | No
         else:
             detectors[table.name] = (table, None)
     return detectors
-
-
-def _chosen(
-    path: Path, tables: list[StepTable], detector: str | None
-) -> tuple[StepTable, str | None]:
-    """The table and the label there of the detector wanted, or of the only one."""
-    detectors = _by_detector(tables)
-    names = ", ".join(detectors)
-    if detector is None and len(detectors) > 1:
-        raise CpunetError(f"{path}: holds detectors {names}; choose one with `hits_detector`")
-    if detector is not None and not names:
-        raise CpunetError(
-            f"{path}: its hits name no detector to pick {detector} by; leave out "
-            "`hits_detector`"
-        )
-    if detector is not None and detector not in detectors:
-        raise CpunetError(f"{path}: no detector {detector}; it holds {names}")
-    return next(iter(detectors.values())) if detector is None else detectors[detector]
 
 
 def _to_hits(
@@ -158,8 +154,10 @@ def _to_hits(
     again = np.ones(len(numbers), bool)
     again[np.unique(numbers, return_index=True)[1]] = False
     numbers[again] = largest + 1 + np.arange(again.sum())
+    # from the frame of the file to that of the crystal
+    mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
     hits = Hits.of(
-        options.to_crystal(position[order]),
+        (position[order] - np.asarray(options.origin)) * mirror,
         edep[order],
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
@@ -265,15 +263,13 @@ def describe_hits(
             continue
         lines = label_peaks(hits.energy_kev, peaks)
         places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
-        extents = (f"{axis} {span(_ends(values), 2)}" for axis, values in places.items())
+        extents = (
+            f"{axis} {span([values.min(), values.max()], 2)}" for axis, values in places.items()
+        )
         detectors[name] = [
             ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
-            ("energy", f"{span(_ends(hits.energy_kev))} keV an event"),
+            ("energy", f"{span([hits.energy_kev.min(), hits.energy_kev.max()])} keV an event"),
             ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
             ("extents", f"{', '.join(extents)} mm"),
         ]
     return detectors
-
-
-def _ends(values: FloatArray) -> list[float]:
-    return [float(values.min()), float(values.max())]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -186,7 +186,7 @@ class HitFile:
             "origin_mm": list(self.options.origin),
             "flip_z": self.options.flip_z,
             "time_window_us": WINDOW_US,
-            "windows_kev": _by_name(self.windows),
+            "windows_kev": {w.name: (w.low_kev, w.high_kev) for w in self.windows},
         }
 
 
@@ -220,7 +220,7 @@ class GammaSource:
         """Provenance of the hits, for the output."""
         return {
             "monte_carlo": "Tl-208, 2614.511 keV",
-            "windows_kev": _by_name(self.events),
+            "windows_kev": {w.name: (w.low_kev, w.high_kev) for w in self.events},
             "events": {window.name: n for window, n in self.events.items()},
             "source_height_mm": self.height_mm,
             "source_radius_mm": self.radius_mm,
@@ -261,7 +261,3 @@ class GammaSource:
 
 
 HitSource = HitFile | GammaSource
-
-
-def _by_name(windows: Iterable[EnergyWindow]) -> dict[str, tuple[float, float]]:
-    return {window.name: (window.low_kev, window.high_kev) for window in windows}

@@ -43,16 +43,6 @@ class HitOptions:
     flip_z: bool = False
     units: str = ""
 
-    def to_crystal(self, position_mm: FloatArray) -> FloatArray:
-        """Positions of shape ``(n, 3)`` in mm, from the frame of the file to the crystal's.
-
-        `origin` is subtracted. With `flip_z`, z (and y, so that the frame remains right-handed)
-        are then mirrored.
-        """
-        moved = position_mm - np.asarray(self.origin)
-        mirror = np.array([1.0, -1.0, -1.0]) if self.flip_z else np.ones(3)
-        return np.asarray(moved * mirror, np.float64)
-
 
 @dataclass(frozen=True, eq=False)
 class Hits:

@@ -23,8 +23,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
-from cpunet.pulses.row_columns import other_columns
-from cpunet.pulses.writing import PulseWriter
+from cpunet.pulses.writing import PulseWriter, other_columns
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import form_of
 from cpunet.translation.options import TranslateOptions

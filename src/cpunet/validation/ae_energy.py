@@ -280,22 +280,19 @@ def _course(points: list[SiteFit]) -> Course:
         chi_square=chi_square,
         degrees=len(points) - 2,
     )
-    law = _resolution(energy, sigma / mean, sigma_error / mean)
-    scale_error = float(scale * np.sqrt(covariance[1, 1]))
-    return Course(points, float(scale), scale_error, line, law)
-
-
-def _resolution(energy: Values, relative: Values, error: Values) -> WidthLaw:
-    """Fit ``a`` and ``b`` of sqrt(a + (b/E)^2), neither below 0, to the squared widths."""
+    # a and b of sqrt(a + (b/E)^2), neither below 0, from the squared widths
     terms = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1)
+    relative, spread = sigma / mean, sigma_error / mean
     squares = relative**2
     for _ in range(3):
         # errors are scaled to the fitted widths; otherwise widths that fluctuate low weigh most
-        weight = relative / (2 * squares * error)
-        a, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
-        squares = terms @ np.array([a, b2])
-    at_reference = 100 * np.sqrt(a + b2 * 1e6 / REFERENCE_KEV**2)
-    return WidthLaw(float(a), float(1e3 * np.sqrt(b2)), 2.0, float(at_reference))
+        weight = relative / (2 * squares * spread)
+        constant, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
+        squares = terms @ np.array([constant, b2])
+    at_reference = float(100 * np.sqrt(constant + b2 * 1e6 / REFERENCE_KEV**2))
+    law = WidthLaw(float(constant), float(1e3 * np.sqrt(b2)), 2.0, at_reference)
+    scale_error = float(scale * np.sqrt(covariance[1, 1]))
+    return Course(points, float(scale), scale_error, line, law)
 
 
 def _columns(points: Sequence[SiteFit]) -> Values:

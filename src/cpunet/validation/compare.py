@@ -216,9 +216,18 @@ class Comparison:
         }
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
         title = f"{label(self.method)}: {len(self.metrics)} runs compared"
-        runs = [
-            _overview(name, scores_of, self.method) for name, scores_of in self.metrics.items()
-        ]
+        runs = []
+        for name, metrics in self.metrics.items():
+            off, judged = judged_scores(metrics, self.method)
+            text = f"{off} of {judged} off" if judged else "not judged"
+            marked = off > 2 and off > 0.2 * judged  # one or two of many may be off
+            if part(metrics, "training").get("ok") is False:
+                text, marked = f"{text}, a bad fit", True
+            lines = [summary(metrics, peak, self.method) for peak in part(metrics, "peaks")]
+            about = "; ".join(f"{key}: {of}" for key, of in part(metrics, "compared").items())
+            runs.append(
+                {"name": name, "text": text, "marked": marked, "lines": lines, "about": about}
+            )
         values = {"title": title, "comparison": self, "runs": runs, "links": links}
         page = rendered("compare.html", **values, peaks=peaks, over=OVER, far=f"{FAR:g}")
         with written_aside(path) as aside:
@@ -358,7 +367,7 @@ def compared(
 def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     """Scores of a method at a peak, by name."""
     scores, survival = part(metrics, "peaks", peak), part(metrics, "ae_survival", peak)
-    collected = {}
+    collected, of_legend = {}, {}
     for name, quantity in part(scores, "parameters").items():
         ceiling = number(quantity, "iou", "ceiling")
         more = "" if ceiling is None else f" ({ceiling:.1f})"
@@ -368,6 +377,12 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     auc, error, chance = (
         number(scores, "two_sample", method, key) for key in ("auc", "auc_std", "null_mean")
     )
+    judged = judged_parameters(scores)
+    for name in (name for name in MAIN if name in judged):
+        shift, spread = (number(judged[name], key, method) for key in ("shift", "shift_std"))
+        unit = LABELLED[name].unit
+        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
+        of_legend[title] = Cell.of(shift, spread, "+.2g", 0.0)
     edge = number(scores, "paired", method, "edge_rmse")
     difference, std = (
         number(survival, key, method) for key in ("difference", "difference_std")
@@ -375,41 +390,9 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
     return collected | {
         "classifier: AUC": Cell.of(auc, error, ".3f", chance or 0.0),
         "edge RMSE [10⁻³]": Cell.of(None if edge is None else 1e3 * edge, None, "#.3g", 0.0),
-        **_legend(metrics, peak, method),
+        **of_legend,
         "A/E survival minus data [points]": Cell.of(difference, std, "+.2f", 0.0),
     }
-
-
-def _legend(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
-    """Differences of LEGEND's quantities from the data, by name."""
-    judged, collected = judged_parameters(part(metrics, "peaks", peak)), {}
-    for name in (name for name in MAIN if name in judged):
-        shift, error = (number(judged[name], key, method) for key in ("shift", "shift_std"))
-        unit = LABELLED[name].unit
-        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
-        collected[title] = Cell.of(shift, error, "+.2g", 0.0)
-    return collected
-
-
-class Overview(NamedTuple):
-    """Line of one run: how many scores are off, verdicts in words, and what was compared."""
-
-    name: str
-    text: str
-    marked: bool
-    lines: list[str]
-    about: str
-
-
-def _overview(name: str, metrics: Metrics, method: str) -> Overview:
-    off, judged = judged_scores(metrics, method)
-    text = f"{off} of {judged} off" if judged else "not judged"
-    marked = off > 2 and off > 0.2 * judged  # one or two of many may be off
-    if part(metrics, "training").get("ok") is False:
-        text, marked = f"{text}, a bad fit", True
-    lines = [summary(metrics, peak, method) for peak in part(metrics, "peaks")]
-    about = "; ".join(f"{key}: {text}" for key, text in part(metrics, "compared").items())
-    return Overview(name, text, marked, lines, about)
 
 
 def _pulses(metrics: Metrics) -> dict[str, Any]:

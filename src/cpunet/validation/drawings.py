@@ -17,7 +17,7 @@ from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
 from cpunet.validation.noise import spectrum_of_noise
-from cpunet.validation.peaks import PeakSets
+from cpunet.validation.peaks import MeanPulse, PeakSets, around_half
 from cpunet.validation.run_figures import (
     cycle_figure,
     further_histograms,
@@ -28,7 +28,6 @@ from cpunet.validation.run_figures import (
     roc_figure,
     shape_figure,
 )
-from cpunet.validation.slices import MeanPulse, around_half
 from cpunet.validation.verdicts import held_out, judged_parameters
 
 # methods in the figures; a reader may hide some
@@ -63,27 +62,21 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
         evaluated.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values())
     )
     if any(name.startswith(f"{IREN.part}.") for name in evaluated.run.weights):
-        drawn |= _cycles(fullest, evaluated.run.iren)
+        # pulses of both sides through both networks and back
+        iren, ren = evaluated.run.iren, fullest.translations.ren
+        for forward, back, side, names in (
+            (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
+            (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
+        ):
+            start, rows = fullest.windows(side)[:SHOWN], fullest.rows[side][:SHOWN]
+            kev = fullest.translations.energy_kev[side][rows]
+            middle = forward.apply(start, energy_kev=kev, noise=False)
+            end = back.apply(middle, energy_kev=kev, noise=False)
+            stages = dict(zip(names, (start, middle, end), strict=True))
+            draw = partial(cycle_figure, stages, ren.dt_ns)
+            drawn[f"{fullest.name} cycle of {names[0].lower()}"] = draw
     if evaluated.run.records:
         drawn["losses"] = partial(loss_curves, evaluated.run.records)
-    return drawn
-
-
-def _cycles(peak: PeakSets, iren: IREN) -> dict[str, Drawing]:
-    """Pulses of both sides through both networks and back."""
-    ren = peak.translations.ren
-    drawn: dict[str, Drawing] = {}
-    for forward, back, side, names in (
-        (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
-        (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
-    ):
-        start, rows = peak.windows(side)[:SHOWN], peak.rows[side][:SHOWN]
-        kev = peak.translations.energy_kev[side][rows]
-        middle = forward.apply(start, energy_kev=kev, noise=False)
-        end = back.apply(middle, energy_kev=kev, noise=False)
-        stages = zip(names, (start, middle, end), strict=True)
-        draw = partial(cycle_figure, dict(stages), ren.dt_ns)
-        drawn[f"{peak.name} cycle of {names[0].lower()}"] = draw
     return drawn
 
 

@@ -18,7 +18,7 @@ from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
 from cpunet.pulses.parameters import tail_slope
-from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
@@ -37,16 +37,23 @@ from cpunet.validation.a_over_e import (
 )
 from cpunet.validation.ae_energy import AgainstEnergy, against_energy
 from cpunet.validation.comparisons import Missing
-from cpunet.validation.fit_errors import fit_ends, moved_values
 from cpunet.validation.methods import (
     Translations,
     fit_baseline_methods,
     translate_all,
     true_responses,
 )
-from cpunet.validation.peaks import ByMethod, PeakScores, PeakSets, score_peak
+from cpunet.validation.peaks import (
+    ByMethod,
+    PeakScores,
+    PeakSets,
+    Slices,
+    aligned_means,
+    fit_ends,
+    moved_values,
+    score_peak,
+)
 from cpunet.validation.report import as_stored
-from cpunet.validation.slices import Slices, aligned_means
 from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
@@ -100,7 +107,11 @@ def evaluate(
     ren = REN.of(run, resolve_device("auto", run.recipe))
     others = further.replace(" ", "").split(",") if further else []
     names = list(dict.fromkeys([*recipe.peaks, trained_on, *others]))
-    selection = _selected(recipe, names)
+    # energies of the peaks, with all sidebands and continua
+    selection = parse_selection(",".join(names), recipe.peaks)
+    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    more += recipe.scores.continuum_kev.values()
+    selection = replace(selection, ranges_kev=(*selection.ranges_kev, *more))
     sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
     data_set = load_pulses(data, "measured", recipe, selection, max_pulses=max_pulses)
     require_same_sampling(sim_set, data_set)
@@ -115,15 +126,18 @@ def evaluate(
         fitted=baselines,
     )
     translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
-    selections = {name: parse_selection(name, recipe.peaks) for name in names}
-    sets = [PeakSets.of(name, selected, translations) for name, selected in selections.items()]
+    sets = [PeakSets.of(n, parse_selection(n, recipe.peaks), translations) for n in names]
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
     ends = fit_ends(run, ren)
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         scales = _dep_scales(sets, seed)
-        decays = _decays_ns(translations)
+        samples = recipe.preparation.at(ren.dt_ns).decay_fit_samples
+        decays = {  # as an analysis has one for a channel
+            method: median_decay_ns(tail_slope(windows, ren.dt_ns, samples))
+            for method, windows in translations.windows.items()
+        }
         ended = pool.map(partial(moved_values, ends=ends, seed=seed), sets)
         moved = {peak.name: values for peak, values in zip(sets, ended, strict=True)}
         work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
@@ -185,16 +199,6 @@ def evaluate(
     return Evaluation(run, sets, values, slices, ae_energy, stored)
 
 
-def _decays_ns(translations: Translations) -> dict[str, float]:
-    """Decay of all pulses of each method, as an analysis has one for a channel."""
-    dt_ns = translations.ren.dt_ns
-    samples = translations.ren.recipe.preparation.at(dt_ns).decay_fit_samples
-    return {
-        method: median_decay_ns(tail_slope(windows, dt_ns, samples))
-        for method, windows in translations.windows.items()
-    }
-
-
 def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
     """Position of the single-site peak of A/E in the DEP, and its error, by method."""
     dep = next((peak for peak in sets if peak.name == DEP), None)
@@ -205,14 +209,6 @@ def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
         for method, rows in dep.rows.items()
     }
     return scales if np.isfinite(list(scales.values())).all() else {}
-
-
-def _selected(recipe: Recipe, names: list[str]) -> EnergySelection:
-    """Energies of the peaks, with all sidebands and continua."""
-    chosen = parse_selection(",".join(names), recipe.peaks)
-    more = [band for _, bands in _lines(recipe).values() for band in bands]
-    more += recipe.scores.continuum_kev.values()
-    return replace(chosen, ranges_kev=(*chosen.ranges_kev, *more))
 
 
 def _range_survivals(
@@ -279,8 +275,11 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
     }
     compared = {name: str(value) for name, value in facts.items() if value is not None}
     compared |= {
-        "simulation": _short(sim.path),
-        "data": _short(data.path),
+        # which do not depend on where a study is stored
+        **{
+            name: "/".join(side.path.absolute().parts[-2:])
+            for name, side in (("simulation", sim), ("data", data))
+        },
         "run": Path(run.name).absolute().name,
         "trained": ", ".join(filter(None, training)),
     }
@@ -299,8 +298,3 @@ def period_of(path: Path) -> str | None:
     """
     match = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
     return None if match is None else f"{match[1]} {match[2]}"
-
-
-def _short(path: Path) -> str:
-    """Name of a file and its folder, which do not depend on where a study is stored."""
-    return "/".join(path.absolute().parts[-2:])

@@ -21,12 +21,10 @@ from typing import TypedDict
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_methods import BaselineMethod
+from cpunet.electronics.baseline_methods import BASELINE_METHODS, BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
-from cpunet.electronics.finishing import finish
-from cpunet.electronics.fitted_kernels import BASELINE_METHODS
-from cpunet.electronics.measured import noise_of, tails_of
+from cpunet.electronics.finishing import finish, noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.progress import stage
@@ -143,12 +141,12 @@ def scores_of_squares(squares: Values) -> PairedScores:
     >>> round(scores_of_squares(squares["ren"])["rmse"], 6)
     0.0
     """
-    total = squares.sum(axis=0)
-    return {
-        "rmse": _root_mean(total[:2]),
-        "edge_rmse": _root_mean(total[2:]),
-        "unaligned": int((squares[:, 1] == 0).sum()),
-    }
+    rmse, edge_rmse = (
+        float(np.sqrt(total / count)) if count else float("nan")
+        for total, count in squares.sum(axis=0).reshape(2, 2)
+    )
+    unaligned = int((squares[:, 1] == 0).sum())
+    return {"rmse": rmse, "edge_rmse": edge_rmse, "unaligned": unaligned}
 
 
 def _squares(difference: Values) -> Values:
@@ -156,11 +154,6 @@ def _squares(difference: Values) -> Values:
     comparable = np.isfinite(difference)
     values = np.where(comparable, difference, 0)
     return np.stack([np.einsum("ij,ij->i", values, values), comparable.sum(axis=1)], axis=1)
-
-
-def _root_mean(sum_and_count: Values) -> float:
-    total, count = sum_and_count
-    return float(np.sqrt(total / count)) if count else float("nan")
 
 
 @dataclass(eq=False)
@@ -278,7 +271,7 @@ class Translations:
         raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
         windows = {"raw": raw}
         for name, method in self.baselines.methods.items():
-            windows[name] = method.translate_like_data(raw, config)
+            windows[name] = finish(method.translate(raw), config, dt_ns=self.ren.dt_ns).windows
         windows["ren"] = self.ren.apply(
             raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
         )
@@ -343,7 +336,7 @@ def translate_all(
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
             for windows in clean.values():
-                comparable[rows] &= _whole(windows)
+                comparable[rows] &= np.isfinite(windows).all(axis=1)
             if truth is not None:
                 truth[rows] = clean.pop("truth")
                 squares_of_block = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
@@ -356,7 +349,7 @@ def translate_all(
         ren,
         baselines,
         every,
-        {method: _whole(windows) for method, windows in every.items()},
+        {m: np.asarray(np.isfinite(windows).all(axis=1)) for m, windows in every.items()},
         {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
         {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()},
         comparable,
@@ -374,7 +367,3 @@ def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> Float
         generator=generator,
         tails_kev=None if tails is None else tails.draw_kev(len(pulses), generator),
     )
-
-
-def _whole(windows: FloatArray) -> Flags:
-    return np.asarray(np.isfinite(windows).all(axis=1))

@@ -101,7 +101,18 @@ def baseline_spectra(
     data = by_method["data"]
     for method in windows:
         if method != "data" and "missing" not in data | by_method[method]:
-            by_method[method] |= _against(by_method[method], data)
+            # deviation of the noise from that of the data; None where it is undefined
+            own = by_method[method]
+            error = np.hypot(own["rms_std"], data["rms_std"])
+            difference = np.subtract(own["power"], data["power"])
+            errors = np.hypot(own["power_std"], data["power_std"])
+            bands = np.abs(difference[errors > 0] / errors[errors > 0])
+            by_method[method] |= {
+                "rms_ratio": own["rms"] / data["rms"] if data["rms"] else None,
+                "sigma": float((own["rms"] - data["rms"]) / error) if error else None,
+                "worst_band_sigma": float(bands.max()) if bands.size else None,
+                "spectrum_sigma": _of_so_many(float(bands.max(initial=0)), bands.size),
+            }
     return by_method
 
 
@@ -158,20 +169,6 @@ def _band_powers(baselines: FloatArray, edges: Values) -> Values:
         power[:, -1] /= 2  # the highest frequency occurs only once
     starts = edges[:-1].astype(int)
     return np.asarray(np.add.reduceat(power, starts, axis=1))
-
-
-def _against(own: Mapping[str, Any], data: Mapping[str, Any]) -> dict[str, float | None]:
-    """Deviation of the noise from that of the data; None where it is undefined."""
-    error = np.hypot(own["rms_std"], data["rms_std"])
-    difference = np.subtract(own["power"], data["power"])
-    errors = np.hypot(own["power_std"], data["power_std"])
-    bands = np.abs(difference[errors > 0] / errors[errors > 0])
-    return {
-        "rms_ratio": own["rms"] / data["rms"] if data["rms"] else None,
-        "sigma": float((own["rms"] - data["rms"]) / error) if error else None,
-        "worst_band_sigma": float(bands.max()) if bands.size else None,
-        "spectrum_sigma": _of_so_many(float(bands.max(initial=0)), bands.size),
-    }
 
 
 def _of_so_many(worst: float, n: int) -> float | None:

@@ -205,8 +205,9 @@ def survival_html(survival: Mapping[str, Any]) -> Markup:
                 _percent(result[key].get(method), result[f"{key}_std"].get(method))
                 for key in ("survival", "difference")
             )
-            sigma = _sigma(result["sigma"].get(method))
-            rows.append([title, label(method), share, off, sigma])
+            sigma = result["sigma"].get(method)
+            in_sigma = NO_VALUE if sigma is None else f"{round(sigma, 1) + 0.0:+.1f}"
+            rows.append([title, label(method), share, off, in_sigma])
             title = ""
     head = ["Peak", "Method", "Survival [%]", "Minus data [points]", "In σ"]
     return part("table", head, rows, {0, 1})
@@ -294,10 +295,6 @@ def _parameter_table(parameters: Mapping[str, Any]) -> Markup:
 
 def _thousandths(value: float | None) -> str:
     return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
-
-
-def _sigma(value: float | None) -> str:
-    return NO_VALUE if value is None else f"{round(value, 1) + 0.0:+.1f}"
 
 
 def _percent(value: float | None, error: float | None) -> str:

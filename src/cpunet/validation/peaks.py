@@ -1,8 +1,31 @@
-"""The pulses of one peak by method, and their scores."""
+"""The pulses of one peak by method, and their scores.
+
+What the errors of a fit do to translated pulses.
+
+The parameters of a readout are as certain as their covariance says.  Some pulses are
+translated again with the parameters at both ends of each axis of the error ellipsoid, with
+the same noise: half of the difference along an axis is one standard deviation of whatever is
+calculated of them.
+
+Mean pulses in slices of rise time: where in the detector a translation is wrong.
+
+Pulses of one slice come from the same regions of the detector and differ by their sites
+and by noise.  Their mean, aligned at half maximum, is the slice's mean pulse.  Its standard
+error is determined, so a difference of simulation and data can be distinguished from chance.
+
+Pulses are ordered by their rise time from 1 to 90 % (``rise_01_90``), which starts with the
+pulse and ends while it still rises.  The paper's drift time ends at the maximum, which on a
+flat top depends on the noise and would smear the slices.
+
+The slices are bounded by quantiles of the rise times of the *data*.  Each method is sliced
+by its own rise times: a method with the wrong response has different events in a slice, which
+counts against it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -12,16 +35,137 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import PARAMETERS, Values
+from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.recipes.schema import Recipe
+from cpunet.training.closed_forms import error_ends
+from cpunet.training.run import Run
+from cpunet.translation.backends import ResponseBackend
+from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import Compared, Missing, compare
 from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
 from cpunet.validation.noise import baseline_spectra
+
+BEFORE_NS, AFTER_NS = 1600.0, 2400.0  # of a mean pulse before and after half maximum
+SLICES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class MeanPulse:
+    """The mean of pulses aligned at half maximum.
+
+    Attributes
+    ----------
+    mean, error
+        Mean and its standard error, shape ``(before + after,)``, in pulse heights; NaN where
+        fewer than 2 pulses contribute.  Errors of neighbouring samples are correlated.
+    n
+        Number of pulses in the mean.
+    """
+
+    mean: Values
+    error: Values
+    n: int
+
+    @classmethod
+    def of(cls, aligned: FloatArray) -> Self:
+        """Average pulses from `align_half_maximum`; those not aligned are left out.
+
+        Sums are in float64: those of ten thousand float32 are off by a part of their error.
+        """
+        count = np.isfinite(aligned).sum(axis=0)
+        mean = np.nansum(aligned, axis=0, dtype=float) / np.maximum(count, 1)
+        squares = np.nansum((aligned - mean) ** 2, axis=0)
+        error = np.sqrt(squares / np.maximum(count - 1, 1) / np.maximum(count, 1))
+        mean, error = (np.where(count >= 2, values, np.nan) for values in (mean, error))
+        return cls(mean, error, int(np.isfinite(aligned).any(axis=1).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """The mean pulses of a dataset by rise time.
+
+    Attributes
+    ----------
+    whole
+        Mean of all pulses.
+    pulses, edges
+        Mean pulse of each slice, and the edges of the slices in ns.
+    """
+
+    whole: MeanPulse
+    pulses: tuple[MeanPulse, ...]
+    edges: Values
+
+
+def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
+    """Edges of slices with equal numbers of measured pulses.
+
+    Parameters
+    ----------
+    rise_time
+        Rise times of the measured pulses in ns; NaN and infinity are ignored.
+    slices
+        Number of slices; one more edge is returned, in ns.
+
+    Examples
+    --------
+    >>> slice_edges(np.arange(101.0), slices=4)
+    array([  0.,  25.,  50.,  75., 100.])
+    """
+    finite = rise_time[np.isfinite(rise_time)]
+    return np.quantile(finite, np.linspace(0, 1, slices + 1))
+
+
+def around_half(windows: FloatArray, dt_ns: float) -> FloatArray:
+    """Pulses from `BEFORE_NS` before their half maximum to `AFTER_NS` after it."""
+    before, after = round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns)
+    return align_half_maximum(windows, before, after)
+
+
+def aligned_means(
+    windows: Callable[[str], FloatArray], rise_time: Mapping[str, Values], dt_ns: float
+) -> dict[str, Slices]:
+    """Mean pulses of each method, in the same slices for all.
+
+    Parameters
+    ----------
+    windows
+        Prepared pulses of a method, shape ``(n, length)``.
+    rise_time
+        Their rise times in ns by method, those of the measured pulses under ``"data"``.
+    dt_ns
+        Sampling period in ns.
+    """
+    edges = slice_edges(rise_time["data"])
+    return {
+        method: sliced(around_half(windows(method), dt_ns), times, edges)
+        for method, times in rise_time.items()
+    }
+
+
+def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
+    """Mean pulse of each slice.
+
+    Parameters
+    ----------
+    aligned
+        Pulses aligned by `align_half_maximum`, shape ``(n, samples)``.
+    rise_time
+        Rise time of each pulse in ns, shape ``(n,)``.
+    edges
+        Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
+    """
+    inside = (rise_time >= edges[0]) & (rise_time <= edges[-1])  # not those that are NaN
+    place = np.searchsorted(edges[1:-1], rise_time, side="right")
+    means = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
+    return Slices(MeanPulse.of(aligned), means, edges)
+
 
 MIN_PULSES = 10  # minimum number of pulses of a distribution
 
@@ -75,18 +219,6 @@ class PeakSets:
             name: scores_of_squares(of_method[rows]) for name, of_method in squares.items()
         } or None
 
-    def not_prepared(self) -> dict[str, int]:
-        """Number of translated pulses that cannot be prepared like data, by method."""
-        raw, whole = self.rows["raw"], self.translations.whole
-        counts = {m: int((~usable[raw]).sum()) for m, usable in whole.items() if m != "data"}
-        return {name: count for name, count in counts.items() if count}
-
-    def missing(self) -> str | None:
-        """Reason why the peak cannot be scored; None if it can."""
-        sides = (("simulated", self.rows["raw"]), ("measured", self.rows["data"]))
-        few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
-        return f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)" if few else None
-
 
 @dataclass(frozen=True, eq=False)
 class PeakScores:
@@ -138,7 +270,7 @@ def score_peak(
         Pulses of the peak.
     moved
         What the errors of the fit do to translated pulses, see
-        `cpunet.validation.fit_errors.moved_values`.
+        `cpunet.validation.peaks.moved_values`.
     recipe
         Recipe of the run.
     seed
@@ -155,8 +287,17 @@ def score_peak(
     scores
         Scores of the peak.
     """
-    counted = PeakScores(len(peak.rows["raw"]), len(peak.rows["data"]), peak.not_prepared())
-    if (missing := peak.missing()) is not None:
+    raw, data = peak.rows["raw"], peak.rows["data"]
+    lost = {
+        method: int((~whole[raw]).sum())
+        for method, whole in peak.translations.whole.items()
+        if method != "data"
+    }
+    counted = PeakScores(len(raw), len(data), {m: n for m, n in lost.items() if n})
+    sides = (("simulated", raw), ("measured", data))
+    few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
+    if few:
+        missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
         return {}, replace(counted, missing=missing)
     dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
     values = {
@@ -171,16 +312,29 @@ def score_peak(
     }
     ends = {"ren": dict(moved)} | {m: {} for m in values if m not in ("data", "ren")}
     for method, of_method in values.items() if scales else ():
-        scale, _ = scales[method]
-        of_method[A_OVER_E] = of_method["current_amplitude"] / scale
+        a_over_e = of_method[A_OVER_E] = of_method["current_amplitude"] / scales[method][0]
         if method != "data":
-            ends[method][A_OVER_E] = _normalised(of_method[A_OVER_E], method, scales)
-    chief, further = (
+            # both ends of the axis of its error, that of both positions of the peak
+            own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
+            error = np.hypot(own, other)
+            moved_by = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
+            ends[method][A_OVER_E] = moved_by[np.newaxis]
+    chief, others = (
         {
             m: {name: v for name, v in of.items() if (name in PARAMETERS) is chosen}
             for m, of in values.items()
         }
         for chosen in (True, False)
+    )
+    parameters, further = (
+        compare(
+            of["data"],
+            {m: of_method for m, of_method in of.items() if m != "data"},
+            recipe.scores,
+            seed,
+            ends,
+        )
+        for of in (chief, others)
     )
     noise = baseline_spectra(
         {method: peak.windows(method)[:, :samples].copy() for method in values},
@@ -190,34 +344,12 @@ def score_peak(
     )
     return values, replace(
         counted,
-        parameters=_compared(chief, recipe, seed, ends),
-        further=_compared(further, recipe, seed, ends),
+        parameters=parameters,
+        further=further,
         two_sample=classifier_tests(peak, chief, seed),
         noise=noise,
         paired=peak.paired_scores(),
     )
-
-
-def _normalised(
-    values: Values,
-    method: str,
-    scales: Mapping[str, tuple[float, float]],
-) -> Values:
-    """A/E over that of the double-escape peak at both ends of each axis of its errors.
-
-    The last axis is the error of both scales.  Parameters of the fit move A/E of both peaks;
-    what is left of that is far less than the error of the scales.
-    """
-    own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
-    error = np.hypot(own, other)
-    return np.stack([values * (1 + error), values * (1 - error)])[np.newaxis]
-
-
-def _compared(
-    values: ByMethod, recipe: Recipe, seed: int, moved: Mapping[str, Mapping[str, Values]]
-) -> dict[str, Compared]:
-    methods = {method: of_method for method, of_method in values.items() if method != "data"}
-    return compare(values["data"], methods, recipe.scores, seed, moved)
 
 
 def classifier_tests(
@@ -246,3 +378,57 @@ def classifier_tests(
     methods = list(values)[1:]
     with ThreadPoolExecutor(usable_cores()) as pool:
         return dict(zip(methods, pool.map(tested, methods), strict=True))
+
+
+PULSES = 300  # of a peak, for which an effect is calculated
+
+Ends = Sequence[tuple[REN, REN]]
+
+
+def fit_ends(run: Run, ren: REN) -> Ends:
+    """A translator at both ends of each axis of the errors; none of a network."""
+    backend = ren.backend
+    if run.fit is None or not isinstance(backend, ResponseBackend):
+        return []
+
+    def at(response: ElectronicsResponse) -> REN:
+        moved = copy.copy(ren)
+        moved.backend = of_end = copy.copy(backend)
+        chain = copy.copy(backend.network)
+        chain.response = response
+        of_end.network = chain
+        return moved
+
+    response = backend.network.response
+    return [(at(a), at(b)) for a, b in error_ends(response, run.fit.covariance)]
+
+
+def moved_values(peak: PeakSets, ends: Ends, seed: int) -> dict[str, Values]:
+    """Parameters of some pulses of a peak at both ends of each axis.
+
+    Parameters
+    ----------
+    peak
+        Pulses of the peak.
+    ends
+        See `fit_ends`.
+    seed
+        Seed of the noise, the same everywhere.
+
+    Returns
+    -------
+    dict
+        By name, shape ``(axes, 2, pulses)``; empty without axes or pulses.
+    """
+    rows = peak.rows["ren"]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), PULSES)).astype(int)]
+    if not ends or not len(rows):
+        return {}
+    windows = peak.translations.windows["raw"][rows]
+    kev, by_end = peak.translations.energy_kev["ren"][rows], []
+    for ren in (ren for pair in ends for ren in pair):
+        moved = ren.apply(windows, energy_kev=kev, generator=np.random.default_rng(seed))
+        pulses, recipe = Pulses.of(moved, dt_ns=ren.dt_ns), ren.recipe
+        by_end.append(all_parameters(pulses, recipe.preparation, recipe.scores))
+    shape = len(ends), 2, len(rows)
+    return {name: np.reshape([values[name] for values in by_end], shape) for name in by_end[0]}

@@ -36,7 +36,7 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
 from cpunet.validation.comparisons import histogram
-from cpunet.validation.slices import BEFORE_NS, MeanPulse
+from cpunet.validation.peaks import BEFORE_NS, MeanPulse
 from cpunet.validation.verdicts import QUANTITIES, judged_parameters, methods_of
 
 AVERAGES = 50  # a moving average is over this fraction of the records
@@ -347,7 +347,7 @@ def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
 
     Examples
     --------
-    >>> from cpunet.validation.slices import around_half
+    >>> from cpunet.validation.peaks import around_half
     >>> time = np.arange(400.0)
     >>> pulses = np.array([1 / (1 + np.exp((200 - time) / width)) for width in (2, 5, 9)])
     >>> aligned = around_half(pulses, dt_ns=16)

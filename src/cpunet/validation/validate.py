@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import replace
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -91,54 +91,45 @@ def validate(
     how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses, "further": peak}
     how |= {"seed": require_seed(seed), "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)
-    if data.table == ALL:
-        return _of_channels(run, (sim, data), folder, how, force)
-    return _validated(used_run(run), (sim, data), folder, how, force)
+    if data.table != ALL:
+        return _validated(used_run(run), (sim, data), folder, how, force)
+    if folder is None:
+        raise CpunetError(f"`data_table` {ALL}: give `out`, the folder of the reports")
+    channels = paired(sim, data)
+    outcome = each_channel(channels, folder, partial(_of_channel, run, how, force))
+    if outcome.done:
+        folders = [folder / name for name in channels]
+        # without force, a channel with a report fails and keeps it
+        failed = [folder / name for name in outcome.failed if force]
+        compared(folders, failed=failed).save(folder / INDEX, force=True)
+        log.info(f"all channels: {folder / INDEX}")
+    return Outcome({n: Report.load(place) for n, place in outcome.done.items()}, outcome.failed)
 
 
 def _validated(
     run: Run, pair: Pair, out: Path | None, how: Mapping[str, Any], force: bool
 ) -> Report:
-    pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
-    if out is None:
-        return _report(run, pair, how)
-    read = (run.folder, *pair[0].files, *pair[1].files, how["truth"])
-    with folder_written_aside(out, REPORT, *read, force=force) as aside:
-        report = _report(run, pair, how)
-        report.write(aside)
-    return replace(report, folder=out)
-
-
-def _report(run: Run, pair: Pair, how: Mapping[str, Any]) -> Report:
     """Scores, and functions that draw; translated pulses are forgotten."""
-    # imported late: not needed for the help of the command
-    from cpunet.validation.evaluation import evaluate
+    pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
+    read = (run.folder, *pair[0].files, *pair[1].files, how["truth"])
+    with ExitStack() as stack:
+        aside = None
+        if out is not None:
+            aside = stack.enter_context(folder_written_aside(out, REPORT, *read, force=force))
+        # imported late: not needed for the help of the command
+        from cpunet.validation.evaluation import evaluate
 
-    evaluation = evaluate(run, *pair, **how)
+        evaluation = evaluate(run, *pair, **how)
+        # nor is matplotlib while the pulses take most memory
+        from cpunet.validation.drawings import drawings
 
-    # nor is matplotlib while the pulses take most memory
-    from cpunet.validation.drawings import drawings
-
-    notes = _notes(run, evaluation.metrics, how["truth"])
-    return Report(evaluation.metrics, evaluation.values, None, drawings(evaluation), notes)
-
-
-def _of_channels(
-    runs: RunLike, pair: Pair, out: Path | None, how: Mapping[str, Any], force: bool
-) -> Outcome[Report]:
-    """Validate the run of each channel of the data, with a page of all reports."""
-    if out is None:
-        raise CpunetError(f"`data_table` {ALL}: give `out`, the folder of the reports")
-
-    channels = paired(*pair)
-    outcome = each_channel(channels, out, partial(_of_channel, runs, how, force))
-    if outcome.done:
-        folders = [out / name for name in channels]
-        # without force, a channel with a report fails and keeps it
-        failed = [out / name for name in outcome.failed if force]
-        compared(folders, failed=failed).save(out / INDEX, force=True)
-        log.info(f"all channels: {out / INDEX}")
-    return Outcome({n: Report.load(place) for n, place in outcome.done.items()}, outcome.failed)
+        notes = _notes(run, evaluation.metrics, how["truth"])
+        drawn = drawings(evaluation)
+        report = Report(evaluation.metrics, evaluation.values, out, drawn, notes)
+        del evaluation  # all pulses
+        if aside is not None:
+            report.write(aside)
+    return report
 
 
 def _of_channel(

@@ -270,7 +270,7 @@ FORMATS: dict[str, tuple[str, str, Callable[[bytes], bool]]] = {
         lambda head: head.startswith((b"\x93NUMPY", b"PK\x03\x04")),
     ),
     "pickle": (
-        ".pickle .pkl", "published.read_pickles",
+        ".pickle .pkl", "arrays.read_pickles",
         lambda head: head[0] == 0x80 and head[1:2] in (b"\2", b"\3", b"\4", b"\5"),
     ),
     # Fortran record marks around the 24 bytes of a Radware header
@@ -363,8 +363,7 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
     if format_ != "HDF5":
         return {}
     from cpunet.hdf5_files import opened
-    from cpunet.pulses.reading.hdf5 import channel_tables
-    from cpunet.pulses.reading.published import detectors, is_majorana
+    from cpunet.pulses.reading.hdf5 import channel_tables, detectors, is_majorana
 
     with opened(path) as file:
         tables = detectors(file) if is_majorana(file) else channel_tables(path, file)

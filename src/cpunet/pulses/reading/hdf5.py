@@ -1,4 +1,12 @@
-"""Read pulses from LH5 files (LEGEND's waveform tables) and from other HDF5 files."""
+"""Read pulses from LH5 files (LEGEND's waveform tables) and from other HDF5 files.
+
+The layout of the Majorana release for AI and machine learning (HDF5) is that of Table I of its
+notes (arXiv:2308.10856; the files are 10.5281/zenodo.8257027): datasets at the top of the file,
+one row per event, named ``raw_waveform`` (3,800 samples), ``energy_label`` (keV),
+``psd_label_low_avse``, ``psd_label_high_avse``, ``psd_label_dcr``, ``psd_label_lq`` (1: passes
+the cut), ``tp0``, ``detector``, ``run_number`` and ``id``.  The NPML files have neither
+energies nor cuts.  Neither the notes' table nor the files give the sampling period.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +25,6 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import (
     is_column,
-    is_text,
     item_at,
     lh5_rows,
     members,
@@ -30,7 +37,6 @@ from cpunet.hdf5_files import (
 )
 from cpunet.pulses.reading.columns import Column, divides, dividing, labels
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.published import is_majorana, read_majorana
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.tables import shortened
 
@@ -282,11 +288,12 @@ def _is_lh5(item: object) -> bool:
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
-    return {
-        name: _stored(path, item)
-        for name, item in members(group).items()
-        if _is_numeric(item) or (divides(name) and is_text(item))
-    }
+    columns = {}
+    for name, item in members(group).items():
+        is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
+        if _is_numeric(item) or (divides(name) and is_text):
+            columns[name] = _stored(path, item)
+    return columns
 
 
 def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
@@ -319,3 +326,42 @@ def _stored(path: Path, dataset: h5py.Dataset) -> Column:
         return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
     read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
     return Column(read, dataset.size, units_of(dataset))
+
+
+WAVEFORMS, DETECTOR = "raw_waveform", "detector"
+_NUMBERS = (DETECTOR, "run_number", "id")  # in every file, with the waveforms
+_RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
+
+
+def is_majorana(file: h5py.File) -> bool:
+    """Whether a file has the layout of the release."""
+    traces = file.get(WAVEFORMS)
+    if not isinstance(traces, h5py.Dataset) or traces.ndim != 2:
+        return False
+    return all(is_column(file.get(name)) for name in _NUMBERS)
+
+
+def detectors(file: h5py.File) -> list[str]:
+    """The detectors of a file, by the release's numbers."""
+    return [str(number) for number in np.unique(file[DETECTOR][()])]
+
+
+def read_majorana(options: PulseFile, file: h5py.File) -> PulseSource:
+    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
+    rows = np.arange(len(file[WAVEFORMS]))
+    if options.table != WAVEFORMS:
+        remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
+        chosen = options.chosen_of(detectors(file), "detector", "detectors", remedy)
+        rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
+    columns = {}
+    for name in file:
+        item = file.get(name)
+        if is_column(item) and item.ndim:
+            shown, units = _RENAMED.get(name, (name, ""))
+            columns[shown] = Column.of(item[()], units)
+    path, name, values = options.path, options.place or WAVEFORMS, file[WAVEFORMS]
+    hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
+    table = PulseSource.of_array(
+        path, "Majorana release", name, values, columns, period_hint=hint
+    )
+    return replace(table, rows=reading(path, values, table.rows)).at(rows)

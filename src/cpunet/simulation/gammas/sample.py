@@ -17,29 +17,27 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.gammas.electrons import (
+    ELECTRON_MASS,
     HITS,
+    K_BINDING,
     LOST,
+    PHOTON_CUT,
     PHOTONS,
+    Array,
+    ElectronTable,
     Event,
+    PhotonTable,
     UnitVector,
     compton_energy,
+    electron_table,
     forward,
     pair_share,
+    photon_table,
     put_photon,
     record,
     remainder,
     slow_down,
     turned,
-)
-from cpunet.simulation.gammas.germanium import (
-    ELECTRON_MASS,
-    K_BINDING,
-    PHOTON_CUT,
-    Array,
-    ElectronTable,
-    PhotonTable,
-    electron_table,
-    photon_table,
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
