@@ -100,7 +100,7 @@ MISTAKES = {
     "no energies": Mistake(f"{TRAIN} --data none-at-all.lh5", r"none-at-all.lh5: .*; .*"),
     "sides swapped": Mistake(
         "train --sim data.lh5 --data sim.lh5 --out out",
-        r"data.lh5: given as simulated pulses, but these look measured.*swapped.*--insist.*",
+        r"sim.lh5: given as measured pulses, but these look simulated.*swapped.*--insist.*",
     ),
     "translated already": Mistake(
         f"{TRAIN} --sim translated.lh5", r"translated.lh5: .*translated.*; .*"

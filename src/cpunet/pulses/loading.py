@@ -211,12 +211,11 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        chosen = _within_traces(source, recipe) if shorten else recipe
-        recipe = chosen.at(source.dt_ns)
         recorded = recorded_side(source)
         refuse_other_side(recorded, file.path, side, SWAPPED)
         guess = recorded is None and not file.insist
-        raw = _read(source, side, recipe.preparation, selection, max_pulses, guess)
+        raw = _read(source, side, recipe, selection, max_pulses, guess, shorten)
+    recipe = raw.recipe.at(source.dt_ns)
     prepared, cuts, baselines = raw.prepared, None, None
     if side == "measured":
         if not file.insist:
@@ -247,13 +246,13 @@ def load_pulses(
         counts = int(low), int(high)
     kev = raw.energies_kev[np.isfinite(raw.energies_kev)]
     return InputSet(
-        prepared, source.dt_ns, file.path, kev, chosen, cuts, file.options,
+        prepared, source.dt_ns, file.path, kev, raw.recipe, cuts, file.options,
         recorded_detector(source), baselines, counts,
     )  # fmt: skip
 
 
-def _within_traces(source: PulseSource, recipe: Recipe) -> Recipe:
-    """The recipe with windows that end as early as the traces of a file ask for.
+def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
+    """The recipe with windows that end as early as the first traces of a file ask for.
 
     Slow pulses are late in their traces.  Without them, the distribution of drift times would
     be another one than that simulated.
@@ -261,16 +260,18 @@ def _within_traces(source: PulseSource, recipe: Recipe) -> Recipe:
     windows, training = recipe.preparation, recipe.training
     if not isinstance(training, MatchingConfig):  # networks have windows of their own
         return recipe
-    block = next(source.blocks(TRIED))
+    raw, dt_ns = block.waveforms, block.dt_ns
+    needed = round((windows.after_ns - windows.padding_after_ns) / dt_ns)
+    half = 0.5 * raw.min(axis=1, keepdims=True) + 0.5 * raw.max(axis=1, keepdims=True)
+    if np.mean((raw >= half).argmax(axis=1) > raw.shape[1] - needed) <= MORE:
+        return recipe
 
     def outside(recipe: Recipe) -> float:
-        codes = prepare(block, recipe.at(source.dt_ns).preparation, "measured").codes
+        codes = prepare(block, recipe.at(dt_ns).preparation, "measured").codes
         edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
         return float(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
 
-    if (share := outside(recipe)) <= MORE:
-        return recipe
-    tried = []
+    share, tried = outside(recipe), list[Recipe]()
     for by in SHORTER_NS:
         after, decay = windows.after_ns - by, windows.decay_fit_ns - by
         if min(after - training.level_ns, decay) > 0:
@@ -284,7 +285,7 @@ def _within_traces(source: PulseSource, recipe: Recipe) -> Recipe:
     best = tried[int(np.argmax(shares <= shares.min() + 0.5 * MORE))]
     end = best.preparation.after_ns
     log.warning(
-        f"{source.path.name}: {100 * share:.2g} % of the traces end before their windows "
+        f"{name}: {100 * share:.2g} % of the traces end before their windows "
         f"would; these end {end:g} ns after the alignment, not {windows.after_ns:g} ns"
     )
     return best
@@ -294,6 +295,7 @@ def _within_traces(source: PulseSource, recipe: Recipe) -> Recipe:
 class _Read:
     """Prepared pulses of a file, and what of all its traces is needed."""
 
+    recipe: Recipe
     prepared: Prepared
     first: FloatArray
     energies_kev: FloatColumn
@@ -308,10 +310,11 @@ class _Read:
 def _read(
     source: PulseSource,
     side: Kind,
-    config: PreparationConfig,
+    recipe: Recipe,
     selection: EnergySelection,
     max_pulses: int | None,
     guess: bool,
+    shorten: bool,
 ) -> _Read:
     """Read, select, prepare and collect the pulses of a file in one pass.
 
@@ -330,6 +333,9 @@ def _read(
                 first = block.waveforms[:RATE_TRACES].copy()
                 if guess:
                     refuse_other_side(apparent_side(first), source.path, side, SWAPPED)
+                if shorten:
+                    recipe = _within_traces(block[:TRIED], recipe, source.path.name)
+                config = recipe.at(source.dt_ns).preparation
             all_of_it = None
             if side == "measured" and sum(map(len, baselines)) < TRACES:
                 all_of_it = prepare(block, config, side)  # baselines of any energy
@@ -355,18 +361,26 @@ def _read(
         error = _nothing_left(source.path, np.concatenate([part.codes for part in sets]))
         raise explained(error, source.path, first, energies, heights, side, selection)
     if max_pulses is not None and n > max_pulses:
-        n = _thin(sets, drawn, max_pulses)
-    # this memory is allocated as it is filled, so the pulses never exist twice in full
-    waveforms, filled = np.empty((n, sets[0].pulses.length), np.float32), 0
+        _thin(sets, drawn, max_pulses)
+    prepared = _joined(sets)
+    rows = np.concatenate([np.zeros(0, np.int64), *whole_rows])
+    return _Read(
+        recipe, prepared, first, energies, heights, baselines, whole, rows, lowest, highest
+    )
+
+
+def _joined(sets: list[Prepared]) -> Prepared:
+    """All sets as one; these lose their windows, so that pulses never exist twice in full."""
+    n, filled = sum(map(len, sets)), 0
+    # this memory is allocated as it is filled
+    waveforms = np.empty((n, sets[0].pulses.length), np.float32)
     for number, part in enumerate(sets):
         waveforms[filled : filled + len(part)] = part.pulses.waveforms
         filled += len(part)
         empty = np.empty((len(part), 0), np.float32)
         sets[number] = replace(part, pulses=part.pulses.with_waveforms(empty))
     prepared = Prepared.concatenate(sets)
-    prepared = replace(prepared, pulses=prepared.pulses.with_waveforms(waveforms))
-    rows = np.concatenate([np.zeros(0, np.int64), *whole_rows])
-    return _Read(prepared, first, energies, heights, baselines, whole, rows, lowest, highest)
+    return replace(prepared, pulses=prepared.pulses.with_waveforms(waveforms))
 
 
 def _selected(
