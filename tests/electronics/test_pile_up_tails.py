@@ -77,15 +77,19 @@ N = 2000
 
 
 def traces_of(
-    rate_khz: float, preset: str = "ornl", broad: bool = False, pile_up_khz: float = 0.4
+    rate_khz: float,
+    preset: str = "ornl",
+    broad: bool = False,
+    pile_up_khz: float = 0.4,
+    n: int = N,
 ) -> RawTraces:
     rng = np.random.default_rng(1)
-    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (N, 1)), 0, 1)
-    energy = rng.choice([1592.5, 2103.5, 2614.5], N)
+    ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (n, 1)), 0, 1)
+    energy = rng.choice([1592.5, 2103.5, 2614.5], n)
     rates = {"earlier_pulses.rate_kHz": rate_khz, "pile_up.rate_kHz": pile_up_khz}
     chain = read_electronics(preset, rates)
     if broad:
-        energy = np.exp(rng.uniform(np.log(100), np.log(2614), N))
+        energy = np.exp(rng.uniform(np.log(100), np.log(2614), n))
         chain = chain.model_copy(update={"other_pulses_kev": tuple(np.quantile(energy, at))})
     return read_out(Pulses.of(ramps, dt_ns=4, energy_kev=energy), chain, seed=2)
 
@@ -194,8 +198,9 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
 
 @pytest.mark.thorough
 def test_traces_that_all_lie_on_tails_are_told():
+    traces = as_pulses(traces_of(3.0, "legend200", n=3000))
     with pytest.raises(CpunetError, match="nearly all traces lie on pile-up tails"):
-        PileUpTails.of(Baselines.of([as_pulses(traces_of(3.0, "legend200"))], PREPARATION))
+        PileUpTails.of(Baselines.of([traces], PREPARATION))
 
 
 @pytest.mark.thorough
