@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand import Side, stand_sides
+from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import Shift, SimulationSettings
-from cpunet.simulation.simulator import cluster_hits
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 
-from cpunet.legend.translate_library import PEAK, currents_about_peak
+from cpunet.legend.currents import PEAK, currents_about_peak
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector

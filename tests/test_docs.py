@@ -252,6 +252,19 @@ def test_every_option_of_every_command_is_in_the_reference():
                 assert f"`{option.names[0]}`" in page
 
 
+def test_pictures_of_the_design_are_those_of_the_code(tmp_path, monkeypatch):
+    made = hook("diagrams", "numpy")
+    monkeypatch.setattr(made, "PICTURES", tmp_path)
+    made.rooms()
+    for name in made.WAYS:
+        made.way(name)
+    drawn = {path.name: path.read_text("utf-8") for path in tmp_path.iterdir()}
+    assert len(drawn) == 4
+    for name, picture in drawn.items():
+        stored = (DOCS / "pictures" / name).read_text("utf-8")
+        assert stored == picture, f"{name}: run docs/hooks/diagrams.py"
+
+
 def test_every_public_name_is_in_the_reference():
     made = hook("api", "mkdocs")
     for name in set(cpunet.__all__) - {"__version__"}:

@@ -8,16 +8,16 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.electronics.baseline_methods import (
+from cpunet.electronics.baseline_methods import RC
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.superpulses import (
     BASELINE_METHODS,
     LEAD_NS,
-    RC,
     GaussExp,
     RCLate,
     SuperpulseKernel,
     crossing,
 )
-from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare

@@ -11,13 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from cpunet.electronics.chain import (
-    Electronics,
-    Exponentials,
-    NoiseSpectrum,
-    moved_apart,
-    read_electronics,
-)
+from cpunet.electronics.chain import Electronics, NoiseSpectrum, read_electronics
+from cpunet.electronics.exponentials import Exponentials, moved_apart
 from cpunet.electronics.finishing import record_length, with_room
 from cpunet.electronics.readout import (
     by_height,

@@ -14,21 +14,20 @@ import pytest
 from lgdo import Array, Scalar, Struct
 
 from cpunet.errors import CpunetError
+from cpunet.legend.currents import (
+    PEAK,
+    continued,
+    currents_about_peak,
+    most_frequent,
+    with_rings,
+)
 from cpunet.legend.library_files import (
     chosen_libraries,
     known_detector,
     make_library,
     merge_libraries,
 )
-from cpunet.legend.translate_library import (
-    PEAK,
-    TemplateTranslator,
-    continued,
-    currents_about_peak,
-    most_frequent,
-    translate_library,
-    with_rings,
-)
+from cpunet.legend.translate_library import TemplateTranslator, translate_library
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
@@ -36,11 +35,12 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.simulation import simulator
+from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator, cluster_hits
+from cpunet.simulation.simulator import Simulator
 from cpunet.training.run import Run
 from cpunet.translation.translator import REN
 from synthetic import after_pole_and_decay, one_line, sampled, write_chain, write_pulses

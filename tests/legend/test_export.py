@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cpunet.electronics.chain import Exponentials
+from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.legend.export import (
     current_delay_ns,

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from cpunet.errors import CpunetError
+from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.gammas.electrons import (
     HITS,
     LOST,
@@ -30,7 +31,6 @@ from cpunet.simulation.gammas.sample import (
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.simulator import cluster_hits
 
 
 def crystal(**changed: float) -> Detector:

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.cluster.hierarchy import fcluster, linkage
 
+from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.hits import FARTHEST_MM, Hits
-from cpunet.simulation.simulator import cluster_hits
 
 
 def hits_with(counts: list[int], seed: int = 0) -> Hits:

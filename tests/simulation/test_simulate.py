@@ -21,6 +21,7 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.settings import read_settings
+from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
@@ -28,7 +29,6 @@ from cpunet.simulation.hit_sources import GammaSource, HitFile, energy_windows
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import simulate
-from cpunet.simulation.simulator import merge_hits
 from synthetic import one_line
 
 SETTINGS = {"length_ns": 1600}

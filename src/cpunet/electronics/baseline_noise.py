@@ -19,7 +19,7 @@ import scipy.ndimage
 import scipy.optimize
 from scipy.stats import median_abs_deviation
 
-from cpunet.electronics.chain import FloatArray as Values
+from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray

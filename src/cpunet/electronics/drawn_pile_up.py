@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.electronics.chain import FloatArray as Values
+from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import PileUpTails, tail_shape
 from cpunet.electronics.tails_law import TailsLaw, earlier_pulses
 from cpunet.errors import CpunetError

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from pydantic import Field
 from scipy.stats import median_abs_deviation
 
-from cpunet.electronics.chain import FloatArray
+from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses

@@ -16,14 +16,9 @@ import numpy.typing as npt
 from numba import prange
 from scipy import fft
 
-from cpunet.electronics.chain import (
-    REFERENCE_KEV,
-    ComplexArray,
-    Electronics,
-    FloatArray,
-    NoiseSpectrum,
-)
+from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum
 from cpunet.electronics.drawn_pile_up import DrawnPileUp, InTracePileUp
+from cpunet.electronics.exponentials import ComplexArray, FloatArray
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.chain import FloatArray
+from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from scipy.special import log_ndtr, ndtr
 
 import cpunet
 from cpunet.errors import CpunetError
+from cpunet.legend.currents import WINDOW, WINDOWS
 from cpunet.legend.library_files import known_detector
-from cpunet.legend.translate_library import WINDOW, WINDOWS
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, read_json, yaml_text
@@ -81,7 +81,7 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
 
     Examples
     --------
-    >>> from cpunet.electronics.chain import Exponentials
+    >>> from cpunet.electronics.exponentials import Exponentials
     >>> chain = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
     >>> nearest = equivalent_kernel(chain)
     >>> 10 < nearest.sigma_ns < 30, 60 < nearest.tau_ns < 90

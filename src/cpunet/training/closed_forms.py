@@ -20,7 +20,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from cpunet.electronics.baseline_noise import record_samples
-from cpunet.electronics.chain import Decay, Electronics, Exponentials, FloatArray, moved_apart
+from cpunet.electronics.chain import Decay, Electronics
+from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
 from cpunet.electronics.readout import noise_power
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import (

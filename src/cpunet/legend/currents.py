@@ -1,0 +1,234 @@
+"""Currents of a pulse-shape library: about their maxima, and beyond the crystal.
+
+The current of a template is averaged three times over 48 ns, like that of A in A/E, and
+shifted so that its maximum is at sample `PEAK`.  The shift includes the fraction of a sample,
+since half a nanosecond already changes the summed current of two sites.
+
+Readers of a library interpolate drift times between nodes and take the template of the nearest
+one.  At the surface, some nodes of a cell are outside the crystal; rings of nodes beyond it
+give hits just inside their values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import prange
+
+from cpunet.kernels import kernel
+from cpunet.pulses.container import FloatArray
+
+WINDOW, WINDOWS = 48, 3  # length of a moving average in ns, and number of averages
+PEAK, LENGTH = 1000, 4001  # sample of the maximum, and length of a template in ns
+MODE_BINS = 1000
+RINGS = 3  # number of rings
+_NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
+
+Floats = npt.NDArray[np.float32]
+Values = npt.NDArray[np.float64]
+
+
+def currents_about_peak(charge: FloatArray) -> tuple[Floats, Values]:
+    """Average the currents, and shift their maxima to sample `PEAK`.
+
+    Parameters
+    ----------
+    charge
+        Charge sampled every nanosecond, 0 before the first sample, shape ``(n, samples)``.
+
+    Returns
+    -------
+    currents
+        Currents in units of the charge per ns, shape ``(n, LENGTH)``; 0 outside the record,
+        rows of NaN for templates that contain NaN, have no maximum above 0, or have fewer
+        than 3 samples.
+    times_ns
+        Times of the maxima after the first sample, shape ``(n,)``, including the delay of the
+        backward averages, which is the same for all templates; NaN for rows of NaN.
+    """
+    n = len(charge)
+    currents = np.full((n, LENGTH), np.nan, np.float32)
+    times = np.full(n, np.nan)
+    if charge.shape[1] < 3:  # no sample has two neighbours
+        return currents, times
+    _about_peak(np.ascontiguousarray(charge, np.float32), currents, times)
+    return currents, times
+
+
+def most_frequent(amplitudes: Values) -> float:
+    """Mode of A/E as in production: centre of the fullest of 1,000 bins of the whole range.
+
+    If all values are the same, it is their value.
+
+    Parameters
+    ----------
+    amplitudes
+        Finite values, at least one.
+
+    Examples
+    --------
+    >>> round(most_frequent(np.array([1.0, 2.0, 2.0, 3.0])), 2)
+    2.0
+    """
+    if np.ptp(amplitudes) == 0:  # the bins would be 0.001/ns wide, a tenth of A/E
+        return float(amplitudes[0])
+    counts, edges = np.histogram(amplitudes, MODE_BINS)
+    highest = int(counts.argmax())
+    return float(0.5 * (edges[highest] + edges[highest + 1]))
+
+
+@kernel(parallel=True)
+def _about_peak(charge: Floats, currents: Floats, times: Values) -> None:
+    # arrays of NaN, filled where a template has a maximum
+    n, n_samples = charge.shape
+    for i in prange(n):
+        current = _averaged(charge[i])
+        peak = 1
+        for k in range(1, n_samples - 1):
+            if current[k] > current[peak]:
+                peak = k
+        bend = current[peak - 1] - 2 * current[peak] + current[peak + 1]
+        # the running sums remain NaN after a NaN
+        if np.isnan(current[-1]) or not (current[peak] > 0 and bend < 0):
+            continue
+        time = peak + 0.5 * (current[peak - 1] - current[peak + 1]) / bend
+        times[i] = time
+        first = int(np.floor(time))
+        f = time - first
+        # cubic interpolation with the slopes of the neighbours (Catmull and Rom)
+        w0 = 0.5 * f * (-1 + f * (2 - f))
+        w1 = 0.5 * (2 + f * f * (3 * f - 5))
+        w2 = 0.5 * f * (1 + f * (4 - 3 * f))
+        w3 = 0.5 * f * f * (f - 1)
+        for j in range(currents.shape[1]):
+            k = first + j - PEAK
+            value = 0.0
+            if 1 <= k < n_samples - 2:
+                value = (
+                    w0 * current[k - 1]
+                    + w1 * current[k]
+                    + w2 * current[k + 1]
+                    + w3 * current[k + 2]
+                )
+            currents[i, j] = value
+
+
+@kernel
+def _averaged(charge: Floats) -> Values:
+    """Differences between samples after the backward averages; NaN from a NaN on."""
+    n_samples = len(charge)
+    current = np.empty(n_samples)
+    before = 0.0
+    for k in range(n_samples):
+        current[k] = charge[k] - before
+        before = charge[k]
+    averaged = np.empty(n_samples)
+    for _ in range(WINDOWS):
+        total = 0.0
+        for k in range(n_samples):
+            total += current[k]
+            if k >= WINDOW:
+                total -= current[k - WINDOW]
+            averaged[k] = total / WINDOW
+        current, averaged = averaged, current
+    return current
+
+
+def with_rings(templates: Floats, rings: int = RINGS) -> Floats:
+    """Fill nodes without a template with the mean of their neighbours, ring by ring.
+
+    The mean of currents that are aligned at their maxima has the mean A/E.
+
+    Parameters
+    ----------
+    templates
+        Templates, shape ``(r, z, samples)``, NaN if there is none; changed in place.
+    rings
+        Number of rings; a node depends only on nodes at most this far away.
+
+    Returns
+    -------
+    numpy.ndarray
+        The same array.
+
+    Examples
+    --------
+    >>> line = np.array([[[1.0], [3.0], [np.nan], [np.nan]]], np.float32)
+    >>> with_rings(line, 1)[0, :, 0].tolist()
+    [1.0, 3.0, 3.0, nan]
+    """
+    filled = ~np.isnan(templates[:, :, 0])
+    for _ in range(rings):
+        held = np.pad(filled, 1)
+        around = np.sum([_seen(held, 1, *step) for step in _NEIGHBOURS], axis=0)
+        new_r, new_z = np.nonzero(~filled & (around > 0))
+        total = np.zeros((len(new_r), templates.shape[2]), np.float64)
+        for i, j in _NEIGHBOURS:
+            near = held[new_r + 1 + i, new_z + 1 + j]
+            total[near] += templates[new_r[near] + i, new_z[near] + j]
+        templates[new_r, new_z] = total / around[new_r, new_z][:, np.newaxis]
+        filled[new_r, new_z] = True
+    return templates
+
+
+def continued(times: Values, rings: int = RINGS) -> Values:
+    """Extrapolate drift times linearly to nodes without one, ring by ring.
+
+    Parameters
+    ----------
+    times
+        Drift times in ns, shape ``(r, z)``; NaN if there is none.
+    rings
+        Number of rings.
+
+    Returns
+    -------
+    numpy.ndarray
+        Drift times in ns, shape ``(r, z)``. A new one is the mean of the linear extrapolations
+        from two nodes in each of eight directions, or else the mean of its neighbours.
+
+    Examples
+    --------
+    >>> continued(np.array([[4.0, 6.0, np.nan, np.nan]]), 2).tolist()
+    [[4.0, 6.0, 8.0, 10.0]]
+    """
+    made = np.pad(times, 2, constant_values=np.nan)
+    for _ in range(rings):
+        near, far = (
+            np.stack([_seen(made, 2, n * i, n * j) for i, j in _NEIGHBOURS]) for n in (1, 2)
+        )
+        inner = _seen(made, 2, 0, 0)
+        best = _mean(2 * near - far)
+        best = np.where(np.isnan(best), _mean(near), best)
+        inner[...] = np.where(np.isnan(inner), best, inner)
+    return _seen(made, 2, 0, 0).copy()
+
+
+def padded_axis(axis: Values, before: int, after: int) -> Values:
+    """Continue an ascending axis by its widest step on both sides.
+
+    Examples
+    --------
+    >>> padded_axis(np.array([0.0, 0.5, 1.0]), 0, 2).tolist()
+    [0.0, 0.5, 1.0, 1.5, 2.0]
+    """
+    step = float(np.diff(axis).max())
+    low = axis[0] - step * np.arange(before, 0, -1)
+    high = axis[-1] + step * np.arange(1, after + 1)
+    return np.concatenate([low, axis, high])
+
+
+def _seen(padded: npt.NDArray[Any], pad: int, i: int, j: int) -> npt.NDArray[Any]:
+    """Inner part of an array with a padding of `pad` nodes, shifted by (i, j)."""
+    n_r, n_z = padded.shape
+    return padded[pad + i : n_r - pad + i, pad + j : n_z - pad + j]
+
+
+def _mean(values: Values) -> Values:
+    """Mean of the finite values along the first axis; NaN if there is none."""
+    finite = np.isfinite(values)
+    n = finite.sum(axis=0)
+    total = np.where(finite, values, 0.0).sum(axis=0)
+    return np.where(n > 0, total / np.maximum(n, 1), np.nan)
