@@ -27,7 +27,7 @@ import cpunet
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Physics, named, titled
 from cpunet.calibration.search import Search
-from cpunet.electronics.finishing import noise_of
+from cpunet.electronics.measured import noise_of
 from cpunet.plotting import styled
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.electronics.finishing import noise_of
+from cpunet.electronics.measured import noise_of
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.finishing import finish, noise_of
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import noise_of
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses

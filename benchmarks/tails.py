@@ -18,8 +18,8 @@ from rich.console import Console
 from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines, tail_shape
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.plotting import COLOURS, DATA_FILL, styled
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import Baselines
 from cpunet.pulses.reading.files import open_pulses
 from cpunet.recipes import load_recipe
 

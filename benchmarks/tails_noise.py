@@ -19,7 +19,7 @@ from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.electronics.tails_law import TailsLaw
-from cpunet.pulses.preparation import Baselines
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.files import open_pulses
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe

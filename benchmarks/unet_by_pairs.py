@@ -16,7 +16,8 @@ import torch
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
-from cpunet.electronics.finishing import finish, trace_noise
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import trace_noise
 from cpunet.networks.generators import KeptNoise
 from cpunet.processes import keep_freed_memory
 from cpunet.pulses.loading import InputSet, SideInfo, load_pulses

@@ -12,8 +12,8 @@ import pytest
 
 from cpunet import CpunetError, FileOptions, PulseFile, info, load
 from cpunet.electronics.pile_up_tails import PileUpTails
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import Baselines
 from cpunet.pulses.provenance import left_out, trace_properties
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits

@@ -15,8 +15,9 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.readout import coloured_noise, linear_response
 from cpunet.networks.generators import stretch
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import Baselines, prepare
+from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import MatchingConfig
 from synthetic import drifting, load_recipe, two_sites
 

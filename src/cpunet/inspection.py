@@ -273,7 +273,7 @@ def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
         if not quality:
             return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
         from cpunet.electronics.pile_up_tails import PileUpTails
-        from cpunet.pulses.preparation import Baselines
+        from cpunet.pulses.baselines import Baselines
 
         lines.append(("left out", left_out(first, recipe)))
         try:

@@ -11,12 +11,14 @@ import scipy.signal
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.finishing import finish, noise_of
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import noise_of
 from cpunet.electronics.readout import coloured_noise, noise_power
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.preparation import Baselines, prepare
+from cpunet.pulses.preparation import prepare
 from synthetic import load_recipe
 
 CONFIG = load_recipe("paper").preparation

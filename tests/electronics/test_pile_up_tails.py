@@ -25,8 +25,9 @@ from cpunet.electronics.tails_law import (
     fit_rate,
 )
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.preparation import Baselines, apply_cuts, fit_cuts, prepare
+from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
 from synthetic import load_recipe, mean_kev
 
 TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)

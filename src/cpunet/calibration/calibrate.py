@@ -34,7 +34,7 @@ from cpunet.calibration.nuisances import (
 )
 from cpunet.calibration.result import described
 from cpunet.calibration.search import Search
-from cpunet.electronics.finishing import drawn_like, noise_of, tails_of
+from cpunet.electronics.measured import drawn_like, noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs

@@ -22,8 +22,8 @@ from scipy.stats import median_abs_deviation
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.preparation import SHORTEST_SHARE, Baselines
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory

@@ -21,9 +21,9 @@ from scipy.stats import median_abs_deviation
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
 from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InfoPart
-from cpunet.pulses.preparation import Baselines
 
 MIN_BASELINES = 30  # minimum number of baselines
 SIGMA_PER_MAD = 1.4826  # of a normal distribution

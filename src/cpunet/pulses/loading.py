@@ -17,20 +17,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
+from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.doubts import explained, require_sense
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import (
-    TRACES,
-    WHOLE,
-    Baselines,
     Codes,
     CutWindows,
     FloatColumn,
     Kind,
     Prepared,
     Rejection,
-    Rows,
     apply_cuts,
     fit_cuts,
     prepare,

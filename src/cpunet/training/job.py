@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from cpunet.electronics.finishing import trace_noise
+from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.kernels import threads
 from cpunet.networks import require_torch

@@ -13,7 +13,8 @@ from torch import nn
 from torch.optim.swa_utils import update_bn
 
 from cpunet.electronics.drawn_pile_up import TraceNoise
-from cpunet.electronics.finishing import finish, trace_noise
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import KeptNoise, LinearInverse, ResponseGenerator
 from cpunet.networks.linear_parts import (

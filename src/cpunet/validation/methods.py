@@ -24,7 +24,8 @@ import numpy.typing as npt
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
-from cpunet.electronics.finishing import finish, noise_of, tails_of
+from cpunet.electronics.finishing import finish
+from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.electronics.superpulses import BASELINE_METHODS
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores

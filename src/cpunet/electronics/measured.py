@@ -1,0 +1,123 @@
+"""Noise and pile-up tails of the measured side."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise, passing
+from cpunet.electronics.finishing import padding
+from cpunet.electronics.pile_up_tails import PileUpTails, TailsInfo
+from cpunet.errors import CpunetError
+from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.loading import InputSet
+from cpunet.recipes.schema import PreparationConfig
+
+log = logging.getLogger(__name__)
+
+NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
+MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
+
+
+def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, TailsInfo]:
+    """Measure noise and pile-up tails in the data of a training, and note the result.
+
+    Parameters
+    ----------
+    data
+        Measured pulses that passed the cuts, with the baselines of their file.
+    config
+        Preparation of the pulses.
+
+    Returns
+    -------
+    tuple
+        Noise, with tails to draw if their existence is certain; entry of ``run.json``: what was
+        measured of tails, even if it is not.
+
+    Raises
+    ------
+    CpunetError
+        If there are too few flat baselines.
+    """
+    pile_up, reason = tails_of(data)
+    drawn: DrawnTails | None = None
+    info = TailsInfo(missing=reason)
+    if pile_up is None:
+        log.info(f"pile-up tails are not measured: {reason}")
+    else:
+        likely = drawn_like(pile_up, data, config)
+        info = pile_up.describe().model_copy(update={"drawn": likely.describe()})
+    if pile_up is not None and pile_up.law is not None:
+        drawn, tenth = likely, info.percent_above["10_kev"]["measured"]
+        alone = "" if pile_up.coupled else " (by slopes alone: levels do not follow the tilts)"
+        log.info(
+            f"pile-up tails: {pile_up.law.rate_khz:.2f} ± {pile_up.fit.rate_error_khz:.2f} "
+            f"kHz{alone}, {tenth:.2g} % of the traces above 10 keV; translations are "
+            "given them"
+        )
+    return TraceNoise(noise_of(data, pile_up), drawn), info
+
+
+def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
+    """Pile-up tails of the data and None, or None and why they cannot be estimated."""
+    try:
+        return PileUpTails.of(_baselines(data)), None
+    except CpunetError as error:
+        return None, str(error)
+
+
+def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) -> DrawnTails:
+    """Distribution of tails like that of the data after their quality cuts.
+
+    Parameters
+    ----------
+    tails
+        Pile-up tails measured in the data.
+    data
+        Measured pulses that passed the cuts.
+    config
+        Preparation of the pulses.
+    """
+    windows, whole = data.prepared.pulses.waveforms, _baselines(data).whole
+    before = config.at(data.dt_ns).samples_before + padding(data.dt_ns)[0]
+    begins = float(np.median(data.prepared.align_sample)) - before
+    passed = None
+    if data.cuts is not None and whole is not None and tails.law is not None:
+        passed = passing(tails, whole, config, data.cuts)
+    return DrawnTails(
+        law=tails.fit.law,
+        height=float(np.median(windows.max(axis=1))),
+        lead_us=begins * data.dt_ns * 1e-3,
+        dt_ns=data.dt_ns,
+        passed=passed,
+        decay_error_us=tails.decay_error_us,
+    )
+
+
+def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
+    """Measure the noise from the raw samples before the pulses.
+
+    If traces have pile-up tails, only those at the level of empty baselines are
+    used.
+
+    Raises
+    ------
+    CpunetError
+        If the baselines are too few or too short.
+    """
+    baselines = _baselines(data)
+    first = baselines.first
+    usable = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
+    usable[NOISE_TRACES:] = False
+    if tails is not None and tails.law is not None:
+        empty = usable & tails.empty(first)
+        usable = empty if empty.sum() >= MIN_EMPTY else usable
+    return BaselineNoise.of(baselines, usable)
+
+
+def _baselines(data: InputSet) -> Baselines:
+    assert data.baselines is not None  # these are measured pulses
+    return data.baselines
