@@ -184,7 +184,7 @@ def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> 
     assert fit == near.fit
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_ringing_is_found_with_few_pulses() -> None:
     ringing = {"frequency_MHz": 5.0, "fraction": 0.285, "damping_ns": 160.0}
     rings = measured_with(Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing}))

@@ -45,7 +45,7 @@ MOST = 4096  # pulses of each side that are compared
 PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
 # Times in ns from the half height between which every sample is compared, shortest and longest
 # stretches within and elsewhere, and samples compared per pulse at most.
-DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 0.5
+DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 1.3
 # Centres of the slices as ranks of either side.  The highest amplitudes are single sites, which
 # differ least in shape.
 AMPLITUDE, RISE = "log_amplitude", "rise"
