@@ -214,6 +214,24 @@ def test_baselines_of_different_kinds_are_drawn_as_such(n: int) -> None:
     assert width.std() == pytest.approx(0.3, rel=0.25)
 
 
+def test_noise_has_the_power_of_baselines_of_which_some_are_quiet() -> None:
+    """Also where the noise falls towards low frequencies, and in each set that is drawn."""
+    rng, n, length, used = np.random.default_rng(3), 2000, 1200, 500
+    frequency = np.fft.rfftfreq(8 * length)
+    size = 1 / np.hypot(1, (frequency - 0.006) / 0.003)
+    bins = size * rng.standard_normal((n, 2 * len(size))).view(complex)
+    baselines = 40 * np.fft.irfft(bins, 8 * length)[:, :length]
+    baselines[: n // 20] *= 0.3
+    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
+    assert noise.n_baselines > 0.98 * n
+    power = [
+        noise.draw(np.ones(n), used, np.random.default_rng(seed)).var(axis=1).mean()
+        for seed in range(5)
+    ]
+    ratios = np.array(power) / TO_PREPARED**2 / baselines[:, :used].var(axis=1).mean()
+    assert ratios == pytest.approx(1, abs=0.02)
+
+
 def test_traces_without_noise_are_refused() -> None:
     with pytest.raises(CpunetError, match="most baselines are constant"):
         BaselineNoise.of(Baselines.of([on_baselines(np.zeros((100, 1200)))], CONFIG))

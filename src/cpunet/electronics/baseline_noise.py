@@ -17,7 +17,6 @@ import numpy.typing as npt
 import scipy.fft
 import scipy.ndimage
 import scipy.optimize
-from scipy.stats import median_abs_deviation
 
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
@@ -33,7 +32,7 @@ FLAT_SIGMAS, CLIPS = (
 )  # robust standard deviations within which traces stay, and number of iterations
 # Baselines are clustered along directions in which their band powers spread this many times
 # more than those of baselines from a single spectrum.
-KINDS, BANDS, DIFFERENT, OUTLIER = 24, 16, 1.3, 8.0
+KINDS, BANDS, DIFFERENT, OUTLIER = 48, 16, 1.3, 8.0
 FIRST_OF_BANDS = 4  # bins below it hold residuals of the mean, and drifts
 # Below the third bin of a baseline, its mean and the window's leakage hide the spectrum.
 # There it is inferred from the structure function over the baseline's length.
@@ -208,15 +207,19 @@ class BaselineNoise:
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
         each = max(1, (long - length) // length)  # parts of a trace, with a gap at its end
         continua = self.density[np.newaxis] if self.kinds is None else self.kinds
+        shares = np.ones(1) if self.shares is None else self.shares
         size = _sizes(self._at(continua, long), long)
         lines = None if self.lines is None else _sizes(self._lines_at(long), long)
         noise = np.empty((n, length), np.float32)
         order = rng.permutation(n)
+        # each kind as often as among the baselines, in random order
+        places = rng.permutation((np.arange(-(-n // each)) + rng.random()) * each / n)
+        kinds = np.searchsorted(shares.cumsum()[:-1], places)
         for first in range(0, n, each * TRACES):
             rows = order[first : first + each * TRACES]
-            shape = (-(-len(rows) // each), 2 * size.shape[1])
+            kind = kinds[first // each :][: min(TRACES, -(-len(rows) // each))]
+            shape = (len(kind), 2 * size.shape[1])
             bins = rng.standard_normal(shape, np.float32).view(np.complex64)
-            kind = rng.choice(len(size), size=len(bins), p=self.shares)
             bins *= size[kind]
             if lines is not None:
                 # sines of random phase: of fixed amplitude, the RMS modulus of a Gaussian bin
@@ -324,9 +327,9 @@ def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
     width = (baselines - lines).std(axis=1)
     flat = np.ones(len(baselines), bool)
     for _ in range(CLIPS):
-        for values in (slope, width):
-            sigma = median_abs_deviation(values[flat], scale="normal")
-            flat &= np.abs(values - np.median(values[flat])) <= FLAT_SIGMAS * sigma
+        for off in (np.abs(slope - np.median(slope[flat])), width - np.median(width[flat])):
+            sigma = 1.4826 * np.median(np.abs(off[flat]))
+            flat &= off <= FLAT_SIGMAS * sigma  # quiet baselines are as flat as others
     return flat
 
 
@@ -422,7 +425,7 @@ def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
     -------
     array
         Density at the frequencies of the lines. From `FIRST_CLEAN_BIN`
-        upwards it is the measured one. Below, it rises towards 0 by a non-negative sum of
+        upwards it is the measured one. Below, it is a non-negative sum of a constant and
         Lorentzians whose structure function is closest to `drift`.
     """
     samples, length = 2 * (len(lines) - 1), len(drift)
@@ -430,9 +433,10 @@ def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
     bins = np.arange(len(density)) / length
     join = bins[FIRST_CLEAN_BIN]
     fast = np.interp(frequency, bins[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
+    constant, fast = np.where(frequency < join, (fast, 0 * fast), (0 * fast, fast))
     corners = np.geomspace(2 / samples, join, CORNERS)[:, np.newaxis]
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
-    slow = np.maximum(slow, 0)
+    slow = np.vstack([constant, np.maximum(slow, 0)])
     lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
     # both signs of the frequency: a density of 1 is a mean square of 1
     oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
