@@ -1,8 +1,7 @@
-"""NumPy, HDF5 that is not LH5, spectra and text of siggen, and what is wrong with files."""
+"""NumPy, HDF5 that is not LH5, and what is wrong with files."""
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import awkward as ak
@@ -89,30 +88,6 @@ def test_columnwise_arrays_and_objects_beside_the_waveforms(tmp_path):
     np.testing.assert_array_equal(read.waveforms, VALUES)
 
 
-PULSE = np.linspace(0, 1000, 50, dtype=np.float32)
-
-
-def spectrum(rows: np.ndarray) -> bytes:
-    """As siggen's `write_spectrum` lays it out: two Fortran records."""
-    n_rows, length = rows.shape
-    title = struct.pack("<i8siiiii", 24, b"pulse   ", length, n_rows, 1, 1, 24)
-    data = rows.astype("<f4").tobytes()
-    mark = struct.pack("<i", len(data))
-    return title + mark + data + mark
-
-
-def test_the_rows_of_a_spectrum_are_pulses(tmp_path):
-    path = tmp_path / "pulses.spe"
-    rows = np.stack([PULSE + i for i in range(5)])
-    path.write_bytes(spectrum(rows))
-    with pytest.raises(CpunetError, match="give `dt_ns`"):
-        open_pulses(path)
-    source = open_pulses(path, dt_ns=1)
-    assert (source.n_pulses, source.length, source.dt_ns) == (5, 50, 1)
-    found = np.concatenate([block.waveforms for block in source.blocks(2)])
-    np.testing.assert_array_equal(found, rows)
-
-
 @pytest.mark.parametrize("orient", [np.ravel, np.atleast_2d, np.vstack])
 @pytest.mark.parametrize("suffix", ["npz", "h5"])
 @pytest.mark.parametrize("n", [1, 7])
@@ -187,7 +162,7 @@ def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(600)
 
 
-@pytest.mark.parametrize("suffix", [".lh5", ".h5", ".fcio", ".npz", ".npy", ".spe", ".dat", ""])
+@pytest.mark.parametrize("suffix", [".lh5", ".h5", ".fcio", ".npz", ".npy", ".dat", ""])
 @pytest.mark.parametrize("content", [b"", PNG, b"\0" * 700], ids=["empty", "png", "zeros"])
 def test_foreign_files(tmp_path, suffix, content):
     path = tmp_path / f"file{suffix}"
@@ -213,12 +188,11 @@ def whole(tmp_path_factory) -> list[Path]:
     np.savez(folder / "b.npz", waveform=values, energy_kev=np.arange(30.0))
     np.savez_compressed(folder / "c.npz", waveform=values)
     np.save(folder / "d.npy", values)
-    (folder / "e.spe").write_bytes(spectrum(values))
     return sorted(folder.iterdir())
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-@given(fraction=st.floats(0, 0.99), which=st.integers(0, 4))
+@given(fraction=st.floats(0, 0.99), which=st.integers(0, 3))
 def test_any_truncation_is_one_line_naming_the_file(whole, fraction, which):
     content = whole[which].read_bytes()
     path = whole[which].with_stem("cut")

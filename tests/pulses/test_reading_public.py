@@ -44,50 +44,33 @@ def write_majorana(path: Path, n: int = 2 * N, *, labels: bool = True, length: i
 def test_one_detector_of_the_majorana_release(tmp_path):
     file = tmp_path / "MJD_Train_0.hdf5"
     traces = write_majorana(file, 50, length=40)
-    assert [*table_sizes(file)] == ["5", "9"]
-    source = open_pulses(file, table="9", dt_ns=10)
+    assert [*table_sizes(file)] == ["detector=5", "detector=9"]
+    with pytest.raises(CpunetError, match=r"2 channels or detectors .* `table` detector=5"):
+        open_pulses(file, dt_ns=10)
+    with pytest.raises(CpunetError, match=r"no detector 7; it holds 5, 9$"):
+        open_pulses(file, table="detector=7", dt_ns=10)
+    with pytest.raises(CpunetError, match="not in the file; give `dt_ns`"):
+        open_pulses(file, table="detector=5")
+    source = open_pulses(file, table="detector=9", dt_ns=10)
     rows = np.arange(1, 50, 3)
     assert (source.n_pulses, source.length, source.dt_ns) == (len(rows), 40, 10)
-    blocks = list(source.blocks(4))
-    assert [len(block) for block in blocks] == [4, 4, 4, 4, 1]
+    assert [len(block) for block in source.blocks(4)] == [4, 4, 4, 4, 1]
     pulses = source.read()
     np.testing.assert_array_equal(pulses.waveforms, traces[rows].astype(np.float32))
-    np.testing.assert_array_equal(pulses.event_number, 10 * rows)
     np.testing.assert_array_equal(pulses.energy_kev, KEV)
-    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), traces[rows])
     labels = source.columns["psd_label_low_avse"].read(0, len(rows))
     np.testing.assert_array_equal(labels, rows % 2)
-    assert (source.format, source.name) == ("Majorana release", "9")
-    assert source.energies == "column energy [keV]"
+    assert source.energies == "column energy_label [keV]"
 
 
 def test_all_detectors_and_files_without_labels(tmp_path):
     file = tmp_path / "MJD_NPML_0.hdf5"
     write_majorana(file, 6, labels=False, length=40)
-    with open_pulses(file, table="raw_waveform", dt_ns=10) as source:
-        assert source.n_pulses == 6
-        assert source.energies == "not known"
+    with open_pulses(file, table="detector=*", dt_ns=10) as source:
+        assert (source.n_pulses, source.energies) == (6, "not known")
     with h5py.File(file, "r+") as content:
         content["detector"][...] = 5
     assert len(open_pulses(file, dt_ns=10).read()) == 6
-
-
-def test_what_is_wrong_with_a_majorana_file(tmp_path):
-    file = tmp_path / "MJD_Test_0.hdf5"
-    write_majorana(file, 6, length=40)
-    with pytest.raises(CpunetError, match=r"2 detectors \(5, 9\); choose one with `table`"):
-        open_pulses(file, dt_ns=10)
-    with pytest.raises(CpunetError, match=r"no detector 7; there are 5, 9$"):
-        open_pulses(file, table="7", dt_ns=10)
-    with pytest.raises(
-        CpunetError, match=r"not in the file; give `dt_ns` \(the Majorana.*10\)"
-    ):
-        open_pulses(file, table="5")
-    with h5py.File(file, "r+") as content:  # then it is any HDF5 file
-        del content["id"]
-        del content["detector"]
-    with pytest.raises(CpunetError, match="an array of two dimensions"):
-        open_pulses(file, dt_ns=10)
 
 
 def write_pickles(path: Path, traces: np.ndarray, *, lists: bool = False, **more: object):
@@ -125,7 +108,7 @@ def test_pickled_pulses(tmp_path, lists):
 DEFECTS = {
     "no period": (
         {"dt_ns": None},
-        r"give `dt_ns` \(CPU-Net's pulses are sampled every 16 ns\)",
+        r"the sampling period is not in the file; give `dt_ns`",
     ),
     "a table": ({"table": "x"}, r"has no tables; leave out `table`"),
     "no pulse": ({"then": 5}, r"entry 3 is no pulse \(a dictionary of wf"),

@@ -44,7 +44,7 @@ FRACTIONS = {"tp_99": 0.99, "tp_90": 0.9, "tp_80": 0.8, "tp_50": 0.5, "tp_10": 0
 
 
 def legend_parameters(
-    waveforms: Values, decay_ns: float, noise: Values, dt_ns: float, aligned: int
+    waveforms: FloatArray, decay_ns: float, noise: Values, dt_ns: float, aligned: int
 ) -> dict[str, Values]:
     r"""Times in ns from the aligned sample, and areas over the height in ns.
 

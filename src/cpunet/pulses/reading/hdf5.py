@@ -1,18 +1,14 @@
 """Read pulses from LH5 files (LEGEND's waveform tables) and from other HDF5 files.
 
-The layout of the Majorana release for AI and machine learning (HDF5) is that of Table I of its
-notes (arXiv:2308.10856; the files are 10.5281/zenodo.8257027): datasets at the top of the file,
-one row per event, named ``raw_waveform`` (3,800 samples), ``energy_label`` (keV),
-``psd_label_low_avse``, ``psd_label_high_avse``, ``psd_label_dcr``, ``psd_label_lq`` (1: passes
-the cut), ``tp0``, ``detector``, ``run_number`` and ``id``.  The NPML files have neither
-energies nor cuts.  Neither the notes' table nor the files give the sampling period.
+The release of the Majorana Demonstrator for machine learning is such a file (Table I of its
+notes, arXiv:2308.10856; 10.5281/zenodo.8257027): datasets with a row for each event, named
+``raw_waveform``, ``energy_label`` (keV), ``detector`` and others, without a sampling period.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -44,49 +40,44 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
-_PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
+# plain datasets, in order of preference
+_PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 
 def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    path = options.path
-    with one_line(path), ExitStack() as unless_read:
-        file = unless_read.enter_context(open_hdf5(path))
-        source = read_majorana(options, file) if is_majorana(file) else _read(options, file)
-        unless_read.pop_all()
-        return replace(source, close=file.close)
-
-
-def _read(options: PulseFile, file: h5py.File) -> PulseSource:
-    path, name = options.path, choose_waveforms(options.path, file, options.place)
-    table, _, own_name = name.rpartition("/")
-    group, values = file[table or "/"], file[name]
-    columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
-    if isinstance(values, h5py.Dataset):
-        columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-        plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
-        return replace(plain, rows=reading(path, values, plain.rows), group=group)
-    own, values = columns_of(path, values), values["values"]
-    # a group holds the traces encoded, or as vectors of their own lengths
-    is_group, sized = isinstance(values, h5py.Group), values
-    if is_group:
-        sized = values.get("encoded_data", values).get("cumulative_length")
-    n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
-    first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-    shortest, longest = first.shape[1:] * 2
-    if n and is_group and "cumulative_length" in values:
-        lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-        shortest, longest = int(lengths.min()), int(lengths.max())
-    if shortest < longest and first.dtype.kind == "f":
-        log.info(
-            f"{path.name}: pulses of {shortest} to {longest} samples are continued with their "
-            "last value"
-        )
-    rows = reading(path, values, partial(_lh5_traces, values, longest))
-    return PulseSource(
-        path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
-        t0=own.get("t0"), group=group,
-    )  # fmt: skip
+    path, file = options.path, open_hdf5(options.path)
+    with one_line(path):
+        name = choose_waveforms(path, file, options.place)
+        table, _, own_name = name.rpartition("/")
+        group, values = file[table or "/"], file[name]
+        columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+        if isinstance(values, h5py.Dataset):
+            columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
+            plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
+            rows = reading(path, values, plain.rows)
+            return replace(plain, rows=rows, group=group, close=file.close)
+        own, values = columns_of(path, values), values["values"]
+        # a group holds the traces encoded, or as vectors of their own lengths
+        is_group, sized = isinstance(values, h5py.Group), values
+        if is_group:
+            sized = values.get("encoded_data", values).get("cumulative_length")
+        n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
+        first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
+        shortest, longest = first.shape[1:] * 2
+        if n and is_group and "cumulative_length" in values:
+            lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
+            shortest, longest = int(lengths.min()), int(lengths.max())
+        if shortest < longest and first.dtype.kind == "f":
+            log.info(
+                f"{path.name}: pulses of {shortest} to {longest} samples are continued with "
+                "their last value"
+            )
+        rows = reading(path, values, partial(_lh5_traces, values, longest))
+        return PulseSource(
+            path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
+            t0=own.get("t0"), group=group, close=file.close,
+        )  # fmt: skip
 
 
 def _lh5_traces(
@@ -326,42 +317,3 @@ def _stored(path: Path, dataset: h5py.Dataset) -> Column:
         return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
     read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
     return Column(read, dataset.size, units_of(dataset))
-
-
-WAVEFORMS, DETECTOR = "raw_waveform", "detector"
-_NUMBERS = (DETECTOR, "run_number", "id")  # in every file, with the waveforms
-_RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
-
-
-def is_majorana(file: h5py.File) -> bool:
-    """Whether a file has the layout of the release."""
-    traces = file.get(WAVEFORMS)
-    if not isinstance(traces, h5py.Dataset) or traces.ndim != 2:
-        return False
-    return all(is_column(file.get(name)) for name in _NUMBERS)
-
-
-def detectors(file: h5py.File) -> list[str]:
-    """The detectors of a file, by the release's numbers."""
-    return [str(number) for number in np.unique(file[DETECTOR][()])]
-
-
-def read_majorana(options: PulseFile, file: h5py.File) -> PulseSource:
-    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
-    rows = np.arange(len(file[WAVEFORMS]))
-    if options.table != WAVEFORMS:
-        remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
-        chosen = options.chosen_of(detectors(file), "detector", "detectors", remedy)
-        rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
-    columns = {}
-    for name in file:
-        item = file.get(name)
-        if is_column(item) and item.ndim:
-            shown, units = _RENAMED.get(name, (name, ""))
-            columns[shown] = Column.of(item[()], units)
-    path, name, values = options.path, options.place or WAVEFORMS, file[WAVEFORMS]
-    hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
-    table = PulseSource.of_array(
-        path, "Majorana release", name, values, columns, period_hint=hint
-    )
-    return replace(table, rows=reading(path, values, table.rows)).at(rows)

@@ -41,9 +41,10 @@ ANY = "*"  # value of a column that separates no channels
 
 # Columns by which the rows of two files are joined; the last is no number of an event.
 EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
-_USUAL = ("energy_kev", "energy_keV", "energy")
-# LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units.
-_NAMED_IN_KEV = re.compile(r"(_cal|kev)$", re.IGNORECASE)
+_USUAL = ("energy_kev", "energy_keV", "energy", "energy_label")
+# LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units, the
+# release of the Majorana Demonstrator `energy_label`.
+_NAMED_IN_KEV = re.compile(r"(_cal|kev|energy_label)$", re.IGNORECASE)
 
 # The first samples of a trace, before any pulse, for the amplitude's baseline.
 _BASELINE_FRACTION, _BASELINE_SAMPLES = 0.05, 10
@@ -95,8 +96,6 @@ class PulseSource:
         Name of the column of the sampling period.
     period
         Sampling period, if it is in the file.
-    period_hint
-        Hint for the error message if the sampling period is not in the file.
     t0
         Times of the first samples, if they are in the file.
     numbers
@@ -124,7 +123,6 @@ class PulseSource:
     attrs: Mapping[str, str] = field(default_factory=dict)
     period_name: str = "dt"
     period: Column | None = None
-    period_hint: str = ""
     t0: Column | None = None
     numbers: Read | None = None
     group: h5py.Group | None = None
@@ -146,7 +144,6 @@ class PulseSource:
         values: Any,
         columns: Mapping[str, Column],
         attrs: Mapping[str, str] = MappingProxyType({}),
-        period_hint: str = "",
     ) -> PulseSource:
         """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
 
@@ -167,7 +164,7 @@ class PulseSource:
         period_name = "dt_ns" if "dt_ns" in columns else "dt"
         return cls(
             path, format, name, n, length, lambda start, stop: values[start:stop], columns,
-            attrs, period_name, columns.get(period_name), period_hint,
+            attrs, period_name, columns.get(period_name),
         )  # fmt: skip
 
     def at(self, rows: npt.NDArray[np.int64]) -> PulseSource:
@@ -321,12 +318,10 @@ def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Read | N
     """The period in ns from the column of the file or from the user, and that of each trace.
 
     A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
-    and ``dt_ns`` is required; the error message contains the hint of the format.  A file that
-    says another period than the user is corrected, with a warning.
+    and ``dt_ns`` is required.  A file that says another period than the user is corrected, with
+    a warning.
     """
-    path, name, column, hint = (
-        source.path, source.period_name, source.period, source.period_hint,
-    )  # fmt: skip
+    path, name, column = source.path, source.period_name, source.period
     units = "" if column is None else column.units or ("ns" if name.endswith("_ns") else "")
     ns_per_unit = factor(units, "ns") if units else None
     if column is None or ns_per_unit is None:
@@ -338,9 +333,7 @@ def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Read | N
                 f"{unit_names('ns')}"
             )
         why = "is not in the file" if column is None else f"({name}) has no units"
-        raise CpunetError(
-            f"{path}: the sampling period {why}; give `dt_ns`{hint and f' ({hint})'}"
-        )
+        raise CpunetError(f"{path}: the sampling period {why}; give `dt_ns`")
     if len(column) != 1:
         column.require_length(path, name, source.n_pulses)
     period = float(column.read(0, 1)[0]) * ns_per_unit
