@@ -8,7 +8,6 @@ import re
 import h5py
 import numpy as np
 import pytest
-from lgdo import VectorOfVectors
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
@@ -19,7 +18,7 @@ from cpunet.pulses.provenance import apparent_side, recorded_side, require_side
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
-from synthetic import load_recipe, waveform_table, write_pulses, write_table
+from synthetic import load_recipe, write_pulses, write_table
 
 RECIPE = load_recipe("fast")
 FEP = parse_selection("FEP", RECIPE.peaks)
@@ -113,17 +112,6 @@ def test_energies_of_another_file_are_joined_by_the_events_of_both(tmp_path, key
         open_pulses(raw, energy=f"{hit}:ch1/other/energy")
 
 
-def test_ideal_pulses_as_long_as_their_drift_stay_where_they_end(tmp_path, caplog):
-    """Ragged pulses of a digitiser are refused: test_lh5.py."""
-    caplog.set_level(logging.INFO)
-    values = VectorOfVectors([[0, 1, 3], [0, 5], [0, 1, 2, 7]], dtype=np.float32)
-    source = open_pulses(write_table(tmp_path / "sim.lh5", "sim", waveform_table(values)))
-    expected = [[0, 1, 3, 3], [0, 5, 5, 5], [0, 1, 2, 7]]
-    np.testing.assert_array_equal(source.read().waveforms, expected)
-    np.testing.assert_array_equal(next(source.blocks(2)).waveforms, expected[:2])
-    assert any("2 to 4 samples are continued" in message for message in caplog.messages)
-
-
 @pytest.mark.parametrize("bits", [12, 14, 16])
 @pytest.mark.parametrize("signed", [True, False])
 def test_counts_that_roll_over_are_named_and_unwrapped(tmp_path, bits, signed):
@@ -166,15 +154,6 @@ def test_reversed_dimensions_are_named(tmp_path, suffix):
             file.update(arrays)
     with pytest.raises(CpunetError, match=rf"julia.*\(1400, {N}\) .* reversed; .* transposed"):
         open_pulses(path, dt_ns=16)
-
-
-def test_units_in_an_array_of_one(tmp_path):
-    write_table(tmp_path / "sim.lh5", "sim", traces(kev()), kev())
-    with h5py.File(tmp_path / "sim.lh5", "a") as file:
-        file["sim/energy"].attrs["units"] = np.array(["MeV"], h5py.string_dtype())
-        file["sim/waveform/dt"].attrs["units"] = np.array([b"ns"])
-    pulses = open_pulses(tmp_path / "sim.lh5").read()
-    np.testing.assert_allclose(pulses.energy_kev, 1000 * kev())
 
 
 def test_arrays_that_could_be_traces_are_named(tmp_path):

@@ -16,7 +16,6 @@ from cpunet.pulses.parameters import (
     PARAMETERS,
     align_half_maximum,
     current_amplitude,
-    current_amplitude_kernel,
     drift_time,
     pulse_parameters,
     tail_slope,
@@ -122,18 +121,6 @@ def test_the_current_amplitude_per_ns_is_the_same_at_any_period(decay_ns, means,
     assert per_ns == pytest.approx(wanted, rel=6e-3)
 
 
-@pytest.mark.parametrize("dt_ns", [1.0, 4.0, 10.0, 12.5, 16.0, 32.0])
-def test_current_amplitude_is_that_of_its_kernel(dt_ns):
-    pulses = sampled(20.0, dt_ns, means=False)[:3]
-    weights = current_amplitude_kernel(dt_ns)
-    np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-4)
-    highest = [
-        max(np.convolve(np.diff(pulse), row[::-1], "valid").max() for row in weights)
-        for pulse in pulses
-    ]
-    assert current_amplitude(pulses, dt_ns) == pytest.approx(highest, rel=1e-4)
-
-
 @given(
     start=st.floats(100, 250),
     samples=st.floats(20, 140),
@@ -175,12 +162,6 @@ def test_times_and_areas_of_a_ramp(samples):
     assert found["drift_time"] == pytest.approx(0.99 * rise_ns, abs=0.01)
 
 
-def last_crossing(pulse: np.ndarray, level: float) -> float:
-    top = int(np.argmax(pulse))
-    below = np.flatnonzero(pulse[:top] < level)[-1]
-    return float(np.interp(level, pulse[below : below + 2], [below, below + 1]))
-
-
 @pytest.mark.parametrize("decay_us", [np.inf, 60.0])
 @pytest.mark.parametrize("samples", [40, 97])
 def test_quantities_of_legend_of_a_ramp_that_decays(samples, decay_us):
@@ -198,15 +179,6 @@ def test_quantities_of_legend_of_a_ramp_that_decays(samples, decay_us):
     # dspeed sums samples, not trapezoids: half a sample of the height missing at the begin
     missing = 0.2**2 / 2 * rise_ns - 0.1 * DT_NS
     assert found["lq"] == pytest.approx(missing, rel=0.02)
-
-
-def test_times_of_noisy_pulses():
-    waveforms = multi_site(40, 2e-3, seed=1)
-    found = parameters_of(waveforms)
-    for i, pulse in enumerate(waveforms.astype(float)):
-        for name, fraction in TIME_POINTS.items():
-            expected = (last_crossing(pulse, fraction * pulse.max()) - 400) * DT_NS
-            assert found[name][i] == pytest.approx(expected, abs=0.02)
 
 
 def test_baseline_rms_is_that_about_a_line():

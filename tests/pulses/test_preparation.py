@@ -204,19 +204,6 @@ class TestSimulated:
 
 
 class TestSets:
-    def test_joining_blocks_equals_one_block(self) -> None:
-        raw = measured(n=30)
-        raw[[3, 17, 18]] = np.nan
-        pulses = Pulses.of(raw, dt_ns=DT_NS, energy_kev=np.arange(30.0))
-        whole = prepare(pulses, CONFIG, "measured")
-        blocks = [prepare(pulses[s : s + 7], CONFIG, "measured") for s in range(0, 30, 7)]
-        joined = Prepared.concatenate(blocks)
-        assert joined.rejections == whole.rejections == {"nan": 3}
-        np.testing.assert_array_equal(joined.index, whole.index)
-        np.testing.assert_array_equal(joined.codes, whole.codes)
-        np.testing.assert_array_equal(joined.pulses.waveforms, whole.pulses.waveforms)
-        np.testing.assert_array_equal(joined.pulses.energy_kev, joined.index)
-
     def test_rejecting_counts_and_choosing_does_not(self) -> None:
         prepared = prepared_of(np.concatenate([np.full((1, 1200), np.nan), measured(n=4)]))
         reasons = np.array([0, Rejection.CHI2, 0, Rejection.CHI2], np.uint8)

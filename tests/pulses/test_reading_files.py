@@ -55,13 +55,6 @@ def test_the_usual_names_are_understood(tmp_path, write, name, waveform, dt_ns, 
     assert source.read().event_number.tolist() == list(range(0, 33, 3))
 
 
-@pytest.mark.parametrize(("write", "name"), WRITERS)
-def test_an_energy_without_units_is_not_in_kev(tmp_path, write, name):
-    path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, energy=ENERGY)
-    assert np.isnan(open_pulses(path).read().energy_kev).all()
-    np.testing.assert_array_equal(open_pulses(path, kev_per_adc=1).read().energy_kev, ENERGY)
-
-
 def test_a_choice_between_arrays(tmp_path):
     path = write_npz(tmp_path / "pulses.npz", wf1=VALUES, wf16=VALUES[:, ::2], note="text")
     with pytest.raises(CpunetError, match=r"2 arrays of two dimensions \(wf1, wf16\); choose"):
@@ -80,12 +73,6 @@ def test_npy_needs_the_period(tmp_path):
     for dt_ns in (0, -1, np.nan):
         with pytest.raises(CpunetError, match=r"dt_ns is .*; expected more than 0"):
             open_pulses(path, dt_ns=dt_ns)
-
-
-def test_columnwise_arrays_and_objects_beside_the_waveforms(tmp_path):
-    path = write_npz(tmp_path / "pulses.npz", waveform=np.asfortranarray(VALUES), more={"a": 1})
-    read = open_pulses(path, dt_ns=16).read()
-    np.testing.assert_array_equal(read.waveforms, VALUES)
 
 
 @pytest.mark.parametrize("orient", [np.ravel, np.atleast_2d, np.vstack])
@@ -170,12 +157,6 @@ def test_foreign_files(tmp_path, suffix, content):
     with pytest.raises(CpunetError, match=r"^[^\n]*file[^\n]*: [^\n]*; [^\n]*$") as error:
         open_pulses(path, dt_ns=16)
     assert ("is empty" in str(error.value)) == (content == b"")
-
-
-def test_content_counts_more_than_the_name(tmp_path):
-    pulses = Pulses.of(np.zeros((2, 20)), dt_ns=16)
-    write_pulses(tmp_path / "pulses.npz", pulses)
-    assert open_pulses(tmp_path / "pulses.npz").format == "LH5"
 
 
 @pytest.fixture(scope="module")
