@@ -281,10 +281,21 @@ def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
     columns = {}
     for name, item in members(group).items():
+        # MATLAB has no vectors, but writes a row
+        is_number = is_column(item) or (_is_array(item) and 1 in item.shape)
         is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
-        if _is_numeric(item) or (divides(name) and is_text):
+        if is_number or (is_text and divides(name)):
             columns[name] = _stored(path, item)
     return columns
+
+
+def _stored(path: Path, dataset: h5py.Dataset) -> Column:
+    """A dataset as a column."""
+    if dataset.ndim != 1:  # a number, or a row of MATLAB's
+        values = np.asarray(dataset[()])
+        return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
+    read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
+    return Column(read, dataset.size, units_of(dataset))
 
 
 def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
@@ -295,25 +306,12 @@ def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
     CpunetError
         If there is no such file or column; the message lists the other columns of the group.
     """
-    file, place = open_hdf5(path), name.strip("/").rpartition("/")[0]
+    file = open_hdf5(path)
+    place, _, own = name.strip("/").rpartition("/")
     with one_line(path):
-        parent, item = item_at(file, place), item_at(file, name)
-        others = columns_of(path, parent) if isinstance(parent, h5py.Group) else {}
-        if _is_numeric(item):
-            return _stored(path, item), others
-        names = list(others or file)
+        group = item_at(file, place)
+        columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
+        if own in columns:
+            return columns[own], columns
+        names = list(columns or file)
     raise CpunetError(f"{path}: no column {name}; there are {shortened(names)}")
-
-
-def _is_numeric(item: object) -> bool:
-    """Whether an item is a column of numbers; MATLAB has no vectors, but writes a row."""
-    return is_column(item) or (_is_array(item) and 1 in item.shape)
-
-
-def _stored(path: Path, dataset: h5py.Dataset) -> Column:
-    """A dataset as a column."""
-    if dataset.ndim != 1:  # a number, or a row of MATLAB's
-        values = np.asarray(dataset[()])
-        return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
-    read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
-    return Column(read, dataset.size, units_of(dataset))

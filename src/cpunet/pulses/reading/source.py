@@ -402,19 +402,16 @@ def _elsewhere(source: PulseSource, energy: str) -> Column:
     ours, theirs = (np.asarray(c[key].read(0, len(c[key]))) for c in (columns, others))
     if np.array_equal(ours, theirs):
         return column
-    order = np.argsort(theirs, kind="stable")
-    at = order[np.minimum(np.searchsorted(theirs[order], ours), len(theirs) - 1)]
-    shared = theirs[at] == ours
-    if not shared.any() or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
-        lost = f"{(~shared).sum()} of {len(ours)} are not there"
+    _, at, of = np.intersect1d(ours, theirs, return_indices=True)
+    if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
         raise CpunetError(
-            f"{path}: {energy} is of other events than these pulses ({key}: "
-            f"{'twice' if shared.all() else lost})",
+            f"{path}: {energy} is of other events than these pulses ({key})",
             "give the energies of the same events",
         )
     log.info(
         f"{path.name}: {energy} is in another order or of other events; joined by {key}, "
-        f"{(~shared).sum()} of {len(ours)} pulses have no energy there"
+        f"{len(ours) - len(at)} of {len(ours)} pulses have no energy there"
     )
-    values = np.where(shared, np.asarray(column.read(0, len(column)), float)[at], np.nan)
+    values = np.full(len(ours), np.nan)
+    values[at] = np.asarray(column.read(0, len(column)), float)[of]
     return Column.of(values, column.units)
