@@ -122,7 +122,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     place = (table or "").strip("/")
     item = item_at(file, place)
     if item is None:
-        tables = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
+        tables = waveform_tables(file) or list(file)
         raise CpunetError(f"{path}: no table {place}; there are {shortened(tables)}")
     if _is_lh5(item) or _is_array(item):
         return place
@@ -151,53 +151,26 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
 
 
 def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
-    """Error that names the arrays which could be traces, if there are any."""
+    """Error that names what could be traces: the arrays with most values for each event."""
     if place and (tables := waveform_tables(file)):
         return CpunetError(f"{path}: no waveforms in {place}; they are in {shortened(tables)}")
-    arrays, others, tables = list[str](), list[str](), list[str]()
+    held: dict[str, int] = {}
     for folder in _folders(file):
-        tables += [folder.path] if folder.is_table else []
         for name, item in folder.members.items():
-            where = f"{folder.path}/{name}".strip("/")
-            if kind := _no_array(item):
-                others.append(f"{where} is {kind}")
-            elif _is_array(item) and item.shape[1] > 3:  # of three columns are positions
-                arrays.append(where)
-    if others and not arrays:
-        return CpunetError(
-            f"{path}: {others[0]}",
-            "if it holds the traces, write them as an array of two dimensions (event, sample)",
-        )
-    if not arrays:
-        return CpunetError(
-            f"{path}: no waveforms in it; it holds {shortened(tables or list(file))}",
-            "give a file of traces (their energies may be here: `data_energy` FILE:COLUMN)",
-        )
-    many = "an array" if len(arrays) == 1 else f"{len(arrays)} arrays"
+            if isinstance(item, h5py.Dataset) and item.shape:
+                what = h5py.check_vlen_dtype(item.dtype) or item.dtype
+                size = item.dtype.itemsize * int(np.prod(item.shape[1:]))
+                held[f"{folder.path}/{name}".strip("/") + f" {item.shape} of {what}"] = size
+    listed = sorted(held, key=lambda name: -held[name]) or list(file)
     return CpunetError(
-        f"{path}: no table of waveforms in it, but {many} of two dimensions "
-        f"({shortened(arrays)})",
-        "if it holds traces, name it by `table` (`sim_table`, `data_table`); give `dt_ns`",
+        f"{path}: no waveforms in it; it holds {shortened(listed)}",
+        "name an array of traces (event, sample) by `table` (`sim_table`, `data_table`) and "
+        "give `dt_ns`, or write them as such an array; `data_energy` FILE:COLUMN reads energies",
     )
 
 
 def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
     return isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
-
-
-def _no_array(item: object) -> str:
-    """What a dataset of traces is in place of an array of two dimensions; empty if none."""
-    if not isinstance(item, h5py.Dataset):
-        return ""
-    kind, fields = item.dtype, item.dtype.names or ()
-    if any(kind[name].shape for name in fields):
-        return f"a compound table of fields {shortened(fields)}"
-    if kind.subdtype or (item.ndim > 2 and kind.kind in "iuf"):
-        return f"an array of shape {item.shape + kind.shape}, as of several segments"
-    inner = h5py.check_vlen_dtype(kind)
-    if inner is not None and np.dtype(inner).kind in "iuf":
-        return f"an array of rows of free length ({inner})"
-    return ""
 
 
 def waveform_tables(file: h5py.File) -> list[str]:
@@ -237,7 +210,6 @@ class _Folder:
 
     path: str
     members: dict[str, h5py.Group | h5py.Dataset]
-    is_table: bool
     waveforms: list[str]
     broken: list[str]
 
@@ -264,7 +236,7 @@ def _folders(
         names = []  # the inside of waveforms
     of = f"{path}/".lstrip("/")
     lost = [] if names or is_table else [of + name for name in broken]
-    yield _Folder(path, items, is_table, [of + name for name in names], lost)
+    yield _Folder(path, items, [of + name for name in names], lost)
     for name, item in items.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
