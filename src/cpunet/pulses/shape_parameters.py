@@ -200,6 +200,7 @@ def all_parameters(
         decay_ns = median_decay_ns(
             tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
         )
+    lever = np.arange(preparation.baseline_samples) - (preparation.baseline_samples - 1) / 2
     for rows in blocks(len(pulses), BLOCK):
         good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
         block = np.array(pulses.waveforms[good], dtype=np.float32, order="C")
@@ -211,8 +212,11 @@ def all_parameters(
                 else amplitudes[good],
                 "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
                 "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
-                "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
             }
+            baselines, n = block[:, : preparation.baseline_samples].astype(float), lever.size
+            baselines -= baselines.mean(axis=1, keepdims=True)
+            baselines -= np.outer(baselines @ lever / (lever @ lever), lever)  # about a line
+            columns["baseline_rms"] = np.sqrt((baselines**2).sum(axis=1) / (n - 2))
             height, levels = block.max(axis=1), np.array([*TIME_POINTS.values()])
             levels = np.outer(np.where(height > 0, height, np.nan), levels).astype(np.float32)
             top = block.argmax(axis=1)[:, np.newaxis]
@@ -235,18 +239,6 @@ def median_decay_ns(slopes: Values) -> float:
     finite = slopes[np.isfinite(slopes)]
     slope = float(np.median(finite)) if finite.size else 0.0
     return -1e6 / slope if slope < 0 else np.inf
-
-
-def _rms_about_line(baseline: FloatArray) -> Values:
-    """RMS of the residuals of a straight line, over its degrees of freedom."""
-    samples = baseline.shape[1]
-    if samples < 3:
-        return np.full(len(baseline), np.nan)
-    lever = np.arange(samples) - (samples - 1) / 2
-    values = baseline.astype(float)
-    values -= values.mean(axis=1, keepdims=True)
-    values -= np.outer(values @ lever / (lever @ lever), lever)
-    return np.asarray(np.sqrt((values**2).sum(axis=1) / (samples - 2)))
 
 
 MAX_BINS = 49

@@ -165,7 +165,7 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     return CpunetError(
         f"{path}: no waveforms in it; it holds {shortened(listed)}",
         "name an array of traces (event, sample) by `table` (`sim_table`, `data_table`) and "
-        "give `dt_ns`, or write them as such an array; `data_energy` FILE:COLUMN reads energies",
+        "give `dt_ns`, or write them as such an array; energies are `data_energy` FILE:COLUMN",
     )
 
 
