@@ -47,35 +47,16 @@ def multi_site(n: int, noise: float, seed: int) -> np.ndarray:
 
 
 def production_chain(waveforms: np.ndarray) -> np.ndarray:
-    """I_max from a processing chain as the experiments configure it."""
-    from dspeed import build_processing_chain
-    from lgdo import Table, WaveformTable
+    """I_max by the processors of the experiments, as they configure them."""
+    from dspeed.processors import avg_current, moving_window_multi, upsampler
 
-    table = Table(size=len(waveforms))
-    table.add_field("waveform", WaveformTable(values=waveforms, dt=16, dt_units="ns", t0=0))
-    steps = {
-        "curr": ("avg_current", ["waveform", 1, "curr(len(waveform) - 1, 'f')"], "ADC"),
-        "curr_up": (
-            "upsampler",
-            ["curr", 16, "curr_up((len(curr) - 1) * 16, 'f', period=curr.period / 16)"],
-            "ADC",
-        ),
-        "curr_av": ("moving_window_multi", ["curr_up", 48, 3, 0, "curr_av"], "ADC"),
-        "t_min, t_max, a_min, a_max": (
-            "min_max",
-            ["curr_av", "t_min", "t_max", "a_min", "a_max"],
-            ["ns", "ns", "ADC", "ADC"],
-        ),
-    }
-    processors = {
-        name: {"function": function, "module": "dspeed.processors", "args": args, "unit": unit}
-        for name, (function, args, unit) in steps.items()
-    }
-    chain, _, out = build_processing_chain(
-        {"outputs": ["a_max"], "processors": processors}, table
-    )
-    chain.execute()
-    return out["a_max"].nda
+    n, length = waveforms.shape
+    current, fine = np.empty((n, length - 1), "f4"), np.empty((n, 16 * (length - 2)), "f4")
+    avg_current(waveforms, 1, current)
+    upsampler(current, 16, fine)
+    smooth = np.empty_like(fine)
+    moving_window_multi(fine, 48, 3, 0, smooth)
+    return smooth.max(axis=1)
 
 
 # in more noise the chain's maximum can be a sample at an end of the record, which it holds

@@ -168,9 +168,6 @@ class TestSaturation:
         raw = measured(n=200, amplitude=amplitude, noise=noise, tau_us=550.0, length=1000)
         assert "saturated" not in prepared_of(raw).rejections
 
-    def test_flat_simulated_tops_are_legitimate(self) -> None:
-        assert prepared_of(simulated(n=5), "simulated").rejections == {}
-
 
 class TestSimulated:
     def test_scaled_to_one_aligned_and_padded(self) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -46,8 +47,9 @@ _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    path, file = options.path, open_hdf5(options.path)
-    with one_line(path):
+    path = options.path
+    with one_line(path), ExitStack() as unless_read:
+        file = unless_read.enter_context(open_hdf5(path))
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
         group, values = file[table or "/"], file[name]
@@ -56,7 +58,7 @@ def read_hdf5(options: PulseFile) -> PulseSource:
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
             plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
             rows = reading(path, values, plain.rows)
-            return replace(plain, rows=rows, group=group, close=file.close)
+            return replace(plain, rows=rows, group=group, close=unless_read.pop_all().close)
         own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
         is_group, sized = isinstance(values, h5py.Group), values
@@ -76,7 +78,7 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         rows = reading(path, values, partial(_lh5_traces, values, longest))
         return PulseSource(
             path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
-            t0=own.get("t0"), group=group, close=file.close,
+            t0=own.get("t0"), group=group, close=unless_read.pop_all().close,
         )  # fmt: skip
 
 
