@@ -111,15 +111,6 @@ class TestMeasured:
         assert np.all(window[padding : padding + 5] != 0)
         assert abs(window[padding:200].mean()) < 1e-6
 
-    def test_records_too_short_are_counted(self) -> None:
-        early, late = measured(start=100.0), measured(start=900.0)
-        prepared = prepared_of(np.concatenate([early, late, measured()]))
-        assert prepared.codes.tolist() == [Rejection.PULSE_AT_EDGE] * 2 + [0]
-        assert prepared.rejections == {"pulse_at_edge": 2}
-        assert prepared_of(early[:, :500]).rejections == {"window_outside_record": 1}
-        assert prepared.index.tolist() == [2]
-        assert len(prepared_of(late, padding_after_ns=3200)) == 1
-
     def test_what_is_not_a_pulse_is_counted_by_reason(self) -> None:
         good = measured()[0]
         noise = np.random.default_rng(1).normal(14_000, 10, 1200).round()

@@ -123,7 +123,9 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
         for name, fraction in TIME_POINTS.items()
     },
     **{
-        name: Parameter(f"Rise time {int(begin[1:])}–{end[1:]} %", "ns")
+        name: Parameter(
+            f"Rise time {100 * TIME_POINTS[begin]:g}–{100 * TIME_POINTS[end]:g} %", "ns"
+        )
         for name, (begin, end) in RISE_TIMES.items()
     },
     "tp_0_est": Parameter("tp_0_est", "ns"),
