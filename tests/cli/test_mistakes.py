@@ -84,7 +84,7 @@ MISTAKES = {
     "wrong column": Mistake(f"{TRAIN} --data-energy nothing", r"data.lh5.*nothing.*; .*"),
     "truncated": Mistake(f"{TRAIN} --data half.lh5", r"half.lh5: .*; .*"),
     "empty": Mistake(f"{TRAIN} --data empty.lh5", r"empty.lh5: is empty; .*"),
-    "text": Mistake(f"{TRAIN} --data text.lh5", r"text.lh5: not a HDF5 file, .*; .*"),
+    "text": Mistake(f"{TRAIN} --data text.lh5", r"text.lh5: of no known format; .*"),
     # energies and sides
     "energies in ADC": Mistake(
         f"{TRAIN} --data adc.lh5", r"adc.lh5: .*energy.*; .*--kev-per-adc.*"

@@ -34,42 +34,41 @@ def file(tmp_path):
     return tmp_path / "pulses.lh5"
 
 
-def test_a_single_table_is_found_and_read_in_blocks(file, raw):
-    energy = RNG.uniform(0, 3000, N)
+def test_a_single_table_is_read_in_blocks_whatever_the_name_of_its_file(tmp_path, raw):
+    file, energy = tmp_path / "pulses.npz", RNG.uniform(0, 3000, N)
     write_table(file, "geds/raw", raw, energy, eventnumber=np.arange(N) * 7)
     source = open_pulses(file)
     assert (source.n_pulses, source.length, source.dt_ns) == (N, LENGTH, 16.0)
     blocks = list(source.blocks(5))
     assert [len(block) for block in blocks] == [5, 5, 5, 5, 3]
-    pulses = source.read()
+    pulses = Pulses.concatenate(blocks)
     np.testing.assert_array_equal(pulses.waveforms, raw)
     np.testing.assert_array_equal(pulses.energy_kev, energy)
     np.testing.assert_array_equal(pulses.event_number, np.arange(N) * 7)
-    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), raw)
-    assert source.format == "LH5"
-    assert source.name == "geds/raw/waveform"
+    assert (source.format, source.name) == ("LH5", "geds/raw/waveform")
     assert sorted(source.columns) == ["energy", "eventnumber"]
 
 
 @pytest.mark.parametrize(
-    ("dt", "units", "dt_ns"),
-    [(16, "ns", 16), (0.016, "us", 16), (1.6e-8, "s", 16), (0.016, "\u03bcs", 16)],
+    ("of_time", "dt", "of_energy", "kev"),
+    [
+        ("ns", 16, "keV", 1),
+        ("us", 0.016, "MeV", 1000),
+        ("s", 1.6e-8, "eV", 1e-3),
+        ("\u03bcs", 0.016, np.array(["MeV"], h5py.string_dtype()), 1000),  # an array of one
+    ],
 )
-def test_the_units_of_the_sampling_period_count(file, raw, dt, units, dt_ns):
-    write_table(file, "t", waveform_table(raw, dt, units))
-    assert open_pulses(file).dt_ns == pytest.approx(dt_ns)
-
-
-@pytest.mark.parametrize(("units", "factor"), [("keV", 1), ("MeV", 1000), ("eV", 1e-3)])
-def test_the_units_of_the_energy_count(file, raw, caplog, units, factor):
-    energy = Array(np.linspace(1, 2, N), attrs={"units": units})
-    write_table(file, "t", raw, energy)
-    np.testing.assert_allclose(
-        open_pulses(file).read().energy_kev, factor * np.linspace(1, 2, N)
-    )
+def test_the_units_of_period_and_energy_count(file, raw, caplog, of_time, dt, of_energy, kev):
+    energies = np.linspace(1, 2, N)
+    write_table(file, "t", waveform_table(raw, dt, of_time), energies)
+    with h5py.File(file, "a") as h5:
+        h5["t/energy"].attrs["units"] = of_energy
+    source = open_pulses(file)
+    assert source.dt_ns == pytest.approx(16)
+    np.testing.assert_allclose(source.read().energy_kev, kev * energies)
     corrected = open_pulses(file, kev_per_adc=0.1)  # as where a unit or a factor is wrong
-    np.testing.assert_allclose(corrected.read().energy_kev, 0.1 * factor * np.linspace(1, 2, N))
-    assert f"in {units}; its energies are multiplied by 0.1" in caplog.text
+    np.testing.assert_allclose(corrected.read().energy_kev, 0.1 * kev * energies)
+    assert "its energies are multiplied by 0.1" in caplog.text
 
 
 def test_a_column_in_adc_is_no_energy_unless_calibrated(file, raw):
@@ -137,17 +136,21 @@ def test_of_several_columns_the_full_rate_is_taken_and_told(file, raw, caplog):
     assert (other.dt_ns, other.length) == (64.0, 10)
 
 
-def test_ragged_waveforms_are_refused_if_they_differ(file):
-    even = VectorOfVectors([[1, 2, 3, 4]] * 5, dtype=np.uint16)
-    odd = VectorOfVectors([[1, 2, 3, 4]] * 4 + [[1, 2]], dtype=np.uint16)
-    for name, values in (("even", even), ("odd", odd)):
-        write_table(file, name, waveform_table(values))
-    assert [len(b) for b in open_pulses(file, table="even").blocks(2)] == [2, 2, 1]
-    np.testing.assert_array_equal(
-        open_pulses(file, table="even").read().waveforms[4], [1, 2, 3, 4]
-    )
+def test_vectors_of_their_own_lengths(file, caplog):
+    """Ideal pulses, as long as their drift, stay where they end; traces are of one length."""
+    caplog.set_level("INFO")
+    even, odd = [[1, 2, 3, 4]] * 5, [[1, 2, 3, 4]] * 4 + [[1, 2]]
+    for name, rows, kind in (("even", even, "u2"), ("odd", odd, "u2"), ("ideal", odd, "f4")):
+        write_table(file, name, waveform_table(VectorOfVectors(rows, dtype=kind)))
+    source = open_pulses(file, table="even")
+    assert [len(b) for b in source.blocks(2)] == [2, 2, 1]
+    np.testing.assert_array_equal(source.read().waveforms, even)
     with pytest.raises(CpunetError, match=r"event 4: 2 samples, others have 4; split the file"):
         open_pulses(file, table="odd").read()
+    source = open_pulses(file, table="ideal")
+    np.testing.assert_array_equal(source.read().waveforms, [[1, 2, 3, 4]] * 4 + [[1, 2, 2, 2]])
+    np.testing.assert_array_equal(source.read(4, 5).waveforms, [[1, 2, 2, 2]])
+    assert "pulses of 2 to 4 samples are continued" in caplog.text
 
 
 def test_a_period_that_changes_names_the_event(file, raw):
@@ -281,18 +284,6 @@ def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
     assert [list(row) for row in table.edep] == hits
     with h5py.File(path) as file:
         assert file.attrs["made"] == "by hand"
-
-
-def test_other_columns_are_read_by_rows(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    columns = {"a": (np.arange(6), "mm"), "tails_kev": (np.arange(6), "")}
-    write_pulses(path, some(), columns=columns)
-    own = {"waveform", "energy", "event_number", "tails_kev"}
-    read, left_out = other_columns(open_pulses(path), own)
-    found = read(2, 3)
-    assert ([*found], left_out) == (["a", "tails_kev_source"], {})
-    assert found["a"].nda.tolist() == [2, 3, 4]
-    assert found["a"].attrs["units"] == "mm"
 
 
 def test_no_column_replaces_another(tmp_path):

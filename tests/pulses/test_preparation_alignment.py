@@ -223,6 +223,7 @@ class TestRejections:
             assert cut.shape[1] > 800
             assert set(prepared_of(cut).codes) == {Rejection.PULSE_AT_EDGE}
         assert prepared_of(pulses[:, 400:]).rejections == {}
+        assert prepared_of(late, padding_after_ns=1600).rejections == {}
 
     def test_record_shorter_than_the_window(self) -> None:
         pulses = self.traces()

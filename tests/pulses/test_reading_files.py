@@ -1,8 +1,7 @@
-"""NumPy, HDF5 that is not LH5, spectra and text of siggen, and what is wrong with files."""
+"""NumPy, HDF5 that is not LH5, and what is wrong with files."""
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import awkward as ak
@@ -56,13 +55,6 @@ def test_the_usual_names_are_understood(tmp_path, write, name, waveform, dt_ns, 
     assert source.read().event_number.tolist() == list(range(0, 33, 3))
 
 
-@pytest.mark.parametrize(("write", "name"), WRITERS)
-def test_an_energy_without_units_is_not_in_kev(tmp_path, write, name):
-    path = write(tmp_path / name, waveform=VALUES, dt_ns=16.0, energy=ENERGY)
-    assert np.isnan(open_pulses(path).read().energy_kev).all()
-    np.testing.assert_array_equal(open_pulses(path, kev_per_adc=1).read().energy_kev, ENERGY)
-
-
 def test_a_choice_between_arrays(tmp_path):
     path = write_npz(tmp_path / "pulses.npz", wf1=VALUES, wf16=VALUES[:, ::2], note="text")
     with pytest.raises(CpunetError, match=r"2 arrays of two dimensions \(wf1, wf16\); choose"):
@@ -81,36 +73,6 @@ def test_npy_needs_the_period(tmp_path):
     for dt_ns in (0, -1, np.nan):
         with pytest.raises(CpunetError, match=r"dt_ns is .*; expected more than 0"):
             open_pulses(path, dt_ns=dt_ns)
-
-
-def test_columnwise_arrays_and_objects_beside_the_waveforms(tmp_path):
-    path = write_npz(tmp_path / "pulses.npz", waveform=np.asfortranarray(VALUES), more={"a": 1})
-    read = open_pulses(path, dt_ns=16).read()
-    np.testing.assert_array_equal(read.waveforms, VALUES)
-
-
-PULSE = np.linspace(0, 1000, 50, dtype=np.float32)
-
-
-def spectrum(rows: np.ndarray) -> bytes:
-    """As siggen's `write_spectrum` lays it out: two Fortran records."""
-    n_rows, length = rows.shape
-    title = struct.pack("<i8siiiii", 24, b"pulse   ", length, n_rows, 1, 1, 24)
-    data = rows.astype("<f4").tobytes()
-    mark = struct.pack("<i", len(data))
-    return title + mark + data + mark
-
-
-def test_the_rows_of_a_spectrum_are_pulses(tmp_path):
-    path = tmp_path / "pulses.spe"
-    rows = np.stack([PULSE + i for i in range(5)])
-    path.write_bytes(spectrum(rows))
-    with pytest.raises(CpunetError, match="give `dt_ns`"):
-        open_pulses(path)
-    source = open_pulses(path, dt_ns=1)
-    assert (source.n_pulses, source.length, source.dt_ns) == (5, 50, 1)
-    found = np.concatenate([block.waveforms for block in source.blocks(2)])
-    np.testing.assert_array_equal(found, rows)
 
 
 @pytest.mark.parametrize("orient", [np.ravel, np.atleast_2d, np.vstack])
@@ -187,7 +149,7 @@ def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(600)
 
 
-@pytest.mark.parametrize("suffix", [".lh5", ".h5", ".fcio", ".npz", ".npy", ".spe", ".dat", ""])
+@pytest.mark.parametrize("suffix", [".lh5", ".h5", ".fcio", ".npz", ".npy", ".dat", ""])
 @pytest.mark.parametrize("content", [b"", PNG, b"\0" * 700], ids=["empty", "png", "zeros"])
 def test_foreign_files(tmp_path, suffix, content):
     path = tmp_path / f"file{suffix}"
@@ -195,12 +157,6 @@ def test_foreign_files(tmp_path, suffix, content):
     with pytest.raises(CpunetError, match=r"^[^\n]*file[^\n]*: [^\n]*; [^\n]*$") as error:
         open_pulses(path, dt_ns=16)
     assert ("is empty" in str(error.value)) == (content == b"")
-
-
-def test_content_counts_more_than_the_name(tmp_path):
-    pulses = Pulses.of(np.zeros((2, 20)), dt_ns=16)
-    write_pulses(tmp_path / "pulses.npz", pulses)
-    assert open_pulses(tmp_path / "pulses.npz").format == "LH5"
 
 
 @pytest.fixture(scope="module")
@@ -213,12 +169,11 @@ def whole(tmp_path_factory) -> list[Path]:
     np.savez(folder / "b.npz", waveform=values, energy_kev=np.arange(30.0))
     np.savez_compressed(folder / "c.npz", waveform=values)
     np.save(folder / "d.npy", values)
-    (folder / "e.spe").write_bytes(spectrum(values))
     return sorted(folder.iterdir())
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-@given(fraction=st.floats(0, 0.99), which=st.integers(0, 4))
+@given(fraction=st.floats(0, 0.99), which=st.integers(0, 3))
 def test_any_truncation_is_one_line_naming_the_file(whole, fraction, which):
     content = whole[which].read_bytes()
     path = whole[which].with_stem("cut")

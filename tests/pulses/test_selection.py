@@ -133,14 +133,6 @@ def test_outliers_are_found_and_clean_pulses_stay(spoiled: Prepared) -> None:
     assert len(cut) + sum(cut.rejections.values()) == cut.n_read == 500
 
 
-def test_windows_of_one_set_apply_to_another(spoiled: Prepared) -> None:
-    cuts = fit_cuts(spoiled, CUTS)
-    other = prepared_of(traces(np.full(100, 30_000.0), seed=9))
-    assert len(apply_cuts(other, cuts)) == 100
-    slower = prepared_of(traces(np.full(20, 30_000.0)) + 3_000 * pulse(-500))
-    assert len(apply_cuts(slower, cuts)) == 0
-
-
 def test_pulses_without_noise_lose_nothing() -> None:
     raw = np.linspace(1_000, 2_000, 50)[:, None] * pulse(560)
     prepared = prepared_of(raw)

@@ -269,6 +269,15 @@ def _baseline_stretch(length, start, s):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _base_of_window(trace, start, stop, s):  # type: ignore[no-untyped-def]
+    """Level of a window before its pulse."""
+    if s.simulated:
+        return _charge_before(trace, start, min(stop, len(trace)))
+    first, last = _baseline_stretch(len(trace), start, s)
+    return mean_of(trace[first:last])
+
+
+@compiled
 def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
     """Align, compute the baseline of that window, and repeat until nothing moves."""
     length = len(trace)
@@ -293,11 +302,7 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
         if top_sample >= stop:
             top = np.float64(highest_of(trace[align:stop]))
             top_sample = align + first_at(trace[align:stop], top)
-        if s.simulated:
-            base = _charge_before(trace, start, stop)
-        else:
-            first, last = _baseline_stretch(length, start, s)
-            base = mean_of(trace[first:last])
+        base = _base_of_window(trace, start, stop, s)
     return align, base, top
 
 
@@ -324,12 +329,7 @@ def _level_at(trace, align, s):  # type: ignore[no-untyped-def]
     nothing from it, and noise moves it little.
     """
     length, start, stop = len(trace), align - s.samples_before, align + s.samples_after
-    if s.simulated:
-        base = _charge_before(trace, start, min(stop, length))
-    else:
-        first, last = _baseline_stretch(length, start, s)
-        base = mean_of(trace[first:last])
-    n = s.decay_fit_samples
+    base, n = _base_of_window(trace, start, stop, s), s.decay_fit_samples
     centre, total, moment = 0.5 * (n - 1), 0.0, 0.0
     for k in range(n):
         value = np.float64(trace[max(min(stop - n + k, length - 1), 0)])

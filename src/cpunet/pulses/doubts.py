@@ -42,36 +42,15 @@ LEAST_PERIOD, MIN_ROLLED, MOSTLY = 256, 3, 0.9
 FEW_ROLLED, MAX_ROLLED = 0.02, 0.2
 
 
-def go_down(traces: FloatArray) -> bool:
-    """Whether most traces of shape (pulses, samples) fall from their baselines."""
-    if not len(traces):
-        return False
-    up, down = amplitude(traces), amplitude(-traces)
-    return bool(np.mean(down > 2 * np.maximum(up, 0)) > 0.5)
-
-
 class RolledOver(NamedTuple):
-    """Counts that jump by a period, the share of traces in which they do, and their type."""
+    """Counts that jump by a period: the share of such traces, a text, and what to do."""
 
-    period: int
     share: float
-    signed: bool
+    text: str
+    remedy: str
 
     def __str__(self) -> str:
-        return (
-            f"{100 * self.share:.0f} % of the traces jump by {self.period} = "
-            f"2^{self.period.bit_length() - 1} counts: "
-            + ("unsigned samples stored as signed, or " if self.signed else "")
-            + "counts beyond the range rolled over"
-        )
-
-    def refusal(self, path: Path) -> CpunetError:
-        """The error of a file with such counts."""
-        view = "as unsigned (values.view('uint16') in NumPy), or " if self.signed else ""
-        return CpunetError(
-            f"{path}: {self}",
-            f"write them {view}as numpy.unwrap(values.astype(float), period={self.period})",
-        )
+        return self.text
 
 
 def rolled_over(traces: FloatArray) -> RolledOver | None:
@@ -85,8 +64,8 @@ def rolled_over(traces: FloatArray) -> RolledOver | None:
     Examples
     --------
     >>> ramp = 30_000 + 50.0 * np.arange(200) + np.arange(5)[:, np.newaxis]
-    >>> rolled_over(ramp) is None, rolled_over((ramp + 2**15) % 2**16 - 2**15)
-    (True, RolledOver(period=65536, share=1.0, signed=True))
+    >>> rolled_over(ramp) is None, str(rolled_over((ramp + 2**15) % 2**16))[:43]
+    (True, '100 % of the traces jump by 65536 = 2^16 co')
     """
     jumps = np.abs(np.diff(traces, axis=1)).max(axis=1)
     steep = (jumps > np.ptp(traces, axis=1) / 2) & (jumps >= LEAST_PERIOD / 2)
@@ -95,8 +74,18 @@ def rolled_over(traces: FloatArray) -> RolledOver | None:
     period = 2 ** int(np.round(np.log2(np.median(jumps[steep]))))
     left = np.abs(np.diff(np.unwrap(traces[steep], period=period), axis=1)).max(axis=1)
     rolled = (np.abs(jumps[steep] - period) < period / 4) & (left < period / 4)
-    signed = period == 2**16 and bool(traces[steep].min() < 0)
-    return RolledOver(period, float(steep.mean()), signed) if rolled.mean() > MOSTLY else None
+    if rolled.mean() <= MOSTLY:
+        return None
+    share, because, view = float(steep.mean()), "", ""
+    if period == 2**16 and traces[steep].min() < 0:
+        because = "unsigned samples stored as signed, or "
+        view = "as unsigned (values.view('uint16') in NumPy), or "
+    return RolledOver(
+        share,
+        f"{100 * share:.0f} % of the traces jump by {period} = 2^{period.bit_length() - 1} "
+        f"counts: {because}counts beyond the range rolled over",
+        f"write them {view}as numpy.unwrap(values.astype(float), period={period})",
+    )
 
 
 def mismatched(kev: Values, amplitudes: Values) -> float:
@@ -106,37 +95,19 @@ def mismatched(kev: Values, amplitudes: Values) -> float:
     by trapping, for piled-up and for saturated pulses.  Returns 0 if there are too few, or if
     all amplitudes are alike, as of pulses that were scaled to one height.
     """
-    heights, gains = _of_usable(kev, amplitudes)
-    if len(heights) < MIN_PULSES or _far_from_median(heights) < ALIKE:
-        return 0.0
-    return _far_from_median(gains)
-
-
-def _of_usable(kev: Values, amplitudes: Values) -> tuple[Values, Values]:
-    """Amplitudes, and amplitudes over energies, of pulses well above the noise."""
     with np.errstate(invalid="ignore"):
         usable = (kev > LOW_KEV) & (amplitudes > 0)
-    return amplitudes[usable], amplitudes[usable] / kev[usable]
+    if usable.sum() < MIN_PULSES:
+        return 0.0
+    heights = amplitudes[usable]
+    of_heights, of_gains = (
+        float(np.mean(np.abs(values / np.median(values) - 1) > FAR))
+        for values in (heights, heights / kev[usable])
+    )
+    return of_gains if of_heights >= ALIKE else 0.0
 
 
-def _far_from_median(values: Values) -> float:
-    return float(np.mean(np.abs(values / np.median(values) - 1) > FAR))
-
-
-class SecondRate(NamedTuple):
-    """A change of the rate within a trace: its sample, and how many samples are averaged."""
-
-    sample: int
-    averaged: float
-
-    def __str__(self) -> str:
-        return (
-            f"noise and slope of the tails change at sample {self.sample}, as if "
-            f"{self.averaged:.0f} samples were averaged from there: a second rate"
-        )
-
-
-def second_rate(traces: FloatArray) -> SecondRate | None:
+def second_rate(traces: FloatArray) -> tuple[int, float] | None:
     """Find where digitisers begin to average samples, which are then longer.
 
     Averages of m samples have less noise, by the root of m if it is white, and the decay goes
@@ -146,6 +117,11 @@ def second_rate(traces: FloatArray) -> SecondRate | None:
     ----------
     traces
         Raw traces, shape (pulses, samples).
+
+    Returns
+    -------
+    tuple or None
+        The sample at which they begin, and how many they average.
     """
     heights = amplitude(traces)
     good = np.isfinite(heights) & (heights > 0)
@@ -176,7 +152,7 @@ def second_rate(traces: FloatArray) -> SecondRate | None:
     faster = slopes[1] / slopes[0] if slopes[0] < 0 else 0.0
     if lower < MIN_NOISE or faster < MIN_SLOPE:
         return None
-    return SecondRate(start + at + 1, faster)
+    return start + at + 1, float(faster)
 
 
 def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Values) -> None:
@@ -191,39 +167,27 @@ def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Value
     kev, amplitudes
         Energies and amplitudes of all pulses.
     """
-    rolled = rolled_over(traces)
-    if rolled is not None and rolled.share >= MAX_ROLLED:
-        raise rolled.refusal(path)
-    if rolled is not None:
-        log.warning(str(rolled.refusal(path)))
+    if (rolled := rolled_over(traces)) is not None:
+        error = CpunetError(f"{path}: {rolled}", rolled.remedy)
+        if rolled.share >= MAX_ROLLED:
+            raise error
+        log.warning(str(error))
     share = mismatched(kev, amplitudes)
     text = f"{path}: {100 * share:.0f} % of amplitudes and energies do not go together"
     if share > MAX_MISMATCHED:
-        heights, gains = _of_usable(kev, amplitudes)
-        low = heights[gains < (1 - FAR) * np.median(gains)]
-        top = float(np.quantile(heights, 0.99))
-        # they end at one height where something before the digitiser saturates
-        if len(low) and _far_from_median(low) < ALIKE and np.median(low) > (1 - FAR) * top:
-            raise CpunetError(
-                f"{text}: amplitudes end at {top:.0f}, as of a saturated amplifier",
-                "select lower energies (`peak`), or another channel",
-            )
-        # and are those of baselines where records begin with padding
-        padded = float(np.mean(np.ptp(traces[:, : traces.shape[1] // 20], axis=1) == 0))
-        if FEW_MISMATCHED < padded < 1:
-            raise CpunetError(
-                f"{text}: {100 * padded:.0f} % of the traces begin with equal samples, as if "
-                "padded",
-                "leave out these traces, or cut all where their records begin",
-            )
         raise CpunetError(
             f"{text}: these energies are not those of these traces",
-            "give the energy column of the same channel and events, in their order",
+            "give the energy column of the same channel and events, in their order; select "
+            "lower energies (`peak`) where amplitudes saturate, cut samples that pad records",
         )
     if share > FEW_MISMATCHED:
         log.warning(text)
-    if (rate := second_rate(traces)) is not None:
-        log.warning(f"{path}: {rate}; cut the traces there, or resample them")
+    if (begins := second_rate(traces)) is not None:
+        log.warning(
+            f"{path}: noise and slope of the tails change at sample {begins[0]}, as if "
+            f"{begins[1]:.0f} samples were averaged from there: a second rate; cut the traces "
+            "there, or resample them"
+        )
 
 
 def explained(
@@ -238,8 +202,8 @@ def explained(
     """Why no pulse can be used, if traces or energies show it; else the error as it is."""
     rolled = rolled_over(traces)
     if rolled is not None and rolled.share >= FEW_ROLLED:
-        return rolled.refusal(path)
-    if go_down(traces):
+        return CpunetError(f"{path}: {rolled}", rolled.remedy)
+    if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
         return CpunetError(
             f"{path}: the traces go down: their polarity is negative",
             "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",

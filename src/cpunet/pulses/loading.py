@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.doubts import explained, require_sense
 from cpunet.pulses.peaks import EnergySelection, label_peaks
 from cpunet.pulses.preparation import (
@@ -33,12 +33,7 @@ from cpunet.pulses.preparation import (
     prepare,
     rejections_of,
 )
-from cpunet.pulses.provenance import (
-    apparent_side,
-    recorded_detector,
-    recorded_side,
-    refuse_other_side,
-)
+from cpunet.pulses.provenance import recorded_detector, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import MatchingConfig, PreparationConfig, Recipe
@@ -208,23 +203,20 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        recorded = recorded_side(source)
-        refuse_other_side(recorded, file.path, side, SWAPPED)
-        guess = recorded is None and not file.insist
-        raw = _read(source, side, recipe, selection, max_pulses, guess, shorten)
-    recipe = raw.recipe.at(source.dt_ns)
-    prepared, cuts, baselines = raw.prepared, None, None
+        require_side(source, side, SWAPPED, insist=file.insist)
+        how = (recipe, selection, max_pulses, shorten)
+        inputs, parts, whole, whole_rows = _read(source, file, side, *how)
+    recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
     if side == "measured":
-        if not file.insist:
-            require_sense(file.path, raw.first, raw.energies_kev, raw.amplitudes)
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
-        whole = Pulses.concatenate(raw.whole)[np.isin(raw.whole_rows, prepared.index)]
-        baselines = Baselines.concatenate(raw.baselines, whole)
+        passed = Pulses.concatenate(whole)[np.isin(np.concatenate(whole_rows), prepared.index)]
+        baselines = Baselines.concatenate(parts, passed)
+        inputs = replace(inputs, prepared=prepared, cuts=cuts, baselines=baselines)
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
         if np.median(ends) < MIN_SIMULATED_END:
@@ -238,14 +230,7 @@ def load_pulses(
             f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
             + (f" (left out: {rejected})" if rejected else "")
         )
-    counts, low, high = None, raw.lowest, raw.highest
-    if high >= low and (raw.first == raw.first.round()).all():
-        counts = int(low), int(high)
-    kev = raw.energies_kev[np.isfinite(raw.energies_kev)]
-    return InputSet(
-        prepared, source.dt_ns, file.path, kev, raw.recipe, cuts, file.options,
-        recorded_detector(source), baselines, counts,
-    )  # fmt: skip
+    return inputs
 
 
 def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
@@ -288,32 +273,18 @@ def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
     return best
 
 
-@dataclass(frozen=True, eq=False)
-class _Read:
-    """Prepared pulses of a file, and what of all its traces is needed."""
-
-    recipe: Recipe
-    prepared: Prepared
-    first: FloatArray
-    energies_kev: FloatColumn
-    amplitudes: FloatColumn
-    baselines: list[Baselines]
-    whole: list[Pulses]
-    whole_rows: Rows
-    lowest: float
-    highest: float
-
-
 def _read(
     source: PulseSource,
+    file: PulseFile,
     side: Kind,
     recipe: Recipe,
     selection: EnergySelection,
     max_pulses: int | None,
-    guess: bool,
     shorten: bool,
-) -> _Read:
+) -> tuple[InputSet, list[Baselines], list[Pulses], list[Rows]]:
     """Read, select, prepare and collect the pulses of a file in one pass.
+
+    Without quality cuts; also baselines, and whole traces with their rows.
 
     If there are more than `max_pulses`, those with the smallest random numbers stay.  A pulse
     that is dropped early would also be dropped after all later ones were read, so they are a
@@ -323,13 +294,11 @@ def _read(
     seen = list[tuple[FloatColumn, FloatColumn]]()
     baselines, whole, whole_rows = list[Baselines](), list[Pulses](), list[Rows]()
     first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
-    lowest, highest = np.inf, -np.inf
+    lowest, highest, counts = np.inf, -np.inf, None
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
         for block in source.blocks(BLOCK_SIZE):
             if not start:
                 first = block.waveforms[:RATE_TRACES].copy()
-                if guess:
-                    refuse_other_side(apparent_side(first), source.path, side, SWAPPED)
                 if shorten:
                     recipe = _within_traces(block[:TRIED], recipe, source.path.name)
                 config = recipe.at(source.dt_ns).preparation
@@ -359,11 +328,16 @@ def _read(
         raise explained(error, source.path, first, energies, heights, side, selection)
     if max_pulses is not None and n > max_pulses:
         _thin(sets, drawn, max_pulses)
-    prepared = _joined(sets)
-    rows = np.concatenate([np.zeros(0, np.int64), *whole_rows])
-    return _Read(
-        recipe, prepared, first, energies, heights, baselines, whole, rows, lowest, highest
-    )
+    if side == "measured" and not file.insist:
+        require_sense(source.path, first, energies, heights)
+    if highest >= lowest and (first == first.round()).all():
+        counts = int(lowest), int(highest)
+    energies = energies[np.isfinite(energies)]
+    inputs = InputSet(
+        _joined(sets), source.dt_ns, source.path, energies, recipe, None, file.options,
+        recorded_detector(source), None, counts,
+    )  # fmt: skip
+    return inputs, baselines, whole, whole_rows
 
 
 def _joined(sets: list[Prepared]) -> Prepared:

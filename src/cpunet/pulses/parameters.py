@@ -7,109 +7,29 @@ equal the values of the experiments' production analysis.
 Where pulses cross half of their maximum, and what they are when shifted by parts of a sample,
 is given by the cubic spline through the samples: linear interpolation would smooth the edge.
 
-Compiled loops of the current amplitude: several pulses in, their numbers out.
-
-Each step of dspeed's moving windows depends on the one before, so a single pulse leaves most of
-a processor idle.  Here each step of the current amplitude is done for `LANES` pulses at once.
-All its values are float32 and result from the same operations in the same order as in dspeed's
-``upsampler`` and ``moving_window_multi``, so the results are equal to the last bit.
-
-All sums of the other parameters are float64.  An undefined value is NaN and never raises an
-exception.
+The current amplitude is a product of matrices in float32; all other sums are float64.  An
+undefined value is NaN and never raises an exception.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from functools import cache
+from importlib.util import find_spec, module_from_spec
+from threading import Lock
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
-LANES = 32
-
-_compiled: Any = kernel(error_model="numpy")
-
-
-@_compiled
-def average(values, steps, averaged):  # type: ignore[no-untyped-def]
-    """Mean of each value and the `steps` - 1 before it, in reverse order.
-
-    The windows alternate between looking back and ahead: on reversed values, back is ahead.
-    """
-    width, last, total = np.float32(steps), len(values) - 1, values[0].copy()
-    averaged[last] = total
-    for i in range(1, steps):
-        for lane in range(len(total)):
-            total[lane] += (values[i, lane] - values[0, lane]) / width
-            averaged[last - i, lane] = total[lane]
-    leaving = values[: len(values) - steps]
-    for i in range(len(leaving)):
-        for lane in range(len(total)):
-            total[lane] += (values[i + steps, lane] - leaving[i, lane]) / width
-            averaged[last - steps - i, lane] = total[lane]
-
-
-@_compiled
-def averaged_maxima(current, first, samples, upsampling, widths, ends):  # type: ignore[no-untyped-def]
-    """Maximum of the averaged current of each pulse in the `samples` samples from `first` on.
-
-    Parameters
-    ----------
-    current
-        Float32, shape ``(n, length - 1)``.
-    first, samples
-        First sample that is averaged, shape ``(n,)``, and number of averaged samples.
-    upsampling
-        Steps per sample.
-    widths
-        Widths of the successive moving averages in steps.
-    ends
-        Steps at each end that are excluded from the search.
-
-    Returns
-    -------
-    numpy.ndarray
-        Float32, shape ``(n,)``; NaN if a searched value is NaN.
-    """
-    maxima = np.empty(len(current), np.float32)
-    n, fine = len(current), (samples - 1) * upsampling
-    values = np.empty((fine, LANES), np.float32)
-    averaged = np.empty((fine, LANES), np.float32)
-    highest = np.empty(LANES, np.float32)
-    for begin in range(0, n, LANES):
-        for sample in range(samples):
-            for lane in range(LANES):
-                row = min(begin + lane, n - 1)  # repeat the last pulse in unused lanes
-                highest[lane] = current[row, first[row] + sample]
-            # dspeed centres each sample on its steps
-            start = sample * upsampling - upsampling // 2
-            for i in range(max(start, 0), min(start + upsampling, fine)):
-                values[i] = highest
-        for width in widths:
-            average(values, width, averaged)
-            values, averaged = averaged, values
-        highest[:] = values[ends]
-        for i in range(ends, fine - ends):
-            for lane in range(LANES):
-                # a NaN remains
-                if not values[i, lane] <= highest[lane]:
-                    highest[lane] = values[i, lane]
-        for lane in range(min(LANES, n - begin)):
-            maxima[begin + lane] = highest[lane]
-    return maxima
-
-
 Values = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -137,38 +57,9 @@ AVERAGE_NS, AVERAGES, REFERENCE_NS = 48.0, 3, 16.0
 # `current_amplitude`.
 SHORTER = 2.5
 # Time around the steepest point of a pulse that is searched first for the maximum.
-NEIGHBOURHOOD_NS = 1536.0
+NEIGHBOURHOOD_NS = 768.0
 
 BLOCK = 256  # pulses per block: bounds memory and keeps the buffers in the cache
-
-
-class Averages(NamedTuple):
-    """The averages of the current at a sampling period.
-
-    Parameters
-    ----------
-    steps
-        Steps per sample.
-    widths
-        Widths of the successive moving averages in steps.
-    """
-
-    steps: int
-    widths: tuple[int, ...]
-
-    @classmethod
-    def at(cls, dt_ns: float) -> Averages:
-        """Those for a sampling period in ns."""
-        steps = max(1, round(dt_ns))
-        further = math.sqrt(SHORTER * max(REFERENCE_NS**2 - dt_ns**2, 0.0))
-        times = [AVERAGE_NS] * AVERAGES + [further] * (further > 0)
-        return cls(steps, tuple(max(1, round(time * steps / dt_ns)) for time in times))
-
-    @property
-    def reach(self) -> int:
-        """Samples that they cover on either side."""
-        # they look back and ahead by turns
-        return math.ceil(sum(self.widths[::2]) / self.steps + 1.5)
 
 
 def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
@@ -179,7 +70,7 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     with the moving average :math:`h` over 48 ns in steps of 1 ns, as defined by Majorana
     (arXiv:1901.05388).  At 16 ns it is the result of dspeed's processors
     ``avg_current(1)`` → ``upsampler(16)`` → ``moving_window_multi(48, 3, 0)`` → ``min_max``,
-    whose arithmetic is repeated here for several pulses at once.
+    to single precision, but without averages that reach beyond the ends of a pulse.
 
     At 16 ns, the difference over a sample and holding it for a sample average the current, too,
     as does the digitiser where samples are means.  At a shorter period :math:`\Delta t` a
@@ -187,10 +78,10 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     variance that they lack: of two such averages for samples at a time, of three for means.
     Divided by the period, the amplitude of an edge is then the same within half a percent.
 
-    Each value of that chain is a positively weighted mean of the current some samples
-    away.  The chain is therefore first run only around the steepest point of a
-    pulse.  If the current elsewhere exceeds the maximum of that part, the whole pulse is
-    processed.
+    Each averaged value is a positively weighted mean of the current some samples away, see
+    `current_amplitude_kernel`.  Therefore only the part around the steepest point of a pulse is
+    averaged first.  If the current elsewhere exceeds the maximum of that part, the whole pulse
+    is.
 
     Parameters
     ----------
@@ -219,29 +110,32 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
     >>> current_amplitude(ramp[np.newaxis], dt_ns=16).round(6)
     array([0.005])
     """
-    averages = Averages.at(dt_ns)
-    (steps, widths), reach = averages, averages.reach
-    near = max(round(NEIGHBOURHOOD_NS / dt_ns), 5 * reach)
+    weights = current_amplitude_kernel(dt_ns)
+    reach = weights.shape[1] // 2
+    near = max(round(NEIGHBOURHOOD_NS / dt_ns), 7 * reach)
 
-    def of_block(block: FloatArray) -> Values:
+    def highest(current: FloatArray) -> FloatArray:
+        around = np.lib.stride_tricks.sliding_window_view(current, 2 * reach + 1, axis=1)
+        means = around.reshape(-1, 2 * reach + 1) @ weights.T
+        return np.asarray(means.reshape(len(current), -1).max(axis=1))
+
+    def one_block(block: FloatArray) -> Values:
         current = np.diff(block, axis=1)
-        current[np.isnan(block).any(axis=1)] = np.nan
-        samples, start = current.shape[1], np.zeros(len(current), np.int64)
-        highest = partial(averaged_maxima, upsampling=steps, widths=widths)
-        if samples <= near:
-            return np.asarray(highest(current, start, samples, ends=0), float)
-        first = np.clip(current.argmax(axis=1) - near // 2, 0, samples - near)
-        # near the ends of the neighbourhood the averages differ from those of the whole pulse
-        values = np.asarray(highest(current, first, near, ends=reach * steps), float)
-        # samples that those averages do not reach
-        after = np.arange(samples) - first[:, np.newaxis]
-        inside = (after >= 2 * reach) & (after < near - 2 * reach)
-        elsewhere = np.where(inside, -np.inf, current).max(axis=1)
-        if len(unsure := np.flatnonzero(~(elsewhere <= values))):
-            values[unsure] = highest(current[unsure], start, samples, ends=0)
+        samples = current.shape[1]
+        n = min(near, samples)
+        first = np.clip(current.argmax(axis=1) - n // 2, 0, samples - n)[:, np.newaxis]
+        part = np.take_along_axis(current, first + np.arange(n), axis=1)
+        values = highest(part).astype(float)
+        # other averages are less than the current that these do not reach, or in part
+        elsewhere = current.copy()
+        np.put_along_axis(elsewhere, first + np.arange(2 * reach, n - 2 * reach), -np.inf, 1)
+        if len(unsure := np.flatnonzero(~(elsewhere.max(axis=1) <= values))):
+            values[unsure] = highest(current[unsure])
         return values
 
-    return _by_blocks(of_block, waveforms, max(widths) // steps + 3)
+    # samples and averages near the steepest point are as many more as the period is shorter
+    size = max(1, round(BLOCK * min(1.0, dt_ns / REFERENCE_NS)))
+    return _by_blocks(one_block, waveforms, 2 * reach + 2, size)
 
 
 def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
@@ -251,23 +145,23 @@ def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
     -------
     numpy.ndarray
         Float32, shape ``(steps, 2 * reach + 1)``: for each step within a sample, the weights of
-        the current from `reach` samples before to as many after it, see `Averages`.
+        the current from `reach` samples before to as many after it.
     """
-    averages = Averages.at(dt_ns)
-    steps, reach = averages.steps, averages.reach
-    fine = np.zeros(((4 * reach + 1) * steps, 1), np.float32)
-    centre = 2 * reach * steps
-    fine[centre - steps // 2 : centre - steps // 2 + steps] = 1  # a current of one sample
-    smooth = np.empty_like(fine)
-    for width in averages.widths:
-        average(fine, width, smooth)
-        fine, smooth = smooth, fine
-    # each average reverses the order
-    forward = fine[::-1] if len(averages.widths) % 2 else fine
-    around = forward.reshape(-1, steps)[reach : 3 * reach + 1]
+    steps = max(1, round(dt_ns))
+    further = math.sqrt(SHORTER * max(REFERENCE_NS**2 - dt_ns**2, 0.0))
+    times = [AVERAGE_NS] * AVERAGES + [further] * (further > 0)
+    widths = [max(1, round(time * steps / dt_ns)) for time in times]
+    reach = math.ceil(sum(widths[::2]) / steps + 1.5)
+    # a current of one sample, centred on its steps; averages over times before, after, ...
+    response, first = np.ones(steps), reach * steps - steps // 2
+    for number, width in enumerate(widths):
+        response = np.convolve(response, np.full(width, 1 / width))
+        first -= (width - 1) * (number % 2)
+    fine = np.zeros((2 * reach + 1) * steps, np.float32)
+    fine[first : first + len(response)] = response
     # the response at sample j to a unit current at sample 0 is the weight of the current j
     # samples earlier
-    return np.ascontiguousarray(around[::-1].T)
+    return np.ascontiguousarray(fine.reshape(-1, steps)[::-1].T)
 
 
 def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Values:
@@ -311,9 +205,9 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     """
 
     def one_block(block: FloatArray) -> Values:
-        end = block.argmax(axis=1)
-        height = np.take_along_axis(block, end[:, np.newaxis], axis=1)
-        start = crossings(block, start_fraction * height, end)[:, 0]
+        # the fraction in single precision, as of the pulse
+        end, levels = block.argmax(axis=1), start_fraction * block.max(axis=1)
+        start = crossings(block.astype(float), levels.astype(float), end)
         return np.asarray((end - start) * dt_ns)
 
     return _by_blocks(one_block, waveforms, shortest=2)
@@ -398,12 +292,15 @@ def pulse_parameters(
 
 
 def _by_blocks(
-    function: Callable[[FloatArray], Values], waveforms: FloatArray, shortest: int
+    function: Callable[[FloatArray], Values],
+    waveforms: FloatArray,
+    shortest: int,
+    size: int = BLOCK,
 ) -> Values:
     """Apply `function` to blocks of pulses of at least `shortest` samples."""
     require_pulses(waveforms, shortest)
     values = np.empty(len(waveforms))
-    for rows in blocks(len(waveforms), BLOCK):
+    for rows in blocks(len(waveforms), size):
         values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
     return values
 
@@ -425,24 +322,33 @@ def _spline(near: Sequence[Values], t: Values) -> Values:
     return np.asarray(a + b + c + d)
 
 
-def crossings(waveforms: FloatArray, levels: FloatArray, stops: Integers) -> Values:
+_IMPORT = Lock()
+
+
+@cache
+def processors() -> tuple[Any, ...]:
+    """Dspeed's processors, without its reading of files, which takes seconds to import."""
+    with _IMPORT:
+        bare = "dspeed" not in sys.modules
+        if bare and (spec := find_spec("dspeed")) is not None:
+            sys.modules["dspeed"] = module_from_spec(spec)  # its folder alone, nothing is run
+        try:
+            from dspeed.processors.pole_zero import pole_zero
+            from dspeed.processors.time_point_thresh import interpolated_time_point_thresh
+            from dspeed.processors.trap_filters import trap_norm, trap_pickoff
+        finally:
+            for name in [m for m in sys.modules if bare and m.partition(".")[0] == "dspeed"]:
+                del sys.modules[name]
+    return pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff
+
+
+def crossings(waveforms: Values, levels: Values, stops: npt.NDArray[np.int64]) -> Values:
     """Times in samples of the last crossings of levels before a sample; NaN without any.
 
     They are those of dspeed's ``interpolated_time_point_thresh``, backward and with straight
-    lines between samples, of waveforms ``(n, length)`` and levels ``(n, levels)``, searched
-    from the samples `stops`.
+    lines between samples, of waveforms ``(..., length)``, a level and a sample for each.
     """
-    times, sample = np.full(levels.shape, np.nan), np.arange(waveforms.shape[1] - 1)
-    searched = (sample >= 1) & (sample < stops[:, np.newaxis])
-    for column, level in enumerate(levels.T):
-        below, above = waveforms < level[:, np.newaxis], waveforms > level[:, np.newaxis]
-        crosses = (below[:, :-1] & ~below[:, 1:]) | (above[:, :-1] & ~above[:, 1:])
-        crosses &= searched
-        last = len(sample) - 1 - crosses[:, ::-1].argmax(axis=1)
-        rows = np.flatnonzero(crosses[np.arange(len(last)), last])
-        low, high = (waveforms[rows, last[rows] + i].astype(float) for i in (0, 1))
-        times[rows, column] = last[rows] + (level[rows].astype(float) - low) / (high - low)
-    return times
+    return np.asarray(processors()[1](waveforms, levels, stops, 0, ord("l")))
 
 
 def last_below(

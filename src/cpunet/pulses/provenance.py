@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses, line_slope
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import label_peaks, suggested_calibration
 from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
@@ -84,17 +85,12 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     """
     side = recorded_side(source)
     if side is None and not insist:
-        side = apparent_side(next(iter(source.blocks(_FIRST_PULSES))).waveforms)
-    refuse_other_side(side, source.path, wanted, remedy)
-
-
-def refuse_other_side(side: Recognised | None, path: Path, wanted: Kind, remedy: str) -> None:
-    """Refuse pulses of a file that are of the other side; see `require_side`."""
+        side = apparent_side(next(source.blocks(_FIRST_PULSES)).waveforms)
     if side is not None and side.side != wanted:
         begin = " If" if remedy.endswith("?") else "; if"
         sure = "" if side.certain else f"{begin} they are {wanted}, say so with `insist`"
         raise CpunetError(
-            f"{path}: given as {wanted} pulses, but these {side.why}", f"{remedy}{sure}"
+            f"{source.path}: given as {wanted} pulses, but these {side.why}", f"{remedy}{sure}"
         )
 
 
@@ -247,12 +243,10 @@ def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
     inside = (top >= config.samples_before) & (top + config.samples_after <= whole.length)
     start = top[inside, np.newaxis] - config.samples_before
     windows = np.take_along_axis(traces[inside], start + np.arange(config.length), axis=1)
-    tails = windows[:, -config.decay_fit_samples :].astype(float)
-    tails -= windows[:, : config.baseline_samples].mean(axis=1, keepdims=True, dtype=float)
-    tails, slope = tails[tails.min(axis=1) > 0], 0.0
-    if len(tails) >= MIN_NUMBER:
-        slopes = np.log(tails) @ line_slope(tails.shape[1])
-        slope = float(np.median(slopes)) * 1e3 / whole.dt_ns
+    baselines = windows[:, : config.baseline_samples].mean(axis=1, keepdims=True, dtype=float)
+    slopes = tail_slope(windows - baselines, whole.dt_ns, config.decay_fit_samples)
+    slopes = slopes[np.isfinite(slopes)]
+    slope = float(np.median(slopes)) / 1e3 if len(slopes) >= MIN_NUMBER else 0.0  # in 1/µs
     return [
         ("decay", f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"),
         ("noise", f"{noise} (RMS of a baseline, median)"),

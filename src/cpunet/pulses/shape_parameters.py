@@ -11,10 +11,6 @@ a channel; pulses that do not decay are not corrected.  The height is that of a 
 
 from __future__ import annotations
 
-import sys
-from functools import cache
-from importlib.util import find_spec, module_from_spec
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import hist
@@ -31,6 +27,7 @@ from cpunet.pulses.parameters import (
     crossings,
     current_amplitude,
     drift_time,
+    processors,
     tail_slope,
 )
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
@@ -42,13 +39,12 @@ if TYPE_CHECKING:
 # Rise and flat top of the trapezoid, and times over which charge is compared with that later.
 TRAP_NS, LATE_NS, EFFECTIVE_NS = 2000.0, 2000.0, 3000.0
 T0_RISE_NS, T0_FALL_NS = 128.0, 2000.0  # of the filter that finds the begin of a pulse
-_IMPORT = Lock()
 SILENT = 1e-4  # heights: noise of pulses without any
 FRACTIONS = {"tp_99": 0.99, "tp_90": 0.9, "tp_80": 0.8, "tp_50": 0.5, "tp_10": 0.1}
 
 
 def legend_parameters(
-    waveforms: Values, decay_ns: float, noise: Values, dt_ns: float, aligned: int
+    waveforms: FloatArray, decay_ns: float, noise: Values, dt_ns: float, aligned: int
 ) -> dict[str, Values]:
     r"""Times in ns from the aligned sample, and areas over the height in ns.
 
@@ -72,8 +68,7 @@ def legend_parameters(
     aligned
         Sample from which times count.
     """
-    with _IMPORT:
-        pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff = _processors()
+    pole_zero, _, trap_norm, trap_pickoff = processors()
     corrected = np.asarray(waveforms, float)
     if np.isfinite(decay_ns):
         corrected = pole_zero(corrected, decay_ns / dt_ns)
@@ -85,19 +80,15 @@ def legend_parameters(
     times: dict[str, Values] = {}
     last: Values = top.astype(float)
     for name, fraction in FRACTIONS.items():
-        times[name] = last = interpolated_time_point_thresh(
-            corrected, fraction * height, np.ceil(np.nan_to_num(last)).astype(int), 0, ord("l")
-        )
+        begin = np.ceil(np.nan_to_num(last)).astype(int)
+        times[name] = last = crossings(corrected, fraction * height, begin)
     # behind dspeed's ``t0_filter``: the mean just now minus that before
     rise, fall = round(T0_RISE_NS / dt_ns), round(T0_FALL_NS / dt_ns)
     ramp = 2 * np.arange(rise, 0, -1) / (rise * (rise + 1))
     weights = np.concatenate([ramp, np.full(fall, -1 / fall)])
     filtered = fftconvolve(corrected, weights[np.newaxis], axes=1)[:, : corrected.shape[1]]
     filtered[:, : len(weights)] = 0.0  # which needs samples before the record
-    threshold = np.maximum(noise, SILENT)
-    times["tp_0_est"] = interpolated_time_point_thresh(
-        filtered, threshold, filtered.argmax(axis=1), 0, ord("l")
-    )
+    times["tp_0_est"] = crossings(filtered, np.maximum(noise, SILENT), filtered.argmax(axis=1))
 
     areas = {}
     for name, begin, over_ns in (
@@ -109,22 +100,6 @@ def legend_parameters(
     times = {name: (time - aligned) * dt_ns for name, time in times.items()}
     times["rise_time"] = times["tp_90"] - times.pop("tp_10")
     return times | areas
-
-
-@cache
-def _processors() -> tuple[Any, ...]:
-    """Dspeed's processors, without its reading of files, which takes seconds to import."""
-    bare = "dspeed" not in sys.modules
-    if bare and (spec := find_spec("dspeed")) is not None:
-        sys.modules["dspeed"] = module_from_spec(spec)  # its folder alone, nothing is run
-    try:
-        from dspeed.processors.pole_zero import pole_zero
-        from dspeed.processors.time_point_thresh import interpolated_time_point_thresh
-        from dspeed.processors.trap_filters import trap_norm, trap_pickoff
-    finally:
-        for name in [m for m in sys.modules if bare and m.partition(".")[0] == "dspeed"]:
-            del sys.modules[name]
-    return pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff
 
 
 # Fractions of the maximum at which a pulse is timed.
@@ -148,7 +123,9 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
         for name, fraction in TIME_POINTS.items()
     },
     **{
-        name: Parameter(f"Rise time {int(begin[1:])}–{end[1:]} %", "ns")
+        name: Parameter(
+            f"Rise time {100 * TIME_POINTS[begin]:g}–{100 * TIME_POINTS[end]:g} %", "ns"
+        )
         for name, (begin, end) in RISE_TIMES.items()
     },
     "tp_0_est": Parameter("tp_0_est", "ns"),
@@ -220,37 +197,39 @@ def all_parameters(
             f"{preparation.length}; prepare them first"
         )
     values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
-    fractions = np.array([*TIME_POINTS.values()])
+    if decay_ns is None:
+        finite = np.isfinite(pulses.waveforms).all(axis=1)
+        decay_ns = median_decay_ns(
+            tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
+        )
+    lever = np.arange(preparation.baseline_samples) - (preparation.baseline_samples - 1) / 2
     for rows in blocks(len(pulses), BLOCK):
-        block = np.array(pulses.waveforms[rows], dtype=np.float32, order="C")
-        damaged = ~np.isfinite(block).all(axis=1)
-        block[damaged] = np.nan  # treat infinities as NaN
+        good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
+        block = np.array(pulses.waveforms[good], dtype=np.float32, order="C")
         # overflows become NaN below
         with np.errstate(all="ignore"):
             columns = {
                 "current_amplitude": current_amplitude(block, dt_ns)
                 if amplitudes is None
-                else np.where(damaged, np.nan, amplitudes[rows]),
+                else amplitudes[good],
                 "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
                 "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
-                "baseline_rms": _rms_about_line(block[:, : preparation.baseline_samples]),
             }
-            height = block.max(axis=1)
-            positive = height > 0  # False for NaN
-            stop = np.where(positive, block.argmax(axis=1), 0)
-            levels = np.outer(np.where(positive, height, np.nan), fractions)
-            samples = crossings(block, levels.astype(np.float32), stop)
+            baselines, n = block[:, : preparation.baseline_samples].astype(float), lever.size
+            baselines -= baselines.mean(axis=1, keepdims=True)
+            baselines -= np.outer(baselines @ lever / (lever @ lever), lever)  # about a line
+            columns["baseline_rms"] = np.sqrt((baselines**2).sum(axis=1) / (n - 2))
+            height, levels = block.max(axis=1), np.array([*TIME_POINTS.values()])
+            levels = np.outer(np.where(height > 0, height, np.nan), levels).astype(np.float32)
+            top = block.argmax(axis=1)[:, np.newaxis]
+            samples = crossings(block[:, np.newaxis].astype(float), levels.astype(float), top)
             times = (samples - preparation.samples_before) * dt_ns
             columns |= dict(zip(TIME_POINTS, times.T, strict=True))
             for name, (begin, end) in RISE_TIMES.items():
                 columns[name] = columns[end] - columns[begin]
         for name, column in columns.items():
-            values[name][rows] = np.where(np.isfinite(column), column, np.nan)
-    if decay_ns is None:
-        decay_ns = median_decay_ns(values["tail_slope"])
-    for rows in blocks(len(pulses), BLOCK):
-        good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
-        block, noise = pulses.waveforms[good], values["baseline_rms"][good]
+            values[name][good] = np.where(np.isfinite(column), column, np.nan)
+        noise = values["baseline_rms"][good]
         how = (decay_ns, noise, dt_ns, preparation.samples_before)
         for name, column in legend_parameters(block, *how).items():
             values[name][good] = column
@@ -262,19 +241,6 @@ def median_decay_ns(slopes: Values) -> float:
     finite = slopes[np.isfinite(slopes)]
     slope = float(np.median(finite)) if finite.size else 0.0
     return -1e6 / slope if slope < 0 else np.inf
-
-
-def _rms_about_line(baseline: FloatArray) -> Values:
-    """RMS of the residuals of a straight line, over its degrees of freedom."""
-    samples = baseline.shape[1]
-    if samples < 3:
-        return np.full(len(baseline), np.nan)
-    lever = np.arange(samples) - (samples - 1) / 2
-    values = baseline.astype(float)
-    values -= values.mean(axis=1, keepdims=True)
-    values -= np.outer(values @ lever / (lever @ lever), lever)
-    rms: Values = np.sqrt((values**2).sum(axis=1) / (samples - 2))
-    return rms
 
 
 MAX_BINS = 49

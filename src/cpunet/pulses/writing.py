@@ -273,7 +273,7 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     if (group := source.group) is None:
         for name, column in source.columns.items():
             if not _is_same(name, column.units, own):
-                readers[name] = partial(_from_column, column)
+                readers[name] = partial(_of_column, column)
     else:
         waveforms, size = source.name.rpartition("/")[2], source.n_all or source.n_pulses or 0
         with one_line(source.path):
@@ -300,6 +300,10 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     return read, left_out
 
 
+def _of_column(column: Column, start: int, n: int) -> LGDO:
+    return _column((column.read(start, start + n), column.units))
+
+
 def _rows(
     item: h5py.Group | h5py.Dataset, chosen: npt.NDArray[Any] | None, start: int, n: int
 ) -> LGDO:
@@ -317,11 +321,6 @@ def _rows(
     if rows.dtype.kind == "O":
         attrs["datatype"] = "array<1>{string}"
     return Array(rows, attrs=attrs)
-
-
-def _from_column(column: Column, start: int, n: int) -> Array:
-    attrs = {"units": column.units} if column.units else {}
-    return Array(np.asarray(column.read(start, start + n)), attrs=attrs)
 
 
 def _is_same(name: str, units: str, own: Collection[str]) -> bool:

@@ -1,4 +1,4 @@
-"""Arrays of pulses: in memory, NumPy's ``.npz`` and ``.npy``, siggen's ``.spe``, and pickles.
+"""Arrays of pulses: in memory, NumPy's ``.npz`` and ``.npy``, and pickles.
 
 The authors of CPU-Net published files of pickled dictionaries.  The layout is that of the
 README of their repository (kevinhbhimani/CPU-Net on GitHub) for the record
@@ -12,7 +12,6 @@ arrays and numbers are allowed.
 from __future__ import annotations
 
 import pickle
-import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -30,10 +29,6 @@ from cpunet.pulses.reading.source import PulseSource
 from cpunet.tables import shortened
 
 _WAVEFORMS = ("waveform", "waveforms", "values")
-
-# Radware's spectrum, written by siggen's `stester`: one Fortran record of 24 bytes
-# (8 of title, channels, rows, two unused), then one of float32, each enclosed by its length.
-_SPE = struct.Struct("<i8siiiiii")
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -107,22 +102,6 @@ def read_numpy(options: PulseFile) -> PulseSource:
     return PulseSource.of_array(options.path, "NumPy", name, arrays[name], columns)
 
 
-def read_spectrum(options: PulseFile) -> PulseSource:
-    """Open a ``.spe`` file: one pulse, or one per row of a two-dimensional spectrum."""
-    path, size = options.path, options.path.stat().st_size
-    with path.open("rb") as file:
-        _, _, length, n_rows, _, _, _, n_bytes = _SPE.unpack(file.read(_SPE.size))
-    if length < 1 or n_rows < 1 or n_bytes != 4 * length * n_rows:
-        raise CpunetError(f"{path}: its header is damaged; write it again")
-    if size < _SPE.size + n_bytes:
-        raise CpunetError(
-            f"{path}: is cut off after {max(size - _SPE.size, 0) // 4} of "
-            f"{length * n_rows} samples; write it again"
-        )
-    values = np.memmap(path, "<f4", "r", _SPE.size, (n_rows, length))
-    return PulseSource.of_array(path, "siggen spectrum", "", values, {})
-
-
 # NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
 _ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
     (f"numpy.{core}.{module}", name)
@@ -182,11 +161,8 @@ def read_pickles(options: PulseFile) -> PulseSource:
     for name in sorted(set().union(*numbers)):
         values = np.array([row.get(name, np.nan) for row in numbers])
         columns[name] = Column.of(values, "keV" if name == "energy" else "")
-    hint = "CPU-Net's pulses are sampled every 16 ns"
     waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
-    return PulseSource.of_array(
-        path, "pickled pulses", "", waveforms, columns, period_hint=hint
-    )
+    return PulseSource.of_array(path, "pickled pulses", "", waveforms, columns)
 
 
 def _entries(path: Path) -> Iterator[Any]:
@@ -206,3 +182,6 @@ def _entries(path: Path) -> Iterator[Any]:
             some = value if isinstance(value, list | tuple) else [value]
             n_read += len(some)
             yield from some
+
+
+READERS = {"memory": read_memory, "NumPy": read_numpy, "pickle": read_pickles}

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.units import factor
 
 if TYPE_CHECKING:
     from cpunet.hdf5_files import Read
@@ -66,6 +67,20 @@ class Column:
         if self.constant or len(self) == 1:
             return self
         return replace(self, read=partial(some_of, self.read, rows), size=len(rows))
+
+    def to(self, unit: str) -> Self | None:
+        """The values in ns or keV, see `cpunet.units`; None if they are in no such units."""
+        by = factor(self.units, unit)
+        return None if by is None else self.times(by, unit)
+
+    def times(self, by: float, units: str) -> Self:
+        """The values times a factor, in other units."""
+        read = self.read
+        return replace(
+            self,
+            read=lambda start, stop: by * np.asarray(read(start, stop), np.float64),
+            units=units,
+        )
 
     def require_length(self, path: Path, name: str, n_pulses: int | None) -> None:
         """Raise a `CpunetError` unless it has a value for each pulse, or one for all."""

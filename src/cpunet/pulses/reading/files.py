@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -174,13 +172,7 @@ class PulseFile:
         given = {name: getattr(self, name) for name in _OPTIONS}
         return {name: value for name, value in given.items() if value is not None}
 
-    def chosen_of(
-        self,
-        tables: list[str],
-        kind: str,
-        kinds: str,
-        remedy: str = "choose one with `table` (`sim_table`, `data_table`)",
-    ) -> str:
+    def chosen_of(self, tables: list[str], kind: str, kinds: str) -> str:
         """The table that the user chose, or the only table.
 
         Parameters
@@ -189,8 +181,6 @@ class PulseFile:
             Tables in the file, at least one.
         kind, kinds
             What a table and several are called.
-        remedy
-            What to do if nothing was chosen.
 
         Raises
         ------
@@ -201,7 +191,8 @@ class PulseFile:
             if len(tables) == 1:
                 return tables[0]
             raise CpunetError(
-                f"{self.path}: {len(tables)} {kinds} ({shortened(tables)}); {remedy}"
+                f"{self.path}: {len(tables)} {kinds} ({shortened(tables)})",
+                "choose one with `table` (`sim_table`, `data_table`)",
             )
         if self.place not in tables:
             raise CpunetError(
@@ -211,11 +202,18 @@ class PulseFile:
 
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
-        reader = "arrays.read_memory"
-        if self.pulses is None:
-            reader = FORMATS[recognise(self.path)][1]
-        module, _, name = reader.partition(".")
-        source: PulseSource = getattr(import_module(f"{__package__}.{module}"), name)(self)
+        # HDF5 and FlashCam take a fifth of a second each to import
+        read: Callable[[PulseFile], PulseSource]
+        format_ = "memory" if self.pulses is not None else recognise(self.path)
+        if format_ == "HDF5":
+            from cpunet.pulses.reading.hdf5 import read_hdf5 as read
+        elif format_ == "FlashCam":
+            from cpunet.pulses.reading.flashcam import read_flashcam as read
+        else:
+            from cpunet.pulses.reading import arrays
+
+            read = arrays.READERS[format_]
+        source = read(self)
         try:
             return source.resolved(self)
         except BaseException:
@@ -239,56 +237,36 @@ def pulse_file(
     how = asdict(options) | {"insist": insist}
     if isinstance(source, str | Path):
         return PulseFile(Path(source), **how)
-    given = ", ".join(name for name, value in how.items() if value)
-    if given and isinstance(source, PulseFile | Pulses):
+    if not isinstance(source, PulseFile | Pulses):
+        raise CpunetError(
+            f"{type(source).__name__}: are no pulses",
+            "give a path, a cpunet.PulseFile, or cpunet.Pulses.of(array, dt_ns=…, "
+            "energy_kev=…)",
+        )
+    if given := ", ".join(name for name, value in how.items() if value):
         raise CpunetError(
             f"{given}: is an option of a path", "give it to the PulseFile, or leave it out"
         )
     if isinstance(source, PulseFile):
         return source
-    if isinstance(source, Pulses):
-        return PulseFile(Path("pulses in memory"), pulses=source)
-    raise CpunetError(
-        f"{type(source).__name__}: are no pulses",
-        "give a path, a cpunet.PulseFile, or cpunet.Pulses.of(array, dt_ns=…, energy_kev=…)",
-    )
+    return PulseFile(Path("pulses in memory"), pulses=source)
 
 
-# Suffixes, reader and first bytes of each format.  Readers are imported when needed: HDF5 and
-# FlashCam take a fifth of a second each.
-FORMATS: dict[str, tuple[str, str, Callable[[bytes], bool]]] = {
-    # MATLAB writes 512 bytes of its own before the HDF5 part
-    "HDF5": (
-        ".lh5 .h5 .hdf5 .hdf", "hdf5.read_hdf5",
-        lambda head: b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:520]),
-    ),
-    "FlashCam": (
-        ".fcio", "flashcam.read_flashcam", lambda head: head[4:12] == b"FlashCam",
-    ),
-    "NumPy": (
-        ".npz .npy", "arrays.read_numpy",
-        lambda head: head.startswith((b"\x93NUMPY", b"PK\x03\x04")),
-    ),
-    "pickle": (
-        ".pickle .pkl", "arrays.read_pickles",
-        lambda head: head[0] == 0x80 and head[1:2] in (b"\2", b"\3", b"\4", b"\5"),
-    ),
-    # Fortran record marks around the 24 bytes of a Radware header
-    "spectrum": (
-        ".spe", "arrays.read_spectrum",
-        lambda head: len(head) >= 36 and struct.unpack_from("<i24xi", head) == (24, 24),
-    ),
-}  # fmt: skip
-
+# First bytes of each format
+_FORMATS = {
+    "HDF5": rb"(.{512})?\x89HDF\r\n\x1a\n",  # MATLAB writes 512 bytes of its own before it
+    "FlashCam": rb".{4}FlashCam",
+    "NumPy": rb"\x93NUMPY|PK\x03\x04",
+    "pickle": rb"\x80[\2-\5]",
+}
 _AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
-_FOREIGN = {  # what cannot be read, by its first bytes, and what to do
-    b"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
-    b"MATLAB 5.0": ("MATLAB 5", "save it with -v7.3"),
-    b"PAR1": ("Parquet", f"write it with {_AS_NPZ}"),
-} | dict.fromkeys(
-    (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd"), ("compressed", "unpack it")
-)
-
+_FOREIGN = {  # what cannot be read, and what to do
+    rb"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
+    rb"MATLAB 5\.0": ("MATLAB 5", "save it with -v7.3"),
+    rb"PAR1": ("Parquet", f"write it with {_AS_NPZ}"),
+    rb"\x1f\x8b|BZh|\xfd7zXZ|\x28\xb5\x2f\xfd": ("compressed", "unpack it"),
+    rb"[\xe0-\xef]\xca": ("CAEN CoMPASS", "convert it with legend-daq2lh5"),
+}
 _HEAD_BYTES = 520
 
 
@@ -303,8 +281,7 @@ def open_pulses(
     """Open a file of pulses; the format is recognised by its content.
 
     Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, FlashCam
-    ``.fcio``, NumPy ``.npz`` and ``.npy``, siggen's ``.spe``, the Majorana Demonstrator's data
-    release for machine learning, and CPU-Net's pickled pulses.
+    ``.fcio``, NumPy ``.npz`` and ``.npy``, and CPU-Net's pickled pulses.
 
     Parameters
     ----------
@@ -313,8 +290,8 @@ def open_pulses(
     table
         Location of the waveforms, needed only if there are several: a table or waveform
         column of an LH5 file, a group or dataset of an HDF5 file, an array of an ``.npz``, a
-        channel of an ``.fcio``, a detector of the Majorana release.  Rows of a table that
-        holds several channels are chosen by a column, as ``raw/channel=3``.
+        channel of an ``.fcio``.  Rows of a table that holds several channels are chosen by a
+        column, as ``raw/channel=3``.
     energy
         Column of the energies, or ``FILE:path/to/column`` for a column of another
         HDF5 file of the same events, such as LEGEND's hit tier.
@@ -341,8 +318,7 @@ def open_pulses(
 def table_sizes(path: str | Path) -> dict[str, int | None]:
     """Waveform tables of an LH5 or other HDF5 file; none of formats without tables.
 
-    For the Majorana release these are the detectors, for FlashCam files the channels with
-    traces.
+    For FlashCam files these are the channels with traces.
 
     Returns
     -------
@@ -363,11 +339,10 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
     if format_ != "HDF5":
         return {}
     from cpunet.hdf5_files import opened
-    from cpunet.pulses.reading.hdf5 import channel_tables, detectors, is_majorana
+    from cpunet.pulses.reading.hdf5 import channel_tables
 
     with opened(path) as file:
-        tables = detectors(file) if is_majorana(file) else channel_tables(path, file)
-        return dict.fromkeys(tables)
+        return dict.fromkeys(channel_tables(path, file))
 
 
 def recognise(path: Path) -> str:
@@ -376,8 +351,7 @@ def recognise(path: Path) -> str:
     Raises
     ------
     CpunetError
-        If there is no such file, or it is a folder, empty, of an unknown format, or of another
-        format than its suffix says.
+        If there is no such file, or it is a folder, empty, or of an unknown format.
     """
     try:
         if path.is_dir():
@@ -393,23 +367,13 @@ def recognise(path: Path) -> str:
     # the FCIO library unpacks these two itself, by their suffix
     if path.name.endswith((".fcio.gz", ".fcio.zst")):
         return "FlashCam"
-    formats = (name for name, (_, _, begins) in FORMATS.items() if begins(head))
-    if name := next(formats, None):
-        return name
-    foreign = next((words for start, words in _FOREIGN.items() if head.startswith(start)), None)
-    if head[1:2] == b"\xca" and head[0] >> 4 == 0xE:
-        foreign = ("CAEN CoMPASS", "convert it with legend-daq2lh5")
-    if foreign is not None:
-        raise CpunetError(f"{path}: is a {foreign[0]} file, which is not read", foreign[1])
-    named = (
-        n for n, (suffixes, _, _) in FORMATS.items() if path.suffix.lower() in suffixes.split()
-    )
-    if name := next(named, None):
-        raise CpunetError(
-            f"{path}: not a {name} file, despite its name; "
-            "give a file of pulses or correct its suffix"
-        )
+    for name, start in _FORMATS.items():
+        if re.match(start, head, re.DOTALL):
+            return name
+    for start, (program, remedy) in _FOREIGN.items():
+        if re.match(start, head):
+            raise CpunetError(f"{path}: is a {program} file, which is not read", remedy)
     raise CpunetError(
-        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, "
-        "pickled pulses, or siggen's .spe"
+        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, or "
+        "pickled pulses"
     )

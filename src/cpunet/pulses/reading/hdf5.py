@@ -1,11 +1,8 @@
 """Read pulses from LH5 files (LEGEND's waveform tables) and from other HDF5 files.
 
-The layout of the Majorana release for AI and machine learning (HDF5) is that of Table I of its
-notes (arXiv:2308.10856; the files are 10.5281/zenodo.8257027): datasets at the top of the file,
-one row per event, named ``raw_waveform`` (3,800 samples), ``energy_label`` (keV),
-``psd_label_low_avse``, ``psd_label_high_avse``, ``psd_label_dcr``, ``psd_label_lq`` (1: passes
-the cut), ``tp0``, ``detector``, ``run_number`` and ``id``.  The NPML files have neither
-energies nor cuts.  Neither the notes' table nor the files give the sampling period.
+The release of the Majorana Demonstrator for machine learning is such a file (Table I of its
+notes, arXiv:2308.10856; 10.5281/zenodo.8257027): datasets with a row for each event, named
+``raw_waveform``, ``energy_label`` (keV), ``detector`` and others, without a sampling period.
 """
 
 from __future__ import annotations
@@ -44,7 +41,8 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
-_PLAIN = ("waveform", "waveforms", "values")  # plain datasets, in order of preference
+# plain datasets, in order of preference
+_PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 
 def read_hdf5(options: PulseFile) -> PulseSource:
@@ -52,41 +50,36 @@ def read_hdf5(options: PulseFile) -> PulseSource:
     path = options.path
     with one_line(path), ExitStack() as unless_read:
         file = unless_read.enter_context(open_hdf5(path))
-        source = read_majorana(options, file) if is_majorana(file) else _read(options, file)
-        unless_read.pop_all()
-        return replace(source, close=file.close)
-
-
-def _read(options: PulseFile, file: h5py.File) -> PulseSource:
-    path, name = options.path, choose_waveforms(options.path, file, options.place)
-    table, _, own_name = name.rpartition("/")
-    group, values = file[table or "/"], file[name]
-    columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
-    if isinstance(values, h5py.Dataset):
-        columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-        plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
-        return replace(plain, rows=reading(path, values, plain.rows), group=group)
-    own, values = columns_of(path, values), values["values"]
-    # a group holds the traces encoded, or as vectors of their own lengths
-    is_group, sized = isinstance(values, h5py.Group), values
-    if is_group:
-        sized = values.get("encoded_data", values).get("cumulative_length")
-    n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
-    first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-    shortest, longest = first.shape[1:] * 2
-    if n and is_group and "cumulative_length" in values:
-        lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-        shortest, longest = int(lengths.min()), int(lengths.max())
-    if shortest < longest and first.dtype.kind == "f":
-        log.info(
-            f"{path.name}: pulses of {shortest} to {longest} samples are continued with their "
-            "last value"
-        )
-    rows = reading(path, values, partial(_lh5_traces, values, longest))
-    return PulseSource(
-        path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
-        t0=own.get("t0"), group=group,
-    )  # fmt: skip
+        name = choose_waveforms(path, file, options.place)
+        table, _, own_name = name.rpartition("/")
+        group, values = file[table or "/"], file[name]
+        columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+        if isinstance(values, h5py.Dataset):
+            columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
+            plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
+            rows = reading(path, values, plain.rows)
+            return replace(plain, rows=rows, group=group, close=unless_read.pop_all().close)
+        own, values = columns_of(path, values), values["values"]
+        # a group holds the traces encoded, or as vectors of their own lengths
+        is_group, sized = isinstance(values, h5py.Group), values
+        if is_group:
+            sized = values.get("encoded_data", values).get("cumulative_length")
+        n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
+        first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
+        shortest, longest = first.shape[1:] * 2
+        if n and is_group and "cumulative_length" in values:
+            lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
+            shortest, longest = int(lengths.min()), int(lengths.max())
+        if shortest < longest and first.dtype.kind == "f":
+            log.info(
+                f"{path.name}: pulses of {shortest} to {longest} samples are continued with "
+                "their last value"
+            )
+        rows = reading(path, values, partial(_lh5_traces, values, longest))
+        return PulseSource(
+            path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
+            t0=own.get("t0"), group=group, close=unless_read.pop_all().close,
+        )  # fmt: skip
 
 
 def _lh5_traces(
@@ -131,7 +124,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     place = (table or "").strip("/")
     item = item_at(file, place)
     if item is None:
-        tables = waveform_tables(file) or [f.path for f in _folders(file) if f.is_table]
+        tables = waveform_tables(file) or list(file)
         raise CpunetError(f"{path}: no table {place}; there are {shortened(tables)}")
     if _is_lh5(item) or _is_array(item):
         return place
@@ -160,53 +153,26 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
 
 
 def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
-    """Error that names the arrays which could be traces, if there are any."""
+    """Error that names what could be traces: the arrays with most values for each event."""
     if place and (tables := waveform_tables(file)):
         return CpunetError(f"{path}: no waveforms in {place}; they are in {shortened(tables)}")
-    arrays, others, tables = list[str](), list[str](), list[str]()
+    held: dict[str, int] = {}
     for folder in _folders(file):
-        tables += [folder.path] if folder.is_table else []
         for name, item in folder.members.items():
-            where = f"{folder.path}/{name}".strip("/")
-            if kind := _no_array(item):
-                others.append(f"{where} is {kind}")
-            elif _is_array(item) and item.shape[1] > 3:  # of three columns are positions
-                arrays.append(where)
-    if others and not arrays:
-        return CpunetError(
-            f"{path}: {others[0]}",
-            "if it holds the traces, write them as an array of two dimensions (event, sample)",
-        )
-    if not arrays:
-        return CpunetError(
-            f"{path}: no waveforms in it; it holds {shortened(tables or list(file))}",
-            "give a file of traces (their energies may be here: `data_energy` FILE:COLUMN)",
-        )
-    many = "an array" if len(arrays) == 1 else f"{len(arrays)} arrays"
+            if isinstance(item, h5py.Dataset) and item.shape:
+                what = h5py.check_vlen_dtype(item.dtype) or item.dtype
+                size = item.dtype.itemsize * int(np.prod(item.shape[1:]))
+                held[f"{folder.path}/{name}".strip("/") + f" {item.shape} of {what}"] = size
+    listed = sorted(held, key=lambda name: -held[name]) or list(file)
     return CpunetError(
-        f"{path}: no table of waveforms in it, but {many} of two dimensions "
-        f"({shortened(arrays)})",
-        "if it holds traces, name it by `table` (`sim_table`, `data_table`); give `dt_ns`",
+        f"{path}: no waveforms in it; it holds {shortened(listed)}",
+        "name an array of traces (event, sample) by `table` (`sim_table`, `data_table`) and "
+        "give `dt_ns`, or write them as such an array; energies are `data_energy` FILE:COLUMN",
     )
 
 
 def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
     return isinstance(item, h5py.Dataset) and item.ndim == 2 and item.dtype.kind in "iuf"
-
-
-def _no_array(item: object) -> str:
-    """What a dataset of traces is in place of an array of two dimensions; empty if none."""
-    if not isinstance(item, h5py.Dataset):
-        return ""
-    kind, fields = item.dtype, item.dtype.names or ()
-    if any(kind[name].shape for name in fields):
-        return f"a compound table of fields {shortened(fields)}"
-    if kind.subdtype or (item.ndim > 2 and kind.kind in "iuf"):
-        return f"an array of shape {item.shape + kind.shape}, as of several segments"
-    inner = h5py.check_vlen_dtype(kind)
-    if inner is not None and np.dtype(inner).kind in "iuf":
-        return f"an array of rows of free length ({inner})"
-    return ""
 
 
 def waveform_tables(file: h5py.File) -> list[str]:
@@ -246,7 +212,6 @@ class _Folder:
 
     path: str
     members: dict[str, h5py.Group | h5py.Dataset]
-    is_table: bool
     waveforms: list[str]
     broken: list[str]
 
@@ -273,7 +238,7 @@ def _folders(
         names = []  # the inside of waveforms
     of = f"{path}/".lstrip("/")
     lost = [] if names or is_table else [of + name for name in broken]
-    yield _Folder(path, items, is_table, [of + name for name in names], lost)
+    yield _Folder(path, items, [of + name for name in names], lost)
     for name, item in items.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
@@ -290,33 +255,12 @@ def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
     columns = {}
     for name, item in members(group).items():
+        # MATLAB has no vectors, but writes a row
+        is_number = is_column(item) or (_is_array(item) and 1 in item.shape)
         is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
-        if _is_numeric(item) or (divides(name) and is_text):
+        if is_number or (is_text and divides(name)):
             columns[name] = _stored(path, item)
     return columns
-
-
-def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
-    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
-
-    Raises
-    ------
-    CpunetError
-        If there is no such file or column; the message lists the other columns of the group.
-    """
-    file, place = open_hdf5(path), name.strip("/").rpartition("/")[0]
-    with one_line(path):
-        parent, item = item_at(file, place), item_at(file, name)
-        others = columns_of(path, parent) if isinstance(parent, h5py.Group) else {}
-        if _is_numeric(item):
-            return _stored(path, item), others
-        names = list(others or file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(names)}")
-
-
-def _is_numeric(item: object) -> bool:
-    """Whether an item is a column of numbers; MATLAB has no vectors, but writes a row."""
-    return is_column(item) or (_is_array(item) and 1 in item.shape)
 
 
 def _stored(path: Path, dataset: h5py.Dataset) -> Column:
@@ -328,40 +272,20 @@ def _stored(path: Path, dataset: h5py.Dataset) -> Column:
     return Column(read, dataset.size, units_of(dataset))
 
 
-WAVEFORMS, DETECTOR = "raw_waveform", "detector"
-_NUMBERS = (DETECTOR, "run_number", "id")  # in every file, with the waveforms
-_RENAMED = {"energy_label": ("energy", "keV"), "id": ("event_number", "")}
+def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
+    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
 
-
-def is_majorana(file: h5py.File) -> bool:
-    """Whether a file has the layout of the release."""
-    traces = file.get(WAVEFORMS)
-    if not isinstance(traces, h5py.Dataset) or traces.ndim != 2:
-        return False
-    return all(is_column(file.get(name)) for name in _NUMBERS)
-
-
-def detectors(file: h5py.File) -> list[str]:
-    """The detectors of a file, by the release's numbers."""
-    return [str(number) for number in np.unique(file[DETECTOR][()])]
-
-
-def read_majorana(options: PulseFile, file: h5py.File) -> PulseSource:
-    """The traces of one detector; `table` is its number, or ``raw_waveform`` for all."""
-    rows = np.arange(len(file[WAVEFORMS]))
-    if options.table != WAVEFORMS:
-        remedy = f"choose one with `table`, or all with `table` {WAVEFORMS}"
-        chosen = options.chosen_of(detectors(file), "detector", "detectors", remedy)
-        rows = np.flatnonzero(file[DETECTOR][()].astype(str) == chosen)
-    columns = {}
-    for name in file:
-        item = file.get(name)
-        if is_column(item) and item.ndim:
-            shown, units = _RENAMED.get(name, (name, ""))
-            columns[shown] = Column.of(item[()], units)
-    path, name, values = options.path, options.place or WAVEFORMS, file[WAVEFORMS]
-    hint = "the Majorana Demonstrator's digitisers ran at 100 MHz: 10"
-    table = PulseSource.of_array(
-        path, "Majorana release", name, values, columns, period_hint=hint
-    )
-    return replace(table, rows=reading(path, values, table.rows)).at(rows)
+    Raises
+    ------
+    CpunetError
+        If there is no such file or column; the message lists the other columns of the group.
+    """
+    file = open_hdf5(path)
+    place, _, own = name.strip("/").rpartition("/")
+    with one_line(path):
+        group = item_at(file, place)
+        columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
+        if own in columns:
+            return columns[own], columns
+        names = list(columns or file)
+    raise CpunetError(f"{path}: no column {name}; there are {shortened(names)}")

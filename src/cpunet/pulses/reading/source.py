@@ -41,9 +41,10 @@ ANY = "*"  # value of a column that separates no channels
 
 # Columns by which the rows of two files are joined; the last is no number of an event.
 EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
-_USUAL = ("energy_kev", "energy_keV", "energy")
-# LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units.
-_NAMED_IN_KEV = re.compile(r"(_cal|kev)$", re.IGNORECASE)
+_USUAL = ("energy_kev", "energy_keV", "energy", "energy_label")
+# LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units, the
+# release of the Majorana Demonstrator `energy_label`.
+_NAMED_IN_KEV = re.compile(r"(_cal|kev|energy_label)$", re.IGNORECASE)
 
 # The first samples of a trace, before any pulse, for the amplitude's baseline.
 _BASELINE_FRACTION, _BASELINE_SAMPLES = 0.05, 10
@@ -95,23 +96,20 @@ class PulseSource:
         Name of the column of the sampling period.
     period
         Sampling period, if it is in the file.
-    period_hint
-        Hint for the error message if the sampling period is not in the file.
     t0
         Times of the first samples, if they are in the file.
     numbers
-        Event numbers of the traces read last, if they are in no column.
+        Gives the event numbers of the traces read last, if the file has any.
     group, close
         Group of an HDF5 file with columns of any kind; closes the file.
     chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
-    dt_ns, periods
-        Sampling period in ns; reads that of each trace, if the file has it for each.
+    dt_ns
+        Sampling period in ns; then `period` is that of each trace in ns, or None.
     energies
         The rule that gives each pulse its energy, in words.
-    kev_per_unit, energy_column
-        Factor to keV from values of the column, or from the amplitude if that is None; without
-        a factor energies are unknown.
+    energy, kev_per_adc
+        Energies in keV; without them, the factor from the amplitude, or unknown without that.
     """
 
     path: Path
@@ -124,7 +122,6 @@ class PulseSource:
     attrs: Mapping[str, str] = field(default_factory=dict)
     period_name: str = "dt"
     period: Column | None = None
-    period_hint: str = ""
     t0: Column | None = None
     numbers: Read | None = None
     group: h5py.Group | None = None
@@ -132,10 +129,9 @@ class PulseSource:
     chosen: npt.NDArray[np.int64] | None = None
     n_all: int | None = None
     dt_ns: float = np.nan
-    periods: Read | None = None
     energies: str = ""
-    kev_per_unit: float | None = None
-    energy_column: Column | None = None
+    energy: Column | None = None
+    kev_per_adc: float | None = None
 
     @classmethod
     def of_array(
@@ -146,7 +142,6 @@ class PulseSource:
         values: Any,
         columns: Mapping[str, Column],
         attrs: Mapping[str, str] = MappingProxyType({}),
-        period_hint: str = "",
     ) -> PulseSource:
         """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
 
@@ -164,10 +159,12 @@ class PulseSource:
                 "dimensions are reversed",
                 "write them transposed, with the pulses first",
             )
-        period_name = "dt_ns" if "dt_ns" in columns else "dt"
+        period_name, period = "dt", columns.get("dt")
+        if (in_ns := columns.get("dt_ns")) is not None:
+            period_name, period = "dt_ns", replace(in_ns, units=in_ns.units or "ns")
         return cls(
             path, format, name, n, length, lambda start, stop: values[start:stop], columns,
-            attrs, period_name, columns.get(period_name), period_hint,
+            attrs, period_name, period,
         )  # fmt: skip
 
     def at(self, rows: npt.NDArray[np.int64]) -> PulseSource:
@@ -193,20 +190,20 @@ class PulseSource:
                 "give a file with events"
             )
         of_channel = self._of_channel(file.rows)
-        dt_ns, periods = _sampling(of_channel, file.dt_ns)
-        energies, kev_per_unit, column = _energies(of_channel, file.energy, file.kev_per_adc)
-        for name in EVENT_KEYS[:-1]:
-            if name in of_channel.columns:
-                of_channel.columns[name].require_length(self.path, name, of_channel.n_pulses)
-                break
+        columns, t0, numbers = of_channel.columns, of_channel.t0, of_channel.numbers
+        dt_ns, period = _sampling(of_channel, file.dt_ns)
+        energies, energy = _energies(of_channel, file.energy, file.kev_per_adc)
+        if name := next((name for name in EVENT_KEYS[:-1] if name in columns), None):
+            columns[name].require_length(self.path, name, of_channel.n_pulses)
+            numbers = columns[name].read
         return replace(
-            of_channel, dt_ns=dt_ns, periods=periods, energies=energies,
-            kev_per_unit=kev_per_unit, energy_column=column,
+            of_channel, dt_ns=dt_ns, period=period, t0=None if t0 is None else t0.to("ns"),
+            numbers=numbers, energies=energies, energy=energy, kev_per_adc=file.kev_per_adc,
         )  # fmt: skip
 
     def _of_channel(self, chosen: Mapping[str, str]) -> PulseSource:
         """Rows with the chosen values of some columns, or all if they are of one channel."""
-        if self.n_pulses is None or self.chosen is not None:
+        if self.n_pulses is None:
             return self
         whole = {n: c for n, c in self.columns.items() if len(c) == self.n_pulses}
         rows = np.arange(self.n_pulses)
@@ -262,7 +259,7 @@ class PulseSource:
             start += len(traces)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
-        column = self.energy_column
+        column = self.energy
         if column is not None and not column.constant and len(column) != start:
             raise CpunetError(
                 f"{self.path}: {start} waveforms, but {len(column)} energies; "
@@ -280,26 +277,20 @@ class PulseSource:
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces, np.float32)
         n, stop = len(waveforms), start + len(waveforms)
-        numbers = np.arange(start, stop)
-        number_column = next((x for x in EVENT_KEYS[:-1] if x in self.columns), None)
-        if number_column is not None:
-            numbers = self.columns[number_column].read(start, stop)
-        elif self.numbers is not None:
-            numbers = self.numbers(start, stop)
-        energy_kev = np.full(n, np.nan)
-        if self.kev_per_unit is not None and self.energy_column is None:
-            energy_kev = self.kev_per_unit * amplitude(waveforms)
-        elif self.kev_per_unit is not None and self.energy_column is not None:
-            values = self.energy_column.read(start, stop)
-            energy_kev = self.kev_per_unit * np.asarray(values, np.float64)
+        numbers = np.arange(start, stop) if self.numbers is None else self.numbers(start, stop)
+        energy_kev, t0_ns = np.full(n, np.nan), np.zeros(n)
+        if self.energy is not None:
+            energy_kev = self.energy.read(start, stop)
+        elif self.kev_per_adc is not None:
+            energy_kev = self.kev_per_adc * amplitude(waveforms)
         if len(energy_kev) != n:
             raise CpunetError(
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
-        if self.periods is not None:
-            periods = self.periods(start, stop)
+        if self.period is not None:
+            periods = self.period.read(start, stop)
             other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
             if other.any():
                 first = int(other.argmax())
@@ -308,42 +299,32 @@ class PulseSource:
                     f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
                     "split the file by sampling period"
                 )
-        t0_ns = np.zeros(n)
-        if self.t0 is not None and (ns_per_unit := factor(self.t0.units, "ns")) is not None:
-            t0_ns = ns_per_unit * np.asarray(self.t0.read(start, stop), np.float64)
+        if self.t0 is not None:
+            t0_ns = self.t0.read(start, stop)
         return Pulses.of(
             waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number,
             t0_ns=t0_ns,
         )  # fmt: skip
 
 
-def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Read | None]:
+def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Column | None]:
     """The period in ns from the column of the file or from the user, and that of each trace.
 
-    A column without units is in ns if its name ends in ``_ns``. Otherwise it is not used
-    and ``dt_ns`` is required; the error message contains the hint of the format.  A file that
-    says another period than the user is corrected, with a warning.
+    A column without units is not used, and ``dt_ns`` is required.  A file that says another
+    period than the user is corrected, with a warning.
     """
-    path, name, column, hint = (
-        source.path, source.period_name, source.period, source.period_hint,
-    )  # fmt: skip
-    units = "" if column is None else column.units or ("ns" if name.endswith("_ns") else "")
-    ns_per_unit = factor(units, "ns") if units else None
-    if column is None or ns_per_unit is None:
+    path, name, column = source.path, source.period_name, source.period
+    in_ns = None if column is None else column.to("ns")
+    if column is None or in_ns is None:
         if dt_ns is not None:
             return dt_ns, None
-        if units:
-            raise CpunetError(
-                f"{path}: the sampling period ({name}) is in {units!r}; expected one of "
-                f"{unit_names('ns')}"
-            )
         why = "is not in the file" if column is None else f"({name}) has no units"
-        raise CpunetError(
-            f"{path}: the sampling period {why}; give `dt_ns`{hint and f' ({hint})'}"
-        )
+        if column is not None and column.units:
+            why = f"({name}) is in {column.units!r}, not in one of {unit_names('ns')}"
+        raise CpunetError(f"{path}: the sampling period {why}; give `dt_ns`")
     if len(column) != 1:
         column.require_length(path, name, source.n_pulses)
-    period = float(column.read(0, 1)[0]) * ns_per_unit
+    period = float(in_ns.read(0, 1)[0])
     is_period = np.isfinite(period) and period > 0
     if dt_ns is None and not is_period:
         raise CpunetError(
@@ -356,17 +337,15 @@ def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Read | N
         )
         if not is_period:
             return dt_ns, None
-        ns_per_unit *= dt_ns / period
-        period = dt_ns
-    if len(column) == 1:  # a scalar or an array of length 1 applies to all events
-        return period, None
-    return period, lambda start, stop: ns_per_unit * np.asarray(column.read(start, stop), float)
+        in_ns, period = in_ns.times(dt_ns / period, "ns"), dt_ns
+    # a scalar or an array of length 1 applies to all events
+    return period, None if len(column) == 1 else in_ns
 
 
 def _energies(
     source: PulseSource, energy: str | None, kev_per_adc: float | None
-) -> tuple[str, float | None, Column | None]:
-    """The rule of the energies in words, the factor to keV, and the column that it multiplies.
+) -> tuple[str, Column | None]:
+    """The rule of the energies in words, and energies in keV from a column.
 
     Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
     is in energy units or ``kev_per_adc`` is given.  Otherwise the energy is the amplitude
@@ -379,18 +358,18 @@ def _energies(
     if name:
         column = source.columns[name] if name in source.columns else _elsewhere(source, name)
         units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
-        kev_per_unit, rule = factor(units, "keV"), f"column {name} [{units}]"
-        if kev_per_unit is None and kev_per_adc is not None:
-            kev_per_unit, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
-        elif kev_per_unit is not None and kev_per_adc is not None:
+        by, rule = factor(units, "keV"), f"column {name} [{units}]"
+        if by is None and kev_per_adc is not None:
+            by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
+        elif by is not None and kev_per_adc is not None:
             log.warning(
                 f"{path.name}: column {name} is in {units}; its energies are multiplied by "
                 f"{kev_per_adc:g}, as given (`kev_per_adc`)"
             )
-            kev_per_unit, rule = kev_per_unit * kev_per_adc, f"{rule} x {kev_per_adc:g}"
-        if kev_per_unit is not None:
+            by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
+        if by is not None:
             column.require_length(path, name, source.n_pulses)
-            return rule, kev_per_unit, column
+            return rule, column.times(by, "keV")
         if energy is not None:
             units = f"in {column.units}" if column.units else "without units"
             raise CpunetError(
@@ -398,8 +377,8 @@ def _energies(
                 "add `kev_per_adc` (1 if it is in keV)"
             )
     if kev_per_adc is not None:
-        return f"amplitude x {kev_per_adc:g} keV/ADC", kev_per_adc, None
-    return f"not known{f' (column {name} is not in energy units)' if name else ''}", None, None
+        return f"amplitude x {kev_per_adc:g} keV/ADC", None
+    return f"not known{f' (column {name} is not in energy units)' if name else ''}", None
 
 
 def _elsewhere(source: PulseSource, energy: str) -> Column:
@@ -423,19 +402,16 @@ def _elsewhere(source: PulseSource, energy: str) -> Column:
     ours, theirs = (np.asarray(c[key].read(0, len(c[key]))) for c in (columns, others))
     if np.array_equal(ours, theirs):
         return column
-    order = np.argsort(theirs, kind="stable")
-    at = order[np.minimum(np.searchsorted(theirs[order], ours), len(theirs) - 1)]
-    shared = theirs[at] == ours
-    if not shared.any() or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
-        lost = f"{(~shared).sum()} of {len(ours)} are not there"
+    _, at, of = np.intersect1d(ours, theirs, return_indices=True)
+    if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
         raise CpunetError(
-            f"{path}: {energy} is of other events than these pulses ({key}: "
-            f"{'twice' if shared.all() else lost})",
+            f"{path}: {energy} is of other events than these pulses ({key})",
             "give the energies of the same events",
         )
     log.info(
         f"{path.name}: {energy} is in another order or of other events; joined by {key}, "
-        f"{(~shared).sum()} of {len(ours)} pulses have no energy there"
+        f"{len(ours) - len(at)} of {len(ours)} pulses have no energy there"
     )
-    values = np.where(shared, np.asarray(column.read(0, len(column)), float)[at], np.nan)
+    values = np.full(len(ours), np.nan)
+    values[at] = np.asarray(column.read(0, len(column)), float)[of]
     return Column.of(values, column.units)
