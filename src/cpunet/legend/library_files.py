@@ -223,30 +223,13 @@ def require_complete(
                 )
 
 
-def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
-    """Store a number or an array with LH5 attributes."""
-    group[name] = values
-    dimensions = group[name].ndim
-    kind = f"array<{dimensions}>{{real}}" if dimensions else "real"
-    group[name].attrs.update({"datatype": kind, "units": units})
-
-
-def put_array(
-    group: h5py.Group, name: str, shape: tuple[int, ...], kind: npt.DTypeLike, units: str
-) -> h5py.Dataset:
-    """Create an array of NaN with LH5 attributes, in chunks of one row of grid points."""
-    made = group.create_dataset(
-        name,
-        shape,
-        kind,
-        chunks=(1, *shape[1:]),
-        compression="gzip",
-        compression_opts=1,
-        shuffle=True,
-        fillvalue=np.nan,
-    )
-    made.attrs.update({"datatype": f"array<{len(shape)}>{{real}}", "units": units})
-    return made
+def put(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
+    """Store a number or an array with LH5 attributes, templates in chunks of a row of r."""
+    values = np.asarray(values)
+    large = {"chunks": (1, *values.shape[1:]), "compression": 1, "shuffle": True}
+    made = group.create_dataset(name, data=values, **(large if values.ndim > 1 else {}))
+    kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"
+    made.attrs.update({"datatype": kind, "units": units})
 
 
 def describe(group: h5py.Group) -> None:
@@ -410,33 +393,31 @@ def make_library(
         np.arange(int(axis[-1] / grid_mm + 1e-6) + 1) * grid_mm
         for axis in (simulator.fields.r_mm, simulator.fields.z_mm)
     )
-    counts = MadeLibrary(out)
-    total = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
+    counts = MadeLibrary(out, templates=len(ANGLES_DEG) * len(r_mm) * len(z_mm))
     shape = (len(r_mm), len(z_mm))
-    with written_hdf5(out) as (made, _), stage("Templates", total) as bar:
+    with written_hdf5(out) as (made, _), stage("Templates", counts.templates) as bar:
         library = made.create_group(detector.name or "detector")
-        put_column(library, "r", r_mm, "mm")
-        put_column(library, "z", z_mm, "mm")
-        put_column(library, "dt", wanted.dt_ns, "ns")
-        put_column(library, "t0", 0.0, "ns")
+        put(library, "r", r_mm, "mm")
+        put(library, "z", z_mm, "mm")
+        put(library, "dt", wanted.dt_ns, "ns")
+        put(library, "t0", 0.0, "ns")
         for angle_deg in ANGLES_DEG:
-            angle, whole = f"{angle_deg:03d}_deg", (*shape, wanted.n_samples)
-            waveforms = put_array(library, f"waveform_{angle}", whole, np.float32, "")
-            drift_times = put_array(library, f"drift_time_{angle}", shape, np.float64, "ns")
+            waveforms = np.full((*shape, wanted.n_samples), np.nan, np.float32)
+            drift_times = np.full(shape, np.nan)
             phi = math.radians(angle_deg)
             for i, r in enumerate(r_mm):
                 x, y = r * math.cos(phi), r * math.sin(phi)
                 signals = simulator.signals(x, y, z_mm, ENERGY_KEV)
                 good = signals.valid & signals.collected
-                template = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
-                waveforms[i] = template
-                drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
-                counts.templates += len(z_mm)
+                waveforms[i, good] = signals.waveforms[good]
+                drift_times[i, good] = signals.collection_time_ns[good]
                 counts.written += int(good.sum())
                 counts.outside += int((~signals.valid).sum())
                 counts.late += int((signals.valid & ~signals.collected).sum())
                 bar.update(len(z_mm))
-        library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
+            put(library, f"waveform_{angle_deg:03d}_deg", waveforms, "")
+            put(library, f"drift_time_{angle_deg:03d}_deg", drift_times, "ns")
+        describe(library)
         if not counts.written:
             raise CpunetError(f"{counts}; give a finer grid or longer records")
     return counts

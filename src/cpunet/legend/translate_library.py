@@ -42,8 +42,7 @@ from cpunet.legend.library_files import (
     chosen_libraries,
     describe,
     known_detector,
-    put_array,
-    put_column,
+    put,
     require_complete,
 )
 from cpunet.networks.response_layer import padding
@@ -273,17 +272,16 @@ def _write(
     amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
     mode = most_frequent(np.concatenate(amplitudes).astype(float))
 
-    put_column(group, "r", r_mm, "mm")
-    put_column(group, "z", z_mm, "mm")
-    put_column(group, "dt", PERIOD_NS, "ns")
-    put_column(group, "t0", -PEAK * PERIOD_NS, "ns")
+    put(group, "r", r_mm, "mm")
+    put(group, "z", z_mm, "mm")
+    put(group, "dt", PERIOD_NS, "ns")
+    put(group, "t0", -PEAK * PERIOD_NS, "ns")
     padded = healed = 0
     for angle, mask in inside.items():
-        values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
-        drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
         currents[angle] /= np.float32(mode)
-        values[...] = with_rings(currents.pop(angle))
-        drift_times[...] = filled = continued(times[angle])
+        put(group, f"waveform_{angle}", with_rings(currents.pop(angle)), "")
+        filled = continued(times[angle])
+        put(group, f"drift_time_{angle}", filled.astype(np.float32), "ns")
         padded += int(np.isfinite(filled).sum() - mask.sum())
         healed += int((np.isfinite(filled[inner]) & ~mask & binary_fill_holes(mask)).sum())
     return LibraryNumbers(library.n_templates, translated, padded, healed, mode, delay_ns)

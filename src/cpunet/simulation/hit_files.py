@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.hit_tables import StepTable, hit_format, step_tables
+from cpunet.simulation.hit_tables import hit_format, step_tables
 from cpunet.simulation.hits import (
     FARTHEST_MM,
     LATE_NS,
@@ -62,25 +62,22 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
         If the file cannot be read, has an unknown format, lacks a column, a unit or the
         detector, contains no energy deposit, or has energies of another unit.
     """
-    file = Path(path)
-    with step_tables(file) as tables:
-        detectors, detector = _by_detector(tables), options.hits_detector
+    file, chosen = Path(path), options.hits_detector
+    with step_tables(file) as detectors:
         names = ", ".join(detectors)
-        if detector is None and len(detectors) > 1:
+        if chosen is None and len(detectors) > 1:
             raise CpunetError(
                 f"{file}: holds detectors {names}; choose one with `hits_detector`"
             )
-        if detector is not None and not names:
+        if chosen is not None and not names:
             raise CpunetError(
-                f"{file}: its hits name no detector to pick {detector} by; leave out "
+                f"{file}: its hits name no detector to pick {chosen} by; leave out "
                 "`hits_detector`"
             )
-        if detector is not None and detector not in detectors:
-            raise CpunetError(f"{file}: no detector {detector}; it holds {names}")
-        only = next(iter(detectors.values()))
-        table, label = only if detector is None else detectors[detector]
-        steps = table.steps(options, label)
-        origin = table.origin_mm(label or table.name)
+        if chosen is not None and chosen not in detectors:
+            raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
+        table = detectors[chosen or next(iter(detectors))]
+        steps, origin = table.steps(options.units), table.origin_mm()
     hits = _to_hits(file, steps, origin, options)
     energy_kev = hits.energy_kev
     if not len(hits):
@@ -102,18 +99,6 @@ def holds_hits(path: Path | str) -> bool:
     with suppress(CpunetError):  # the reader of pulses reports the error
         return hit_format(Path(path)) in ("tables", "csv", "npz")
     return False
-
-
-def _by_detector(tables: list[StepTable]) -> dict[str, tuple[StepTable, str | None]]:
-    """Tables by the names of their detectors, with their labels where they share a table."""
-    detectors: dict[str, tuple[StepTable, str | None]] = {}
-    for table in tables:
-        labels = table.detectors()
-        if len(labels) > 1 or (labels and not table.name):
-            detectors |= {label: (table, label) for label in labels}
-        else:
-            detectors[table.name] = (table, None)
-    return detectors
 
 
 def _to_hits(
@@ -254,7 +239,7 @@ def describe_hits(
     """
     detectors: dict[str, Lines] = {}
     with step_tables(path) as tables:
-        names = list(_by_detector(tables))
+        names = [*tables]
     for name in names:
         try:
             hits = read_hits(path, HitOptions(name or None, units=units))
