@@ -157,7 +157,6 @@ LEGEND_PARS = FolderKind(
     own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
 )
 EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
-SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
 
 
 @dataclass(frozen=True)
@@ -290,32 +289,29 @@ def _against_energy(
     path = report / "metrics.json"
     metrics = read_json(path, "give the folder that `cpunet validate` made")
     try:
-        training, scores = metrics["training"], metrics["ae_energy"]
-        other = [key for key in SAME if training[key] != trained[key]]
-        missing = scores.get("missing")
-        methods = {} if missing else dict(scores["methods"])
-        pars: dict[str, Any] = {}
-        if not missing:
-            # the mean of the translation, and the width of the data
-            mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
-            line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
-            pars["aoemeanmod"] = {"psl": {"expression": "x*a+b", "pars": line}}
-            if law["b"] > 0:
-                pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
-            else:
-                log.warning(
-                    f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
-                    "aoeresmod.yaml is not written: give events of more energies"
+        for key, value in trained.items():
+            if (other := metrics["training"][key]) != value:
+                raise CpunetError(
+                    f"{report}: of a run with {key} {other}, this one has {value}; validate "
+                    "this run"
                 )
+        if missing := metrics["ae_energy"].get("missing"):
+            raise CpunetError(f"{report}: no A/E against energy: {missing}")
+        methods = dict(metrics["ae_energy"]["methods"])
+        # the mean of the translation, and the width of the data
+        mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
+        line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
+        noisy = law["b"] > 0
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CpunetError(
             f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
         ) from error
-    if other:
-        raise CpunetError(
-            f"{report}: of a run with {other[0]} {training[other[0]]}, this one has "
-            f"{trained[other[0]]}; validate this run"
+    pars: dict[str, Any] = {"aoemeanmod": {"psl": {"expression": "x*a+b", "pars": line}}}
+    if noisy:
+        pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
+    else:
+        log.warning(
+            f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
+            "aoeresmod.yaml is not written: give events of more energies"
         )
-    if missing:
-        raise CpunetError(f"{report}: no A/E against energy: {missing}")
     return methods, pars
