@@ -243,20 +243,20 @@ OF_THE_SETTINGS = {
 def test_every_key_has_its_place() -> None:
     detector, settings = read_detector("icpc"), SimulationSettings()
     assert set(Shift.model_fields) == set(OF_THE_DETECTOR) | set(OF_THE_SETTINGS)
-    assert Shift().detector(detector) == detector
-    assert Shift().settings(settings) == settings
+    assert Shift().applied(detector) == detector
+    assert Shift().applied(settings) == settings
     for key, (field, value, change) in OF_THE_DETECTOR.items():
         shift = Shift(**{key: value})
-        moved = shift.detector(detector).model_dump()
+        moved = shift.applied(detector).model_dump()
         before = detector.model_dump()
         assert moved.pop(field) - before.pop(field) == pytest.approx(change)
         assert moved == before
-        assert shift.settings(settings) == settings
+        assert shift.applied(settings) == settings
     for key, value in OF_THE_SETTINGS.items():
         shift = Shift(**{key: value})
         expected = settings.model_copy(update={key: value})
-        assert shift.settings(settings) == expected
-        assert shift.detector(detector) == detector
+        assert shift.applied(settings) == expected
+        assert shift.applied(detector) == detector
 
 
 def test_files_and_single_keys(tmp_path: Path) -> None:
@@ -287,6 +287,6 @@ def test_bad_shifts_are_named(part: str, said: str) -> None:
 
 def test_impossible_detectors_and_settings_are_refused() -> None:
     with pytest.raises(CpunetError, match=r"shifted: temperature_K: .*less than or equal"):
-        Shift(temperature_K=100).detector(read_detector("icpc"))
+        Shift(temperature_K=100).applied(read_detector("icpc"))
     with pytest.raises(CpunetError, match=r"hole_trapping_per_us: .*-1"):
-        Shift(hole_trapping_per_us=-1).settings(SimulationSettings())
+        Shift(hole_trapping_per_us=-1).applied(SimulationSettings())
