@@ -338,9 +338,9 @@ def make_library(
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
     under the detector's name: r and z in mm from the centre of the point contact, times in
     ns after the charge is created, pulses of unit charge as float32 arrays of shape
-    (r, z, samples).  The drift times of the format are the collection times of all charge,
-    `Signals.collection_time_ns`.  Grid points without a signal, and those whose charge is not
-    collected within the record, are NaN.
+    (r, z, samples).  The drift times of the format are the times until all charge is
+    collected, `EventPulses.collection_time_ns`.  Grid points without a signal, and those
+    whose charge is not collected within the record, are NaN.
 
     Parameters
     ----------
