@@ -26,7 +26,6 @@ import numpy.typing as npt
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import RectBivariateSpline
 
-from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.outline import DITCH
@@ -243,19 +242,12 @@ def drift_maps(
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
-
-    Raises
-    ------
-    CpunetError
-        If no cell of the maps has a field.
     """
     e_r, e_z, volts = fields.e_r_V_per_cm, fields.e_z_V_per_cm, fields.potential_V
     stacked = np.stack([e_r, e_z, fields.weighting_potential, volts], axis=-1).astype(float)
     # nothing drifts in the ditch, and the field is discontinuous at its walls
     ditch = np.asarray(fields.region) == DITCH
     with_field = np.isfinite(stacked).all(-1) & ~ditch & (stacked[..., :2] != 0).any(-1)
-    if not with_field.any():
-        raise CpunetError("the field maps hold no field; compute them again")
     bias = float(np.nanmax(stacked[..., VOLTS]))
     values, filled = with_ghost_nodes(np.where(with_field[..., None], stacked, 0.0), with_field)
     usable = _all_corners(filled) & ~_all_corners(~with_field)

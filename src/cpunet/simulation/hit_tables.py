@@ -49,7 +49,8 @@ class StepTable:
 
     Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
     the vectors of deposits give the steps of each row. The `name` is that of the detector,
-    empty without any; the `label` that of the steps to read, where detectors share the table.
+    empty without any. Where detectors share the table, `labels` are those of the steps, and
+    those with the `label` are read.
     `units` are those of columns that name none: MeV and mm in tables of g4simple. A `file` of
     remage tells where its detectors are.
     """
@@ -59,19 +60,29 @@ class StepTable:
     name: str = ""
     units: str = ""
     file: h5py.File | None = None
-    label: str | None = None
+    label: str = ""
+    labels: npt.NDArray[np.str_] | None = None
 
     def by_detector(self) -> dict[str, StepTable]:
         """The table, or its parts by the labels of their detectors where several share it.
 
         Labels without deposits are the world or a holder.
         """
-        labels = sorted(
-            map(str, np.unique(self._labels[self._deposits]) if len(self._labels) else ()),
+        if "edep" not in self._roles:
+            return {self.name: self}
+        deposits = self._read(self._roles["edep"][0])[0] > 0
+        of = {name: self._read(name)[0] for name in self.columns if divides(name)}
+        some = {name: values[deposits] for name, values in of.items()}
+        names = dividing(some, int(deposits.sum())) or list(of)[:1]
+        if not names:
+            return {self.name: self}
+        of_steps = texts(of[names[0]]) if len(names) == 1 else labels(of, names)
+        found = sorted(
+            map(str, np.unique(of_steps[deposits])),
             key=lambda label: (len(label), label) if label.isdigit() else (99, label),
         )
-        if len(labels) > 1 or (labels and not self.name):
-            return {label: replace(self, label=label) for label in labels}
+        if len(found) > 1 or (found and not self.name):
+            return {label: replace(self, label=label, labels=of_steps) for label in found}
         return {self.name: self}
 
     def steps(self, units: str) -> dict[str, npt.NDArray[Any]]:
@@ -93,7 +104,7 @@ class StepTable:
                 f"{self.path}: no column for {missing[0]}; "
                 f"the file holds {', '.join(self.columns)}"
             )
-        chosen = slice(None) if self.label is None else self._labels == self.label
+        chosen = slice(None) if self.labels is None else self.labels == self.label
         steps: dict[str, npt.NDArray[Any]] = {}
         for role, (name, in_name) in self._roles.items():
             values, unit = self._read(name)
@@ -126,22 +137,6 @@ class StepTable:
     @cached_property
     def _roles(self) -> dict[str, tuple[str, str]]:
         return roles(self.columns)
-
-    @cached_property
-    def _deposits(self) -> npt.NDArray[np.bool_]:
-        return np.asarray(self._read(self._roles["edep"][0])[0] > 0)
-
-    @cached_property
-    def _labels(self) -> npt.NDArray[np.str_]:
-        """Detector of each step as text, from one column or several; empty if there is none."""
-        if "edep" not in self._roles:
-            return np.empty(0, np.str_)
-        of = {name: self._read(name)[0] for name in self.columns if divides(name)}
-        some = {name: values[self._deposits] for name, values in of.items()}
-        names = dividing(some, int(self._deposits.sum())) or list(of)[:1]
-        if not names:
-            return np.empty(0, np.str_)
-        return texts(of[names[0]]) if len(names) == 1 else labels(of, names)
 
     @cached_property
     def _per_row(self) -> IntArray:
