@@ -149,13 +149,8 @@ def test_the_bore_ends_in_a_hemisphere(angle: float, distance: float) -> None:
     assert not ICPC.inside(r * 4.99 / distance, centre + (z - centre) * 4.99 / distance)
 
 
-def test_the_ditch_is_no_germanium() -> None:
-    assert not ICPC.inside(12.5, 1)
-    assert ICPC.inside(12.5, 2.1)
-    assert ICPC.inside(10.9, 1)
-
-
-def test_the_ditch_does_not_depend_on_the_grid() -> None:
+def test_the_ditch_is_no_germanium_on_any_grid() -> None:
+    assert ICPC.inside([12.5, 12.5, 10.9], [1, 2.1, 1]).tolist() == [False, True, True]
     r, z = np.meshgrid(np.linspace(10, 15, 501), np.linspace(0, 3, 301))
     fine, coarse = changed(grid_mm=0.05), changed(grid_mm=0.5)
     np.testing.assert_array_equal(fine.region(r, z), coarse.region(r, z))
@@ -184,12 +179,10 @@ def test_impurities_follow_their_terms() -> None:
             | {"point_contact_radius": 39.6},
             "point_contact_radius reaches the lithium",
         ),
-        ({"bore_radius": 0}, "bore_radius"),
         ({"bore_bullet_radius": 6}, "bore_bullet_radius"),
         ({"point_contact_radius": 11.5}, "point_contact_radius"),
         ({"wrap_around_radius": 40}, "wrap_around_radius"),
         ({"wrap_around_radius": 0}, "ditch_depth"),
-        ({"ditch_thickness": 0}, "ditch_thickness"),
         ({"ditch_depth": 30}, "ditch_depth"),
         ({"li_thickness": 30}, "li_thickness"),
         ({"taper_angle_deg": 45}, "taper"),
@@ -220,12 +213,12 @@ def test_the_fingerprint_tells_detectors_apart() -> None:
     assert ICPC.fingerprint(without) == changed(bias_V=3999).fingerprint(without)
 
 
-OF_THE_DETECTOR = {
-    "temperature_K": ("temperature_K", 2.0, 2.0),
-    "bias_V": ("bias_V", 20.0, 20.0),
-    "li_thickness_mm": ("li_thickness", 0.1, 0.1),
-    "impurity_tilt_1e10_per_cm4": ("impurity_tilt_1e10_per_cm4", 0.01, 0.01),
-    "impurity_factor": ("impurity_scale", 1.03, 0.03),
+OF_THE_DETECTOR = {  # key of a shift: value, and the value of the field that it gives
+    "temperature_K": (2.0, "temperature_K", 92.0),
+    "bias_V": (20.0, "bias_V", 4020.0),
+    "li_thickness_mm": (0.1, "li_thickness", 1.1),
+    "impurity_tilt_1e10_per_cm4": (0.01, "impurity_tilt_1e10_per_cm4", 0.01),
+    "impurity_factor": (1.03, "impurity_scale", 1.03),
 }
 OF_THE_SETTINGS = {
     "cloud_fwhm_mm": 0.3,
@@ -241,22 +234,17 @@ OF_THE_SETTINGS = {
 
 
 def test_every_key_has_its_place() -> None:
-    detector, settings = read_detector("icpc"), SimulationSettings()
+    settings = SimulationSettings()
     assert set(Shift.model_fields) == set(OF_THE_DETECTOR) | set(OF_THE_SETTINGS)
-    assert Shift().applied(detector) == detector
-    assert Shift().applied(settings) == settings
-    for key, (field, value, change) in OF_THE_DETECTOR.items():
+    cases = {
+        key: (value, {field: result}, {})
+        for key, (value, field, result) in OF_THE_DETECTOR.items()
+    }
+    cases |= {key: (value, {}, {key: value}) for key, value in OF_THE_SETTINGS.items()}
+    for key, (value, of_detector, of_settings) in cases.items():
         shift = Shift(**{key: value})
-        moved = shift.applied(detector).model_dump()
-        before = detector.model_dump()
-        assert moved.pop(field) - before.pop(field) == pytest.approx(change)
-        assert moved == before
-        assert shift.applied(settings) == settings
-    for key, value in OF_THE_SETTINGS.items():
-        shift = Shift(**{key: value})
-        expected = settings.model_copy(update={key: value})
-        assert shift.applied(settings) == expected
-        assert shift.applied(detector) == detector
+        assert shift.applied(ICPC) == ICPC.model_copy(update=of_detector)
+        assert shift.applied(settings) == settings.model_copy(update=of_settings)
 
 
 def test_files_and_single_keys(tmp_path: Path) -> None:
@@ -270,14 +258,11 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
     ("part", "said"),
     [
         ("temprature_K=1", "temprature_K: no such setting; did you mean temperature_K?"),
-        ("temperature_K=warm", "temperature_K: Input should be a valid number, "),
         ("temperature_K=.nan", "finite"),
         ("impurity_factor=0", "greater than 0"),
         ("diffusion_constant=cold", "diffusion_constant"),
-        ("diffusion_constant=true", "diffusion_constant: Input should be a number"),
         ("cloud_fwhm_mm=true", "cloud_fwhm_mm: Input should be a number, not true or false"),
         ("nowhere.yaml", "nowhere.yaml: neither a file nor one of default"),
-        ("a={", "not YAML"),
     ],
 )
 def test_bad_shifts_are_named(part: str, said: str) -> None:
