@@ -322,6 +322,8 @@ def test_a_library_is_made(tmp_path: Path) -> None:
     for change, words in (
         ({"grid_mm": 0}, "`grid_mm` is 0"),
         ({"settings": {"dt_ns": 2}}, "dt_ns = 2: templates are sampled every nanosecond"),
+        ({"grid_mm": 100}, "0 of 2 places .* 2 give no signal"),
+        ({"settings": {"length_ns": 50}}, "[1-9][0-9]* are not collected in time"),
     ):
         with pytest.raises(CpunetError, match=rf"^[^\n]*{words}[^\n]+$"):
             make_library("ppc", tmp_path / "other.lh5", **(short | change))

@@ -176,19 +176,6 @@ def test_the_scale_decides_whether_a_bias_depletes(caplog: pytest.LogCaptureFixt
     assert not caplog.messages
 
 
-def test_undepleted_parts_are_not_superposed() -> None:
-    detector = read_detector("ppc", COARSE)
-    solution = solve(detector)
-    depletion = solution.depletion_V(1.3)
-    for volts in (depletion + 1, depletion - 1):
-        if volts > depletion:
-            assert solution.potential_V(volts, 1.3).max() == pytest.approx(volts)
-            continue
-        wanted = detector.model_copy(update={"bias_V": volts, "impurity_scale": 1.3})
-        with pytest.raises(CpunetError, match="does not deplete it; give at least the dep"):
-            superposed_fields(solution, wanted)
-
-
 @pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
 @pytest.mark.parametrize("measured", [1200.0, 2500.0])
 def test_impurities_are_scaled_to_the_measured_depletion(
