@@ -281,6 +281,7 @@ def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
         ("xtal_diam 70.5", "xtal_radius", "crystal_radius", 35.25),
         ("pc_diam 7", "pc_radius", "point_contact_radius", 3.5),
         ("hole_diam 9", "hole_radius", "bore_radius", 4.5),
+        ("taper_length 4.5", "", "bottom_taper_length", 4.5),
         ("pc_radius 4", "", "point_contact_radius", 4),
         # lines that begin with a space are comments
         (" pc_radius 4\n\tpc_radius 5", "", "point_contact_radius", 3),

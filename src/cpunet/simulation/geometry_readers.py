@@ -201,26 +201,20 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     """
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        if not line.strip() or line[0] in " \t#" or line.split()[0] in _NOT_OF_THE_DETECTOR:
-            continue
         words = line.split("#")[0].split()
-        key = words[0].replace("_diam", "_radius")
-        key = "bottom_taper_length" if key == "taper_length" else key
+        if not words or line[0] in " \t" or words[0] in _NOT_OF_THE_DETECTOR:
+            continue
+        where, key = f"detector {name}: line {number}: {words[0]}", words[0]
+        key = {"taper_length": "bottom_taper_length"}.get(key, key).replace("_diam", "_radius")
         if key not in (*_SIGGEN_FIELDS, *_DERIVED) and not key.startswith(_OFFSETS):
-            raise CpunetError(
-                f"detector {name}: line {number}: unknown key {words[0]}; "
-                "neither siggen nor fieldgen has it"
-            )
+            raise CpunetError(f"{where}: unknown key; neither siggen nor fieldgen has it")
         try:
-            values[key] = float(words[1]) / (2 if key != words[0] else 1)
+            values[key] = float(words[1]) / (2 if words[0].endswith("_diam") else 1)
         except (IndexError, ValueError) as error:
-            raise CpunetError(
-                f"detector {name}: line {number}: {words[0]} has no number; give one"
-            ) from error
+            raise CpunetError(f"{where} has no number; give one") from error
         if key.startswith(_OFFSETS) and values.pop(key):
             raise CpunetError(
-                f"detector {name}: line {number}: {key} is not 0; only axially symmetric "
-                "detectors are simulated"
+                f"{where} is not 0; only axially symmetric detectors are simulated"
             )
         if key == "hole_length_gap":
             values["hole_length"] = values.get("xtal_length", math.nan) - values[key]
