@@ -179,20 +179,17 @@ def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Pa
     assert json.loads(h5py.File(tmp_path / "psl.lh5")["V01"].attrs["cpunet"])["rings"] == 3
 
 
-def test_a_period_in_a_column_with_units_in_bytes(chain: Path, tmp_path: Path) -> None:
-    source = write(tmp_path / "ideal.lh5", charge(), dt=Array(np.array([1e-3])))
+def test_axes_and_periods_as_others_write_them(chain: Path, tmp_path: Path) -> None:
+    # SolidStateDetectors.jl: two nodes about the axis, and a step beyond the end
+    nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
+    changes = {"r": Array(nodes, attrs={"units": "m"}), "dt": Array(np.array([1e-3]))}
+    source = write(tmp_path / "ideal.lh5", charge(), **changes)
     with h5py.File(source, "a") as file:
         file["V01/dt"].attrs["units"] = np.bytes_(b"us")
     translate_library(chain, source, tmp_path / "psl.lh5")
-    assert lh5.read("V01/dt", str(tmp_path / "psl.lh5")).value == 1
-
-
-def test_the_nodes_stay_within_the_rings(chain: Path, tmp_path: Path) -> None:
-    # as SolidStateDetectors.jl writes it: two nodes about the axis, and a step beyond the end
-    nodes = np.array([-1e-8, 1e-8, 1e-3, 2e-3, 3e-3, 3.00000001e-3])
-    source = write(tmp_path / "ideal.lh5", charge(), r=Array(nodes, attrs={"units": "m"}))
-    translate_library(chain, source, tmp_path / "psl.lh5")
     library = lh5.read("V01", str(tmp_path / "psl.lh5"))
+    assert library["dt"].value == 1
+    # the nodes stay within the rings
     np.testing.assert_allclose(library["r"].nda[:-3], 1000 * nodes)
     there = np.isfinite(library["drift_time_000_deg"].nda[:-3, 3:-3])
     assert there[np.isfinite(charge()[..., 0])].all()

@@ -60,11 +60,11 @@ def ntuple_csv(folder: Path, columns: dict[str, Column]) -> Path:
     return csv_file(folder, names, [",".join(map(str, row)) for row in rows])
 
 
-def ntuple_hdf5(path: Path, columns: dict[str, Column]) -> Path:
+def ntuple_hdf5(path: Path, columns: dict[str, Column], table: str = "det1") -> Path:
     with h5py.File(path, "w") as file:
         for name, (values, u) in columns.items():
             name = f"{name}_in_{u}" if u else name
-            file[f"default_ntuples/det1/{name}/pages"] = values
+            file[f"default_ntuples/{table}/{name}/pages"] = values
     return path
 
 
@@ -275,24 +275,6 @@ def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch) -> None:
         HitFile(file, windows=(EnergyWindow("none", 1e6, 2e6),)).open(detector)
 
 
-def g4simple_file(folder: Path, **changed: object) -> Path:
-    columns: dict[str, object] = {
-        "event": np.array([4, 4, 7, 7, 7], np.int32),
-        "volID": np.array([1, 1, 1, 2, 0], np.int32),
-        "Edep": np.array([0.5, 1.0, 0.25, 0.3, 0.0]),
-        "x": np.arange(5.0),
-        "y": np.zeros(5),
-        "z": np.array([1.0, 2, 3, 4, 5]),
-    }
-    columns.update(changed)
-    path = folder / "hits.hdf5"
-    with h5py.File(path, "w") as file:
-        for name, values in columns.items():
-            if values is not None:
-                file[f"default_ntuples/g4sntuple/{name}/pages"] = values
-    return path
-
-
 def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
     path = reference_data / "geant4" / "remage-th228-stp.lh5"
     hits = read_hits(path, HitOptions("det1"))
@@ -330,14 +312,20 @@ def test_npz_of_geant4(reference_data: Path) -> None:
 
 
 def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
-    hits = read_hits(g4simple_file(tmp_path), HitOptions("1"))
+    def read(**changed: list[float]) -> Hits:
+        columns = {"event": [4, 4, 7, 7, 7], "volID": [1, 1, 1, 2, 0]}
+        columns |= {"Edep": [0.5, 1.0, 0.25, 0.3, 0.0], "x": [0, 1, 2, 3, 4], "y": [0] * 5}
+        columns |= {"z": [1, 2, 3, 4, 5]} | changed
+        arrays = {name: (np.array(values), "") for name, values in columns.items()}
+        path = ntuple_hdf5(tmp_path / "hits.hdf5", arrays, "g4sntuple")
+        return read_hits(path, HitOptions("1"))
+
+    hits = read()
     np.testing.assert_allclose(hits.energy_kev, [1500, 250])
     np.testing.assert_array_equal(hits.event_number, [4, 7])
     np.testing.assert_array_equal(hits.z_mm, [1, 2, 3])
-    with pytest.raises(CpunetError, match="has columns for event, x, y, z, edep"):
-        read_hits(g4simple_file(tmp_path, Edep=None))
     with pytest.raises(CpunetError, match="differ in length"):
-        read_hits(g4simple_file(tmp_path, x=np.zeros(3)), HitOptions("1"))
+        read(x=[0, 0, 0])
 
 
 def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
