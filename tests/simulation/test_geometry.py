@@ -33,34 +33,6 @@ def test_active_germanium_is_inside(name: str, r: float, z: float) -> None:
     assert not detector.active(r, z) or detector.inside(r, z)
 
 
-@given(z=st.floats(2.1, 60), depth=st.floats(0, 3))
-def test_lithium_is_as_thick_as_said_on_the_wall(z: float, depth: float) -> None:
-    r = ICPC.crystal_radius - depth
-    assert ICPC.inside(r, z)
-    assert ICPC.active(r, z) == (depth > ICPC.li_thickness + 1e-5)
-
-
-@pytest.mark.parametrize("taper", ["outer", "inner", "bottom"])
-def test_lithium_is_as_thick_as_said_on_a_taper(taper: str) -> None:
-    detector = changed(
-        outer_taper_length=30 if taper == "outer" else 0,
-        inner_taper_length=30 if taper == "inner" else 0,
-        bottom_taper_length=20 if taper == "bottom" else 0,
-        bottom_taper_angle_deg=20,
-        siggen_conventions=False,
-    )
-    angle = math.radians(20 if taper == "bottom" else detector.taper_angle_deg)
-    length, radius = detector.crystal_length, detector.crystal_radius
-    r, z, into_r, into_z = {
-        "outer": (radius - 15 * math.tan(angle), length - 15, -1, -1),
-        "inner": (detector.bore_radius + 15 * math.tan(angle), length - 15, 1, -1),
-        "bottom": (radius - 10 * math.tan(angle), 10, -1, 1),
-    }[taper]
-    for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
-        at = (r + depth * into_r * math.cos(angle), z + depth * into_z * math.sin(angle))
-        assert (detector.inside(*at), detector.active(*at)) == (inside, active)
-
-
 CYLINDERS = {
     "top_cylinder_length": 20, "top_cylinder_radius": 33, "bottom_cylinder_length": 25,
     "bottom_cylinder_radius": 36, "bottom_transition_length": 6, "top_groove_depth": 9,
@@ -112,19 +84,49 @@ def test_walls_follow_their_profiles() -> None:
             assert not detector.inside(wall - inwards, z)[at].any()
 
 
+LONG = {"siggen_conventions": False, "outer_taper_length": 0}
+TEN, TWENTY = math.radians(10), math.radians(20)
+BORE_END = ICPC.crystal_length - ICPC.bore_length + ICPC.bore_radius
+
+
 @pytest.mark.parametrize(
-    ("place", "inwards"),
+    ("change", "place", "inwards"),
     [
-        ((33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
-        ((38.0, 76.0), (0, -1)),  # step below it
-        ((36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
-        ((36 + 4.45 / 2, 28.0), (-6 / math.hypot(6, 4.45), 4.45 / math.hypot(6, 4.45))),
-        ((19.0, 92.0), (1, 0)),  # wall of the groove
-        ((12.0, 87.0), (0, -1)),  # its floor
+        ({}, (ICPC.crystal_radius, 30.0), (-1, 0)),
+        (
+            {},
+            (5 * math.sin(0.7), BORE_END - 5 * math.cos(0.7)),
+            (math.sin(0.7), -math.cos(0.7)),
+        ),
+        (
+            LONG | {"outer_taper_length": 30},
+            (ICPC.crystal_radius - 15 * math.tan(TEN), ICPC.crystal_length - 15),
+            (-math.cos(TEN), -math.sin(TEN)),
+        ),
+        (
+            LONG | {"inner_taper_length": 30},
+            (ICPC.bore_radius + 15 * math.tan(TEN), ICPC.crystal_length - 15),
+            (math.cos(TEN), -math.sin(TEN)),
+        ),
+        (
+            LONG | {"bottom_taper_length": 20, "bottom_taper_angle_deg": 20},
+            (ICPC.crystal_radius - 10 * math.tan(TWENTY), 10),
+            (-math.cos(TWENTY), math.sin(TWENTY)),
+        ),
+        (CYLINDERS, (33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
+        (CYLINDERS, (38.0, 76.0), (0, -1)),  # step below it
+        (CYLINDERS, (36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
+        (
+            CYLINDERS,
+            (36 + 4.45 / 2, 28.0),
+            (-6 / math.hypot(6, 4.45), 4.45 / math.hypot(6, 4.45)),
+        ),
+        (CYLINDERS, (19.0, 92.0), (1, 0)),  # wall of the groove
+        (CYLINDERS, (12.0, 87.0), (0, -1)),  # its floor
     ],
 )
-def test_lithium_is_as_thick_as_said_on_cylinders_and_a_groove(place, inwards) -> None:
-    detector = changed(**CYLINDERS)
+def test_lithium_is_as_thick_as_said(change, place, inwards) -> None:
+    detector = changed(**change)
     for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
         at = [x + depth * step for x, step in zip(place, inwards, strict=True)]
         assert (detector.inside(*at), detector.active(*at)) == (inside, active)
@@ -138,15 +140,6 @@ def test_lithium_of_fieldgen_is_thicker_on_a_taper() -> None:
     assert theirs.active(wall - (1 + tangent) - 0.01, z)
     exact = changed(siggen_conventions=False)
     assert exact.active(wall - 1 / math.cos(math.radians(10)) - 0.01, z)
-
-
-@given(angle=st.floats(0, math.pi / 2), distance=st.floats(5.01, 9))
-def test_the_bore_ends_in_a_hemisphere(angle: float, distance: float) -> None:
-    centre = ICPC.crystal_length - ICPC.bore_length + ICPC.bore_radius
-    r, z = distance * math.sin(angle), centre - distance * math.cos(angle)
-    assert ICPC.inside(r, z)
-    assert ICPC.active(r, z) == (distance > 6 + 1e-5)
-    assert not ICPC.inside(r * 4.99 / distance, centre + (z - centre) * 4.99 / distance)
 
 
 def test_the_ditch_is_no_germanium_on_any_grid() -> None:

@@ -332,28 +332,12 @@ def test_holes_beside_the_axis_are_refused(tmp_path: Path) -> None:
         siggen(tmp_path, "hole_offset_y_top 4")
 
 
-ICPC: dict[str, Any] = {
-    "name": "V99000A",
-    "type": "icpc",
-    "geometry": {
-        "height_in_mm": 80,
-        "radius_in_mm": 35,
-        "borehole": {"radius_in_mm": 5, "depth_in_mm": 55},
-        "groove": {"depth_in_mm": 1, "radius_in_mm": {"outer": 10, "inner": 9}},
-        "pp_contact": {"radius_in_mm": 3, "depth_in_mm": 2},
-    },
-    "characterization": {
-        "l200_site": {"recommended_voltage_in_V": 4500.0},
-        "combined_0vbb_analysis": {"fccd_in_mm": {"value": 0.75}},
-    },
-}
-
-
 def legend(folder: Path, *extra: object) -> Detector:
-    """The diode, with ``geometry.extra`` if it is given."""
-    geometry = ICPC["geometry"] | ({"extra": extra[0]} if extra else {})
+    """A diode with a bore, and ``geometry.extra`` if it is given."""
+    bore = {"borehole": {"radius_in_mm": 5, "depth_in_mm": 55}, "height_in_mm": 80}
+    geometry = DIODE["geometry"] | bore | {"taper": {}} | ({"extra": extra[0]} if extra else {})
     path = folder / "V99000A.json"
-    path.write_text(json.dumps(ICPC | {"geometry": geometry}))
+    path.write_text(json.dumps(DIODE | {"type": "icpc", "geometry": geometry}))
     return read_detector(path, [IMPURITIES])
 
 

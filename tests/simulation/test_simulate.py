@@ -195,17 +195,7 @@ def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
     assert first.energy_kev == pytest.approx(second.energy_kev)
 
 
-def test_hits_outside_are_told(ppc, source, caplog):
-    source.open(ppc)
-    # one of five, at z = 300 mm
-    assert caplog.messages == [
-        f"{source.path}: 1 of 5 (20.0%) hits lie outside ppc (radius 34, z 0 to 46 "
-        "mm); they span x 0 to 12, y 0 to 3, z 20 to 300 mm; their energy is lost; check "
-        "`origin`, `flip_z` and `hits_detector`"
-    ]
-
-
-def test_a_stray_hit_draws_no_warning_and_many_are_refused(ppc, tmp_path: Path, caplog):
+def test_a_stray_hit_draws_no_warning_and_many_are_refused(ppc, source, tmp_path, caplog):
     def opened(inside: int, outside: int) -> str:
         caplog.clear()
         z_mm = [*(20 + 0.01 * i for i in range(inside)), *(47.0 + i for i in range(outside))]
@@ -214,7 +204,11 @@ def test_a_stray_hit_draws_no_warning_and_many_are_refused(ppc, tmp_path: Path, 
         return " ".join(caplog.messages)
 
     assert opened(1000, 1) == ""
-    assert "2 of 1002 (0.2%) hits" in opened(1000, 2)
+    assert opened(1000, 2) == (
+        f"{source.path}: 2 of 1002 (0.2%) hits lie outside ppc (radius 34, z 0 to 46 mm); they "
+        "span x 10 to 10, y 0 to 0, z 20 to 48 mm; their energy is lost; check `origin`, "
+        "`flip_z` and `hits_detector`"
+    )
     with pytest.raises(CpunetError, match=r"10 of 11 \(90.9%\) hits lie outside ppc .* move"):
         opened(1, 10)
 
@@ -226,14 +220,10 @@ def test_no_event_with_a_signal(ppc, tmp_path: Path):
     assert not (tmp_path / "sim.lh5").exists()
 
 
-def test_the_diffusion_is_that_of_the_field_unless_told():
+def test_settings_and_what_is_wrong_with_them(tmp_path: Path):
     assert SimulationSettings().diffusion_constant == 0.12
-    assert SimulationSettings(diffusion_constant="0.09").diffusion_constant == 0.09
     kept = SimulationSettings(diffusion_constant="temperature").model_dump(mode="json")
     assert SimulationSettings.model_validate(kept).diffusion_constant == "temperature"
-
-
-def test_wrong_settings_name_the_file(tmp_path: Path):
     path = tmp_path / "settings.yaml"
     for text, said in (
         ("diffusion_constant: hot", "diffusion_constant: give a number above 0"),
