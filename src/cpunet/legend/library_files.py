@@ -44,6 +44,8 @@ class IdealLibrary:
 
     Attributes
     ----------
+    where
+        File and group, for messages.
     path
         Path of the group, the detector's name.
     r_mm, z_mm
@@ -52,6 +54,7 @@ class IdealLibrary:
         Azimuths such as ``"000_deg"``, ascending.
     """
 
+    where: str
     path: str
     r_mm: Values
     z_mm: Values
@@ -98,7 +101,7 @@ class IdealLibrary:
                     f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
                 )
         angles = tuple(name.removeprefix("waveform_") for name in names)
-        return cls(path, r_mm, z_mm, angles)
+        return cls(where, path, r_mm, z_mm, angles)
 
     @property
     def n_templates(self) -> int:
@@ -193,7 +196,7 @@ def known_detector(run: Run) -> str | None:
 
 
 def require_complete(
-    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary, source: Path
+    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary
 ) -> None:
     """Raise an error if a library lacks whole rows of grid points between others.
 
@@ -206,20 +209,19 @@ def require_complete(
     for angle, mask in inside.items():
         if not mask.any():
             raise CpunetError(
-                f"{source}: {library.path}: no template of {angle} can be translated; simulate "
-                "this azimuth again, or leave it out"
+                f"{library.where}: no template of {angle} can be translated; simulate this "
+                "azimuth again, or leave it out"
             )
         for name, axis, rows in (
             ("r", library.r_mm, mask.any(axis=1)),
             ("z", library.z_mm, mask.any(axis=0)),
         ):
             held = np.flatnonzero(rows)
-            missing = np.setdiff1d(np.arange(held[0], held[-1]), held) if len(held) else held
+            missing = np.setdiff1d(np.arange(held[0], held[-1]), held)
             if len(missing):
                 raise CpunetError(
-                    f"{source}: {library.path}: {len(missing)} rows of {angle} are NaN between "
-                    f"others, the first at {name} {axis[missing[0]]:g} mm; simulate these "
-                    "places again"
+                    f"{library.where}: {len(missing)} rows of {angle} are NaN between others, "
+                    f"the first at {name} {axis[missing[0]]:g} mm; simulate these places again"
                 )
 
 

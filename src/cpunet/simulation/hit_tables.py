@@ -25,7 +25,6 @@ from cpunet.units import factor, unit_names
 HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
 NTUPLES, STEPS = "default_ntuples", "stp"
 _G4SIMPLE, _G4SIMPLE_TITLE, _G4SIMPLE_UNITS = "g4sntuple", "steps data", "mm,MeV"
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
 # what a column is, and its names in small letters: the first of these is read
 _NAMES = {
@@ -49,10 +48,9 @@ class StepTable:
 
     Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
     the vectors of deposits give the steps of each row. The `name` is that of the detector,
-    empty without any. Where detectors share the table, `labels` are those of the steps, and
-    those with the `label` are read.
-    `units` are those of columns that name none: MeV and mm in tables of g4simple. A `file` of
-    remage tells where its detectors are.
+    empty without any. `units` are those of columns that name none: MeV and mm in tables of
+    g4simple. A `file` of remage tells where its detectors are. Where detectors share the table,
+    `labels` are those of the steps, and those with the `label` are read.
     """
 
     path: Path
@@ -207,12 +205,7 @@ def _unit_factor(role: str, where: str, units: Iterable[str]) -> float:
 
 def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
     """Format of a file of hits by its content; `stored` are hits with their pulses."""
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(len(_CSV_MAGIC))
-    except OSError as error:
-        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    if start.startswith(_HDF5_MAGIC):
+    if h5py.is_hdf5(path):
         with opened(path) as file:
             if any(isinstance(file.get(folder), h5py.Group) for folder in (STEPS, NTUPLES)):
                 return "tables"
@@ -220,7 +213,11 @@ def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
     if zipfile.is_zipfile(path):
         with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
             return "npz" if {"x_mm.npy", "offsets.npy"} <= {*archive.namelist()} else ""
-    return "csv" if start == _CSV_MAGIC else ""
+    try:
+        with path.open("rb") as stream:
+            return "csv" if stream.read(len(_CSV_MAGIC)) == _CSV_MAGIC else ""
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 @contextmanager
