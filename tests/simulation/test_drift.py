@@ -15,7 +15,6 @@ from cpunet.simulation.field_lookup import (
     HOLE,
     VelocityTable,
     carrier_velocity,
-    measured_table,
     velocity_factor,
     velocity_table,
 )
@@ -70,16 +69,6 @@ def test_reference_vectors(
         field, expected = data["E"], data[f"{name}_{temperature}"]
     velocity = drift_velocity(velocity_table(temperature), field, carrier)
     np.testing.assert_allclose(velocity, expected, atol=3e-7)
-
-
-@pytest.mark.parametrize(("axis", "column"), [((1, 0, 0), 1), ((1, 1, 0), 2), ((1, 1, 1), 3)])
-def test_along_the_axes_the_table_comes_back(axis: tuple[int, ...], column: int) -> None:
-    table = measured_table()
-    direction = np.array(axis) / np.linalg.norm(axis)
-    for carrier, sign in ((ELECTRON, -1), (HOLE, 1)):
-        velocity = drift_velocity(velocity_table(77), table[:, :1] * direction, carrier)
-        speed = table[:, column + 3 * carrier]
-        np.testing.assert_allclose(velocity, sign * speed[:, None] * direction, atol=1e-12)
 
 
 @given(component, component, component)

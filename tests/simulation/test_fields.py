@@ -147,7 +147,7 @@ def test_any_bias_and_impurity_from_one_solution(
         gradient = scale * detector.impurity_gradient_1e10_per_cm4 + tilt
         written = {"impurity_z0_1e10_per_cm3": z0, "impurity_gradient_1e10_per_cm4": gradient}
         alone = detector.model_copy(update=written | {"bias_V": bias})
-        expected = compute_fields(alone, cache=False)
+        expected = compute_fields(alone)
         for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm", "weighting_potential"):
             np.testing.assert_allclose(
                 getattr(fields, name), getattr(expected, name), atol=1e-6
@@ -191,7 +191,7 @@ def test_impurities_are_scaled_to_the_measured_depletion(
     values = detector.model_dump()
     for key in ("impurity_z0_1e10_per_cm3", "impurity_gradient_1e10_per_cm4"):
         values[key] *= scaled.impurity_scale
-    alone = compute_fields(Detector.model_validate(values), cache=False)
+    alone = compute_fields(Detector.model_validate(values))
     assert alone.depletion_V == pytest.approx(measured, abs=1)
 
 

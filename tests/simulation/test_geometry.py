@@ -40,21 +40,6 @@ CYLINDERS = {
 }  # fmt: skip
 
 
-def test_cylinders_and_a_groove_take_off_their_volumes() -> None:
-    r, z = (np.arange(n * 20) / 20 + 0.025 for n in (41, 96))
-    ring = 2 * math.pi * r[:, np.newaxis] * 0.05**2
-
-    def volume(detector: Detector) -> float:
-        return float((ring * detector.inside(*np.meshgrid(r, z, indexing="ij"))).sum())
-
-    radius = ICPC.crystal_radius
-    cone = math.pi * 6 * (radius**2 - (radius**2 + 36 * radius + 36**2) / 3)
-    expected = math.pi * (20 * (radius**2 - 33**2) + 25 * (radius**2 - 36**2)) + cone
-    expected += math.pi * 9 * (19**2 - ICPC.bore_radius**2)
-    less = volume(changed(outer_taper_length=0)) - volume(changed(**CYLINDERS))
-    assert less == pytest.approx(expected, rel=2e-3)
-
-
 def test_walls_follow_their_profiles() -> None:
     """Tapers, rounded edges and the end of the bore, by their formulas."""
     length, radius = ICPC.crystal_length, ICPC.crystal_radius

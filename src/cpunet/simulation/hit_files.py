@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ from cpunet.simulation.hits import (
     IntArray,
 )
 from cpunet.tables import Lines, counted, span
+
+log = logging.getLogger(__name__)
 
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
@@ -107,7 +109,7 @@ def _to_hits(
     """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
 
     Positions are moved to the frame of the crystal. An event whose number an earlier one has
-    gets a new one, above the largest.
+    gets a new one, above the largest. Late deposits of an event draw a warning.
 
     Raises
     ------
@@ -147,11 +149,16 @@ def _to_hits(
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
     )
-    if time is None or not len(hits):
-        return hits
-    times, begins = time[order], hits.offsets[:-1]
-    spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
-    return replace(hits, n_late=int((spread > LATE_NS).sum()))
+    if time is not None and len(hits):
+        times, begins = time[order], hits.offsets[:-1]
+        spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
+        if late := int((spread > LATE_NS).sum()):
+            log.warning(
+                f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their "
+                "first, simulated as if at once; if these are other events, give them numbers "
+                "of their own"
+            )
+    return hits
 
 
 def first_of_event(number: IntArray, time_ns: FloatArray | None) -> IntArray:

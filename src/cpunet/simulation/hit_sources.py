@@ -20,7 +20,7 @@ from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hits import LATE_NS, WINDOW_US, HitOptions, Hits, OpenHits
+from cpunet.simulation.hits import WINDOW_US, HitOptions, Hits, OpenHits
 
 log = logging.getLogger(__name__)
 
@@ -137,12 +137,6 @@ class HitFile:
             the crystal.
         """
         hits = read_hits(self.path, self.options)
-        if hits.n_late:
-            log.warning(
-                f"{self.path}: {hits.n_late} events have deposits more than {LATE_NS:g} ns "
-                "after their first, simulated as if at once; if these are other events, give "
-                "them numbers of their own"
-            )
         if self.windows:
             # sums of deposits are rounded, in some formats to float32; windows are wider
             energy = hits.energy_kev

@@ -61,9 +61,6 @@ class Hits:
         Int64 array of ``n_events + 1``, from 0 to the number of hits.
     event_number
         Event numbers of the source.
-    n_late
-        Number of events with a deposit more than `LATE_NS` after their first, where a file
-        tells the times.
 
     Raises
     ------
@@ -83,7 +80,6 @@ class Hits:
     edep_kev: FloatArray
     offsets: IntArray
     event_number: IntArray
-    n_late: int = 0
 
     def __post_init__(self) -> None:
         farthest = np.abs(self.position_mm).max(initial=0)
