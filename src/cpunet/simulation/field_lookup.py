@@ -65,13 +65,6 @@ class VelocityTable(NamedTuple):
     fields_per_V_per_cm: float
 
 
-def measured_table() -> FloatArray:
-    """Speeds at 77 K: field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns."""
-    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
-    with source.open(encoding="utf-8") as lines:
-        return np.loadtxt(lines, delimiter=",", comments=("#", "field"))
-
-
 def velocity_table(
     temperature_K: float, factors: VelocityFactors = AS_MEASURED
 ) -> VelocityTable:
@@ -106,7 +99,10 @@ def velocity_table(
     >>> round(carrier_velocity(*table, HOLE, 1000.0, 0.0, 0.0)[0], 3)
     0.081
     """
-    measured = measured_table()
+    # field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns
+    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
+    with source.open(encoding="utf-8") as lines:
+        measured = np.loadtxt(lines, delimiter=",", comments=("#", "field"))
     field = measured[:, 0]
     step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
     grid = np.arange(round(field[-1] / step) + 1) * step
@@ -169,15 +165,6 @@ def carrier_velocity(
 
     positive for holes and negative for electrons. The <100> axes are x, y and z. Beyond the
     last field of the table, its last interval is extrapolated linearly.
-
-    Examples
-    --------
-    Along <100> the speed is that of the table.
-
-    >>> row = measured_table()[8]
-    >>> velocity = carrier_velocity(*velocity_table(77.0), HOLE, row[0], 0.0, 0.0)
-    >>> bool(abs(velocity[0] - row[4]) < 1e-12), velocity[1:3]
-    (True, (0.0, 0.0))
     """
     strength = math.sqrt(ex * ex + ey * ey + ez * ez)
     if strength <= 0.0:
