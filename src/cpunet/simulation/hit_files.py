@@ -117,12 +117,11 @@ def _to_hits(
         If a step has no finite position, time or energy, or a negative energy.
     """
     position = np.stack([steps[axis] for axis in "xyz"], axis=1) - origin_mm
-    event, edep, time = steps["event"], steps["edep"], steps.get("time")
+    event, edep = steps["event"], steps["edep"]
+    time = steps.get("time", np.zeros(len(event)))
     # written so that NaN fails
-    placed = (np.abs(position) <= FARTHEST_MM).all(axis=1)
+    placed = (np.abs(position) <= FARTHEST_MM).all(axis=1) & np.isfinite(time)
     bad = ~(placed & (edep >= 0) & (edep <= MAX_KEV))
-    if time is not None:
-        bad |= ~np.isfinite(time)
     if bad.any():
         raise CpunetError(
             f"{path}: event {event[np.argmax(bad)]}: a step has no finite position or time, or "
@@ -131,8 +130,7 @@ def _to_hits(
         )
     positive = edep > 0
     largest = event.max(initial=-1)
-    event, edep, position = event[positive], edep[positive], position[positive]
-    time = None if time is None else time[positive]
+    event, edep, position, time = (x[positive] for x in (event, edep, position, time))
     first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")
@@ -149,7 +147,7 @@ def _to_hits(
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
     )
-    if time is not None and len(hits):
+    if len(hits):
         times, begins = time[order], hits.offsets[:-1]
         spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
         if late := int((spread > LATE_NS).sum()):
@@ -161,7 +159,7 @@ def _to_hits(
     return hits
 
 
-def first_of_event(number: IntArray, time_ns: FloatArray | None) -> IntArray:
+def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     """Index of the first step of the event of each step.
 
     Steps of a number are parted where none comes for `WINDOW_US` (the decays of a chain are
@@ -171,14 +169,13 @@ def first_of_event(number: IntArray, time_ns: FloatArray | None) -> IntArray:
     --------
     >>> first_of_event(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]))
     array([0, 1, 2])
-    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), None)
+    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), np.zeros(6))
     array([0, 1, 2, 3, 4, 5])
     """
     job = _job_of_step(number)
-    order = np.lexsort((job, number) if time_ns is None else (time_ns, job, number))
+    order = np.lexsort((time_ns, job, number))
     new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
-    if time_ns is not None:
-        new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
+    new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
     starts = np.flatnonzero(np.append(True, new)[: len(number)])
     first = np.empty(len(number), np.int64)
     counts = np.diff(np.append(starts, len(number)))

@@ -75,10 +75,7 @@ class StepTable:
         if not names:
             return {self.name: self}
         of_steps = texts(of[names[0]]) if len(names) == 1 else labels(of, names)
-        found = sorted(
-            map(str, np.unique(of_steps[deposits])),
-            key=lambda label: (len(label), label) if label.isdigit() else (99, label),
-        )
+        found = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
         if len(found) > 1 or (found and not self.name):
             return {label: replace(self, label=label, labels=of_steps) for label in found}
         return {self.name: self}
