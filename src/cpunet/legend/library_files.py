@@ -403,9 +403,11 @@ def make_library(
         put(library, "z", z_mm, "mm")
         put(library, "dt", wanted.dt_ns, "ns")
         put(library, "t0", 0.0, "ns")
+        waveforms = np.empty((*shape, wanted.n_samples), np.float32)
+        drift_times = np.empty(shape)
         for angle_deg in ANGLES_DEG:
-            waveforms = np.full((*shape, wanted.n_samples), np.nan, np.float32)
-            drift_times = np.full(shape, np.nan)
+            waveforms.fill(np.nan)
+            drift_times.fill(np.nan)
             phi = math.radians(angle_deg)
             for i, r in enumerate(r_mm):
                 x, y = r * math.cos(phi), r * math.sin(phi)
