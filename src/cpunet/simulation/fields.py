@@ -198,7 +198,7 @@ class Superposition:
 def solve(detector: Detector) -> Superposition:
     """Solve for the parts of a detector's potential, or load them from the cache.
 
-    They are kept on disk (in ``$CPUNET_CACHE`` or the user's cache folder) and loaded if the
+    They are stored on disk (in ``$CPUNET_CACHE`` or the user's cache folder) and loaded if the
     same detector was solved before, at any bias and any scale and tilt of its impurities.
 
     Raises

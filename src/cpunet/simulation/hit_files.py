@@ -130,7 +130,8 @@ def _to_hits(
         )
     positive = edep > 0
     largest = event.max(initial=-1)
-    event, edep, position, time = (x[positive] for x in (event, edep, position, time))
+    event, edep = event[positive], edep[positive]
+    position, time = position[positive], time[positive]
     first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")

@@ -75,9 +75,9 @@ class StepTable:
         if not names:
             return {self.name: self}
         of_steps = texts(of[names[0]]) if len(names) == 1 else labels(of, names)
-        found = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
-        if len(found) > 1 or (found and not self.name):
-            return {label: replace(self, label=label, labels=of_steps) for label in found}
+        detectors = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
+        if len(detectors) > 1 or (detectors and not self.name):
+            return {label: replace(self, label=label, labels=of_steps) for label in detectors}
         return {self.name: self}
 
     def steps(self, units: str) -> dict[str, npt.NDArray[Any]]:
