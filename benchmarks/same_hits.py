@@ -72,7 +72,7 @@ def main() -> None:
         change = []
         for mode in ("exact", "quick"):
             events = same.simulate(
-                shift.detector(detector), shift.settings(settings), quick=mode == "quick"
+                shift.applied(detector), shift.applied(settings), quick=mode == "quick"
             )
             change.append(moments(events.waveforms[kept], 4) - first[mode])
         exact, error = change[0], change[1] / change[0] - 1

@@ -38,7 +38,7 @@ def hits_of_an_event(detector: Detector) -> Hits:
         wanted=wanted,
     )
     hits = merge_hits(hits, detector, SimulationSettings().cluster_mm)
-    return hits.of_events([np.unique(hits.event_number)[EVENT]])
+    return hits[np.argsort(hits.event_number)[[EVENT]]]
 
 
 def draw_hits(panel: Axes, detector: Detector, hits: Hits) -> None:

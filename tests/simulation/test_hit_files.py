@@ -60,11 +60,11 @@ def ntuple_csv(folder: Path, columns: dict[str, Column]) -> Path:
     return csv_file(folder, names, [",".join(map(str, row)) for row in rows])
 
 
-def ntuple_hdf5(path: Path, columns: dict[str, Column]) -> Path:
+def ntuple_hdf5(path: Path, columns: dict[str, Column], table: str = "det1") -> Path:
     with h5py.File(path, "w") as file:
         for name, (values, u) in columns.items():
             name = f"{name}_in_{u}" if u else name
-            file[f"default_ntuples/det1/{name}/pages"] = values
+            file[f"default_ntuples/{table}/{name}/pages"] = values
     return path
 
 
@@ -100,18 +100,15 @@ def test_decays_of_a_chain_are_events_of_their_own(tmp_path: Path, layout: str) 
 
 def test_late_deposits_are_counted(tmp_path, caplog) -> None:
     """A third of the events has its second step 500 ns after the first."""
-    time = TIME_NS.copy()
-    time[1::9] += 500
-    path = written(tmp_path, "vectors", steps(time=(time, "ns")))
-    HitFile(path).open(read_detector("icpc"))
-    (told,) = (text for text in caplog.messages if "lie outside" not in text)
-    assert f"{N // 3} events have deposits more than 50 ns after their first" in told
-    caplog.clear()
-    time[1::9] += 20_000  # longer than what one event lasts
-    path = written(tmp_path, "vectors", steps(time=(time, "ns")))
-    assert read_hits(path).n_events == 2 * N + N // 3
-    HitFile(path).open(read_detector("icpc"))
-    assert "deposits more than" not in caplog.text
+    for later_ns, n_events, told in ((500, 2 * N, 1), (20_500, 2 * N + N // 3, 0)):
+        time = TIME_NS.copy()
+        time[1::9] += later_ns  # 20 us are longer than what one event lasts
+        hits = read_hits(written(tmp_path, "vectors", steps(time=(time, "ns"))))
+        assert hits.n_events == n_events
+        assert len(caplog.messages) == told
+        text = f"{N // 3} events have deposits more than 50 ns after their first"
+        assert all(text in message for message in caplog.messages)
+        caplog.clear()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -135,15 +132,11 @@ def test_volumes_and_replicas(tmp_path, layout, columns, detectors) -> None:
 
 
 def test_links_to_steps_of_other_files(tmp_path: Path) -> None:
-    for name, factor in (("one", 1.0), ("two", 2.0)):
-        stp(tmp_path / f"{name}.lh5", np.arange(EVENTS))
-        with h5py.File(tmp_path / f"{name}.lh5", "a") as file:
-            table = next(iter(file["stp"]))
-            edep = file[f"stp/{table}/edep"]
-            (edep if isinstance(edep, h5py.Dataset) else edep["flattened_data"])[:] *= factor
     with h5py.File(tmp_path / "all.h5", "w") as file:
-        for name in ("one", "two"):
-            file[f"stp/{name}"] = h5py.ExternalLink(f"{name}.lh5", f"stp/{table}")
+        for name, factor in (("one", 1.0), ("two", 2.0)):
+            columns = steps(edep=(factor * EDEP_KEV, "keV"))
+            remage(tmp_path / f"{name}.lh5", columns, vectors=True, table=name)
+            file[f"stp/{name}"] = h5py.ExternalLink(f"{name}.lh5", f"stp/{name}")
     one, two = (read_hits(tmp_path / "all.h5", HitOptions(name)) for name in ("one", "two"))
     np.testing.assert_allclose(two.energy_kev, 2 * one.energy_kev)
     (tmp_path / "two.lh5").unlink()
@@ -223,92 +216,60 @@ def test_energies_of_another_unit_are_named(tmp_path, factor, said) -> None:
         read_hits(path)
 
 
-def test_a_time_that_is_no_number_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path, "flat", steps(time=(np.full(3 * N, np.nan), "ns")))
-    with pytest.raises(CpunetError, match="event 0: a step has no finite position or time"):
-        read_hits(path)
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"time": (np.full(3 * N, np.nan), "ns")}, "event 0: a step has no finite position or"),
+        ({"evtid": (np.where(EVENT == 0, np.nan, EVENT), "")}, "column evtid"),
+        ({"edep": (0 * EDEP_KEV, "keV")}, "no step deposits energy"),
+    ],
+)
+def test_what_is_wrong_with_values_is_told(tmp_path, change, said) -> None:
+    path = written(tmp_path, "flat", steps(**change))
+    one_line(lambda: read_hits(path), said, str(path))
 
 
-def stp(path: Path, numbers: np.ndarray, *, deposits: bool = True) -> Path:
-    """A table with a row per event of one to four steps on the axis of a detector."""
-    rng = np.random.default_rng(2)
-    ends = np.cumsum(rng.integers(1, 5, len(numbers)))
-    edep = rng.uniform(0, 900, ends[-1]) * (rng.random(ends[-1]) > 0.3) * deposits
-    places = {"xloc": 0 * edep, "yloc": 0 * edep, "zloc": rng.uniform(0.02, 0.03, len(edep))}
-    columns = {name: (values, "m") for name, values in places.items()}
-    table: dict[str, Any] = {"evtid": numbers}
-    for name, (values, unit) in (columns | {"edep": (edep, "keV")}).items():
-        flat = Array(values, attrs={"units": unit})
-        table[name] = VectorOfVectors(flattened_data=flat, cumulative_length=Array(ends))
-    path.unlink(missing_ok=True)
-    return write_table(path, "stp/V01", **table)
+def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path: Path) -> None:
+    small = read_hits(written(tmp_path, "vectors", steps()))
+    large = read_hits(written(tmp_path, "vectors", steps(evtid=(2**53 + EVENT, ""))))
+    np.testing.assert_array_equal(large.event_number, 2**53 + small.event_number)
+    np.testing.assert_array_equal(large.offsets, small.offsets)
 
 
-def require_same(a: Hits, b: Hits) -> None:
-    for name in ("position_mm", "edep_kev", "offsets", "event_number"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+def test_damaged_files_of_remage(tmp_path: Path) -> None:
+    path = written(tmp_path, "vectors", steps())
+    with h5py.File(path, "r+") as file:
+        file["stp/det1/xloc/cumulative_length"][0] = 1
+    one_line(lambda: read_hits(path), "differ in length", str(path))
+    with h5py.File(path, "r+") as file:
+        del file["stp/det1/edep"]
+    one_line(lambda: read_hits(path), "no table of stp or default_ntuples has columns")
 
 
-EVENTS = 53
+@pytest.mark.parametrize("origin", [0.01, np.array([0.01])])
+def test_an_origin_is_a_number_or_an_array_of_one(tmp_path: Path, origin: object) -> None:
+    path = written(tmp_path, "vectors", steps())
+    with h5py.File(path, "r+") as file:
+        file["detector_origins/det1/xloc"] = origin  # in m
+        file["detector_origins/det1/yloc"] = file["detector_origins/det1/zloc"] = 0.0
+    assert (read_hits(path).x_mm == -10).all()
 
 
-def test_event_numbers_that_differ_in_their_last_digit_only(tmp_path):
-    small = read_hits(stp(tmp_path / "small.lh5", np.arange(EVENTS)))
-    file = stp(tmp_path / "stp.lh5", 2**53 + np.arange(EVENTS))
-    read = read_hits(file)
-    np.testing.assert_array_equal(read.event_number, 2**53 + small.event_number)
-    np.testing.assert_array_equal(read.offsets, small.offsets)
-
-
-def test_event_numbers_that_are_text(tmp_path):
-    file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
-    with h5py.File(file, "r+") as content:
-        del content["stp/V01/evtid"]
-        content["stp/V01/evtid"] = [b"a"] * EVENTS
-        content["stp/V01/evtid"].attrs["datatype"] = "array<1>{real}"
-    with pytest.raises(CpunetError, match=r"stp\.lh5: [^\n]+$"):
-        read_hits(file)
-
-
-def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch):
-    file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
+def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch) -> None:
+    file, detector = written(tmp_path, "vectors", steps()), read_detector("icpc")
     monkeypatch.setattr(hit_sources, "BLOCK_EVENTS", 8)
     hits = read_hits(file)
-    kept = hits[(hits.energy_kev >= 100) & (hits.energy_kev <= 1500)]
-    for windows, expected in (((), hits), ((EnergyWindow("some", 100, 1500),), kept)):
-        opened = HitFile(file, windows=windows).open(read_detector("icpc"))
+    low = hits[hits.energy_kev < 1500]
+    for windows, expected in (((), hits), ((EnergyWindow("some", 100, 1500),), low)):
+        opened = HitFile(file, windows=windows).open(detector)
         blocks = list(opened.blocks)
         assert opened.n_events == len(expected) == sum(map(len, blocks)) > 8
         assert {len(block) for block in blocks[:-1]} == {8}
-        require_same(Hits.concatenate(blocks), expected)
-
-
-def test_what_is_wrong_with_a_file_of_hits_is_told(tmp_path):
-    detector = read_detector("icpc")
-    file = stp(tmp_path / "stp.lh5", np.arange(EVENTS))
+        joined = Hits.concatenate(blocks)
+        for name in ("position_mm", "edep_kev", "offsets", "event_number"):
+            np.testing.assert_array_equal(getattr(joined, name), getattr(expected, name))
     with pytest.raises(CpunetError, match="no event in none; widen window_kev"):
         HitFile(file, windows=(EnergyWindow("none", 1e6, 2e6),)).open(detector)
-    stp(file, np.arange(EVENTS), deposits=False)
-    with pytest.raises(CpunetError, match="no step deposits energy"):
-        HitFile(file).open(detector)
-
-
-def g4simple_file(folder: Path, **changed: object) -> Path:
-    columns: dict[str, object] = {
-        "event": np.array([4, 4, 7, 7, 7], np.int32),
-        "volID": np.array([1, 1, 1, 2, 0], np.int32),
-        "Edep": np.array([0.5, 1.0, 0.25, 0.3, 0.0]),
-        "x": np.arange(5.0),
-        "y": np.zeros(5),
-        "z": np.array([1.0, 2, 3, 4, 5]),
-    }
-    columns.update(changed)
-    path = folder / "hits.hdf5"
-    with h5py.File(path, "w") as file:
-        for name, values in columns.items():
-            if values is not None:
-                file[f"default_ntuples/g4sntuple/{name}/pages"] = values
-    return path
 
 
 def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
@@ -348,14 +309,20 @@ def test_npz_of_geant4(reference_data: Path) -> None:
 
 
 def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
-    hits = read_hits(g4simple_file(tmp_path), HitOptions("1"))
+    def read(**changed: list[float]) -> Hits:
+        columns = {"event": [4, 4, 7, 7, 7], "volID": [1, 1, 1, 2, 0]}
+        columns |= {"Edep": [0.5, 1.0, 0.25, 0.3, 0.0], "x": [0, 1, 2, 3, 4], "y": [0] * 5}
+        columns |= {"z": [1, 2, 3, 4, 5]} | changed
+        arrays = {name: (np.array(values), "") for name, values in columns.items()}
+        path = ntuple_hdf5(tmp_path / "hits.hdf5", arrays, "g4sntuple")
+        return read_hits(path, HitOptions("1"))
+
+    hits = read()
     np.testing.assert_allclose(hits.energy_kev, [1500, 250])
     np.testing.assert_array_equal(hits.event_number, [4, 7])
     np.testing.assert_array_equal(hits.z_mm, [1, 2, 3])
-    with pytest.raises(CpunetError, match="has columns for event, x, y, z, edep"):
-        read_hits(g4simple_file(tmp_path, Edep=None))
     with pytest.raises(CpunetError, match="differ in length"):
-        read_hits(g4simple_file(tmp_path, x=np.zeros(3)), HitOptions("1"))
+        read(x=[0, 0, 0])
 
 
 def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
@@ -428,46 +395,6 @@ def test_archives(tmp_path: Path, name: str, values: np.ndarray) -> None:
     path = tmp_path / "hits.npz"
     np.savez(path, **(GOOD | {name: values}))
     with pytest.raises(CpunetError, match=rf"^{re.escape(str(path))}: [^\n]+$"):
-        read_hits(path)
-
-
-def one_table(path: Path, **changes: object) -> Path:
-    rows = [[1.0, 2], [3.0]]
-    columns: dict[str, object] = {
-        "evtid": np.array([3, 7]),
-        "edep": VectorOfVectors([[500.0, 600], [700.0]], attrs={"units": "keV"}),
-        **{f"{axis}loc": VectorOfVectors(rows, attrs={"units": "mm"}) for axis in "xyz"},
-    }
-    return write_table(path, "stp/det1", **columns | changes)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"xloc": VectorOfVectors([[1.0], [2.0, 3]], attrs={"units": "mm"})},
-        {"evtid": Array(np.array([3, np.nan]))},
-    ],
-)
-def test_remage_tables(tmp_path: Path, change: dict[str, object]) -> None:
-    path = one_table(tmp_path / "stp.lh5", **change)
-    with pytest.raises(CpunetError, match=rf"^{re.escape(str(path))}: [^\n]+$"):
-        read_hits(path)
-
-
-@pytest.mark.parametrize("origin", [0.01, np.array([0.01])])
-def test_an_origin_is_a_number_or_an_array_of_one(tmp_path: Path, origin: object) -> None:
-    path = one_table(tmp_path / "stp.lh5")
-    with h5py.File(path, "r+") as file:
-        file["detector_origins/det1/xloc"] = origin  # in m
-        file["detector_origins/det1/yloc"] = file["detector_origins/det1/zloc"] = 0.0
-    assert read_hits(path).x_mm.tolist() == [-9, -8, -7]
-
-
-def test_a_file_of_remage_without_steps(tmp_path: Path) -> None:
-    path = one_table(tmp_path / "stp.lh5")
-    with h5py.File(path, "r+") as file:
-        del file["stp/det1/edep"]
-    with pytest.raises(CpunetError, match="no table of stp or default_ntuples has columns"):
         read_hits(path)
 
 

@@ -36,14 +36,6 @@ def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject)
     assert both.n_events == hits.n_events
 
 
-def test_events_by_their_numbers() -> None:
-    hits = Hits.of([[0, 0, 1], [0, 0, 2], [0, 0, 3]], [1, 2, 4], [0, 2, 2, 3], [5, 9, 7])
-    chosen = hits.of_events([7, 6, 5, 7])
-    assert chosen.event_number.tolist() == [7, 6, 5, 7]
-    assert chosen.energy_kev.tolist() == [4, 0, 3, 4]
-    assert len(hits.of_events([])) == 0
-
-
 def test_hits_at_the_edge_of_what_is_allowed_are_merged() -> None:
     places = [[FARTHEST_MM, 0, 0], [-FARTHEST_MM, 0, 0]]
     assert cluster_hits(Hits.of(places, [1.0, 1.0], [0, 2]), 0.05).n_events == 1

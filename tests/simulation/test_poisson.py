@@ -106,10 +106,7 @@ def test_hemispheres_and_the_axis() -> None:
     assert found.capacitance_pF == pytest.approx(half_sphere, rel=5e-3)
 
 
-def test_electrodes_share_all_of_the_potential() -> None:
-    detector = Hemispheres(**values(0.2))
-    found = solve_potentials(detector, make_grid(detector))
-    np.testing.assert_allclose(found.point_contact + found.bias, 1, atol=1e-10)
+def test_a_grounded_plane_takes_a_part_of_the_potential() -> None:
     grounded = Hemispheres(**values(0.2), vacuum_gap=1.0)
     found = solve_potentials(grounded, make_grid(grounded))
     assert (found.point_contact + found.bias).min() < 1 - 1e-3

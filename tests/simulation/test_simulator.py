@@ -64,14 +64,16 @@ def test_samples_are_means_of_their_steps(planar: FieldMaps) -> None:
     np.testing.assert_allclose(coarse.waveforms[0], means, atol=1e-6)
 
 
-def test_self_repulsion_and_temperature_widen_the_cloud(planar: FieldMaps) -> None:
-    repelling = SimulationSettings(self_repulsion=True)
-    energies = [10.0, 2000.0]
-    low, high = of(planar, repelling).signals(0.0, 0.0, [9.0, 9.0], energies).cloud_fwhm_ns
-    own = of(planar, SimulationSettings()).signals(0.0, 0.0, [9.0], 10.0).cloud_fwhm_ns[0]
-    siggen = of(planar, SIGGEN).signals(0.0, 0.0, [9.0], 10.0).cloud_fwhm_ns[0]
-    assert own <= low < high
-    assert own < siggen
+def test_self_repulsion_and_diffusion_widen_the_cloud(planar: FieldMaps) -> None:
+    def width(energy_kev: float = 10.0, **values: object) -> float:
+        simulator = of(planar, SimulationSettings(**values))  # type: ignore[arg-type]
+        return float(simulator.signals(0.0, 0.0, 9.0, energy_kev).cloud_fwhm_ns[0])
+
+    # kT/e is 0.078 V mm/cm at 90 K; siggen counts up the cloud's duration
+    constants = (width(diffusion_constant=c) for c in ("temperature", 0.12, "siggen"))
+    widths = [width(diffusion=False), *constants]
+    assert np.all(np.diff(widths) > 0)
+    assert widths[2] <= width(self_repulsion=True) < width(2000.0, self_repulsion=True)
 
 
 def test_a_bad_hit_is_named(planar: FieldMaps) -> None:

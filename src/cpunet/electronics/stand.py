@@ -313,7 +313,7 @@ def stand_sides(
     )
     source = events, settings.source_height_mm, settings.source_radius_mm
     sim = Side(detector, settings, GammaSource(*source, sim_seed))
-    other = shift.detector(detector), shift.settings(settings)
+    other = shift.applied(detector), shift.applied(settings)
     data = Side(*other, GammaSource(*source, data_seed))
     return sim, data, readout_seed
 

@@ -23,7 +23,7 @@ from scipy.special import log_ndtr, ndtr
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.legend.currents import WINDOW, WINDOWS
+from cpunet.legend.currents import WINDOW, WINDOWS, averaged
 from cpunet.legend.library_files import known_detector
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
@@ -89,10 +89,10 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
     """
     time = np.arange(LENGTH, dtype=float) - BEGIN
     step = undecayed.step(time)
-    wanted = _about_peak(_averaged(step))
+    wanted = _about_peak(averaged(step))
 
     def scaled(parameters: Values) -> tuple[Values, float]:
-        current = _about_peak(_averaged(kernel_step(time, *parameters)))
+        current = _about_peak(averaged(kernel_step(time, *parameters)))
         weight = wanted**2
         return current, float((weight * current * wanted).sum() / (weight * current**2).sum())
 
@@ -104,12 +104,10 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
         residual, START_NS, bounds=(0.5, LONGEST_NS), diff_step=1e-4
     ).x
     current, height = scaled(np.array([sigma, tau]))
-    peak = BEGIN + int(_averaged(step)[BEGIN:].argmax()) - (WINDOW - 1) * WINDOWS // 2
+    peak = BEGIN + int(averaged(step)[BEGIN:].argmax()) - (WINDOW - 1) * WINDOWS // 2
     kernel = kernel_step(time, sigma, tau)
     # A of the kernel over A of the chain for constant currents
-    ratios = np.array(
-        [_averaged(kernel, w).max() / _averaged(step, w).max() for w in WIDTHS_NS]
-    )
+    ratios = np.array([averaged(kernel, w).max() / averaged(step, w).max() for w in WIDTHS_NS])
     return Equivalent(
         sigma_ns=float(sigma),
         tau_ns=float(tau),
@@ -130,7 +128,7 @@ def current_delay_ns(undecayed: StepResponse) -> float:
     The three averages look back over 48 ns each. Half of their total length is subtracted, so
     that they add no delay.
     """
-    current = _averaged(undecayed.step(np.arange(LENGTH, dtype=float) - BEGIN))
+    current = averaged(undecayed.step(np.arange(LENGTH, dtype=float) - BEGIN))
     return float(current.argmax() - BEGIN - 0.5 * WINDOWS * (WINDOW - 1))
 
 
@@ -140,15 +138,6 @@ def kernel_step(time_ns: Values, sigma_ns: float, tau_ns: float) -> Values:
     shift = sigma_ns / tau_ns
     late = np.exp(np.minimum(0.5 * shift**2 - time_ns / tau_ns + log_ndtr(scaled - shift), 0))
     return np.asarray(ndtr(scaled) - late, np.float64)
-
-
-def _averaged(step: Values, width: int = 1) -> Values:
-    """Current of charge arriving evenly over `width` ns, averaged three times over 48 ns."""
-    current = np.diff(step, prepend=0.0)
-    for size in (width, *(WINDOW,) * WINDOWS):
-        total = np.cumsum(current)
-        current = (total - np.pad(total, (size, 0))[: len(total)]) / size
-    return current
 
 
 def _about_peak(current: Values) -> Values:
@@ -168,7 +157,6 @@ LEGEND_PARS = FolderKind(
     own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
 )
 EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
-SAME = ("recipe", "peak", "seed")  # entries that a report and its run share
 
 
 @dataclass(frozen=True)
@@ -301,32 +289,29 @@ def _against_energy(
     path = report / "metrics.json"
     metrics = read_json(path, "give the folder that `cpunet validate` made")
     try:
-        training, scores = metrics["training"], metrics["ae_energy"]
-        other = [key for key in SAME if training[key] != trained[key]]
-        missing = scores.get("missing")
-        methods = {} if missing else dict(scores["methods"])
-        pars: dict[str, Any] = {}
-        if not missing:
-            # the mean of the translation, and the width of the data
-            mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
-            line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
-            pars["aoemeanmod"] = {"psl": {"expression": "x*a+b", "pars": line}}
-            if law["b"] > 0:
-                pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
-            else:
-                log.warning(
-                    f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
-                    "aoeresmod.yaml is not written: give events of more energies"
+        for key, value in trained.items():
+            if (other := metrics["training"][key]) != value:
+                raise CpunetError(
+                    f"{report}: of a run with {key} {other}, this one has {value}; validate "
+                    "this run"
                 )
+        if missing := metrics["ae_energy"].get("missing"):
+            raise CpunetError(f"{report}: no A/E against energy: {missing}")
+        methods = dict(metrics["ae_energy"]["methods"])
+        # the mean of the translation, and the width of the data
+        mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
+        line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
+        noisy = law["b"] > 0
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CpunetError(
             f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
         ) from error
-    if other:
-        raise CpunetError(
-            f"{report}: of a run with {other[0]} {training[other[0]]}, this one has "
-            f"{trained[other[0]]}; validate this run"
+    pars: dict[str, Any] = {"aoemeanmod": {"psl": {"expression": "x*a+b", "pars": line}}}
+    if noisy:
+        pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
+    else:
+        log.warning(
+            f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
+            "aoeresmod.yaml is not written: give events of more energies"
         )
-    if missing:
-        raise CpunetError(f"{report}: no A/E against energy: {missing}")
     return methods, pars

@@ -44,6 +44,8 @@ class IdealLibrary:
 
     Attributes
     ----------
+    where
+        File and group, for messages.
     path
         Path of the group, the detector's name.
     r_mm, z_mm
@@ -52,6 +54,7 @@ class IdealLibrary:
         Azimuths such as ``"000_deg"``, ascending.
     """
 
+    where: str
     path: str
     r_mm: Values
     z_mm: Values
@@ -98,7 +101,7 @@ class IdealLibrary:
                     f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
                 )
         angles = tuple(name.removeprefix("waveform_") for name in names)
-        return cls(path, r_mm, z_mm, angles)
+        return cls(where, path, r_mm, z_mm, angles)
 
     @property
     def n_templates(self) -> int:
@@ -193,7 +196,7 @@ def known_detector(run: Run) -> str | None:
 
 
 def require_complete(
-    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary, source: Path
+    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary
 ) -> None:
     """Raise an error if a library lacks whole rows of grid points between others.
 
@@ -206,47 +209,29 @@ def require_complete(
     for angle, mask in inside.items():
         if not mask.any():
             raise CpunetError(
-                f"{source}: {library.path}: no template of {angle} can be translated; simulate "
-                "this azimuth again, or leave it out"
+                f"{library.where}: no template of {angle} can be translated; simulate this "
+                "azimuth again, or leave it out"
             )
         for name, axis, rows in (
             ("r", library.r_mm, mask.any(axis=1)),
             ("z", library.z_mm, mask.any(axis=0)),
         ):
             held = np.flatnonzero(rows)
-            missing = np.setdiff1d(np.arange(held[0], held[-1]), held) if len(held) else held
+            missing = np.setdiff1d(np.arange(held[0], held[-1]), held)
             if len(missing):
                 raise CpunetError(
-                    f"{source}: {library.path}: {len(missing)} rows of {angle} are NaN between "
-                    f"others, the first at {name} {axis[missing[0]]:g} mm; simulate these "
-                    "places again"
+                    f"{library.where}: {len(missing)} rows of {angle} are NaN between others, "
+                    f"the first at {name} {axis[missing[0]]:g} mm; simulate these places again"
                 )
 
 
-def put_column(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
-    """Store a number or an array with LH5 attributes."""
-    group[name] = values
-    dimensions = group[name].ndim
-    kind = f"array<{dimensions}>{{real}}" if dimensions else "real"
-    group[name].attrs.update({"datatype": kind, "units": units})
-
-
-def put_array(
-    group: h5py.Group, name: str, shape: tuple[int, ...], kind: npt.DTypeLike, units: str
-) -> h5py.Dataset:
-    """Create an array of NaN with LH5 attributes, in chunks of one row of grid points."""
-    made = group.create_dataset(
-        name,
-        shape,
-        kind,
-        chunks=(1, *shape[1:]),
-        compression="gzip",
-        compression_opts=1,
-        shuffle=True,
-        fillvalue=np.nan,
-    )
-    made.attrs.update({"datatype": f"array<{len(shape)}>{{real}}", "units": units})
-    return made
+def put(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
+    """Store a number or an array with LH5 attributes, templates in chunks of a row of r."""
+    values = np.asarray(values)
+    large = {"chunks": (1, *values.shape[1:]), "compression": 1, "shuffle": True}
+    made = group.create_dataset(name, data=values, **(large if values.ndim > 1 else {}))
+    kind = f"array<{values.ndim}>{{real}}" if values.ndim else "real"
+    made.attrs.update({"datatype": kind, "units": units})
 
 
 def describe(group: h5py.Group) -> None:
@@ -355,9 +340,9 @@ def make_library(
     The LH5 file holds ``struct{r, z, dt, t0, waveform_000_deg, drift_time_000_deg, ...}``
     under the detector's name: r and z in mm from the centre of the point contact, times in
     ns after the charge is created, pulses of unit charge as float32 arrays of shape
-    (r, z, samples).  The drift times of the format are the collection times of all charge,
-    `Signals.collection_time_ns`.  Grid points without a signal, and those whose charge is not
-    collected within the record, are NaN.
+    (r, z, samples).  The drift times of the format are the times until all charge is
+    collected, `EventPulses.collection_time_ns`.  Grid points without a signal, and those
+    whose charge is not collected within the record, are NaN.
 
     Parameters
     ----------
@@ -410,33 +395,33 @@ def make_library(
         np.arange(int(axis[-1] / grid_mm + 1e-6) + 1) * grid_mm
         for axis in (simulator.fields.r_mm, simulator.fields.z_mm)
     )
-    counts = MadeLibrary(out)
-    total = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
+    counts = MadeLibrary(out, templates=len(ANGLES_DEG) * len(r_mm) * len(z_mm))
     shape = (len(r_mm), len(z_mm))
-    with written_hdf5(out) as (made, _), stage("Templates", total) as bar:
+    with written_hdf5(out) as (made, _), stage("Templates", counts.templates) as bar:
         library = made.create_group(detector.name or "detector")
-        put_column(library, "r", r_mm, "mm")
-        put_column(library, "z", z_mm, "mm")
-        put_column(library, "dt", wanted.dt_ns, "ns")
-        put_column(library, "t0", 0.0, "ns")
+        put(library, "r", r_mm, "mm")
+        put(library, "z", z_mm, "mm")
+        put(library, "dt", wanted.dt_ns, "ns")
+        put(library, "t0", 0.0, "ns")
+        waveforms = np.empty((*shape, wanted.n_samples), np.float32)
+        drift_times = np.empty(shape)
         for angle_deg in ANGLES_DEG:
-            angle, whole = f"{angle_deg:03d}_deg", (*shape, wanted.n_samples)
-            waveforms = put_array(library, f"waveform_{angle}", whole, np.float32, "")
-            drift_times = put_array(library, f"drift_time_{angle}", shape, np.float64, "ns")
+            waveforms.fill(np.nan)
+            drift_times.fill(np.nan)
             phi = math.radians(angle_deg)
             for i, r in enumerate(r_mm):
                 x, y = r * math.cos(phi), r * math.sin(phi)
                 signals = simulator.signals(x, y, z_mm, ENERGY_KEV)
                 good = signals.valid & signals.collected
-                template = np.where(good[:, np.newaxis], signals.waveforms, np.float32(np.nan))
-                waveforms[i] = template
-                drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
-                counts.templates += len(z_mm)
+                waveforms[i, good] = signals.waveforms[good]
+                drift_times[i, good] = signals.collection_time_ns[good]
                 counts.written += int(good.sum())
                 counts.outside += int((~signals.valid).sum())
                 counts.late += int((signals.valid & ~signals.collected).sum())
                 bar.update(len(z_mm))
-        library.attrs["datatype"] = f"struct{{{','.join(library)}}}"
+            put(library, f"waveform_{angle_deg:03d}_deg", waveforms, "")
+            put(library, f"drift_time_{angle_deg:03d}_deg", drift_times, "ns")
+        describe(library)
         if not counts.written:
             raise CpunetError(f"{counts}; give a finer grid or longer records")
     return counts

@@ -42,8 +42,7 @@ from cpunet.legend.library_files import (
     chosen_libraries,
     describe,
     known_detector,
-    put_array,
-    put_column,
+    put,
     require_complete,
 )
 from cpunet.networks.response_layer import padding
@@ -218,7 +217,7 @@ def translate_library(
         with written_hdf5(out) as (made, _):
             for charge in ideal:
                 group = made.require_group(charge.path)
-                counted = _write(translate, charge, given[charge.path], group, source)
+                counted = _write(translate, charge, given[charge.path], group)
                 content = {"cpunet": cpunet.__version__, "rings": RINGS, **made_from}
                 group.attrs["cpunet"] = json.dumps(content | asdict(counted))
                 describe(group)
@@ -231,7 +230,6 @@ def _write(
     library: IdealLibrary,
     given: h5py.Group,
     group: h5py.Group,
-    source: Path,
 ) -> LibraryNumbers:
     """Write currents, and drift times within the crystal and about it."""
     step = np.zeros((1, STEP_LENGTH), np.float32)
@@ -247,7 +245,7 @@ def _write(
             currents[angle] = np.full((*shape, LENGTH), np.nan, np.float32)
             times[angle] = np.full(shape, np.nan)
             within = currents[angle][inner], times[angle][inner]
-            for rows, charge in _blocks(given[f"waveform_{angle}"], library, source):
+            for rows, charge in _blocks(given[f"waveform_{angle}"], library):
                 held = ~np.isnan(charge[:, :, 0])
                 templates = charge[held]
                 within[0][rows][held], when = currents_about_peak(translate(templates))
@@ -257,41 +255,37 @@ def _write(
                 bar.update(held.size)
     inside = {angle: np.isfinite(when[inner]) for angle, when in times.items()}
     translated = sum(int(mask.sum()) for mask in inside.values())
-    where = f"{source}: {library.path}"
     if not translated:
         raise CpunetError(
-            f"{where}: none of {library.n_templates} templates can be translated; are they "
-            "charge pulses?"
+            f"{library.where}: none of {library.n_templates} templates can be translated; are "
+            "they charge pulses?"
         )
     if 2 * not_ending > translated:
         raise CpunetError(
-            f"{where}: {not_ending} of {translated} templates end below half of their maximum: "
-            "these are currents, of negative sign, or behind electronics already; give the "
-            "library of charge pulses"
+            f"{library.where}: {not_ending} of {translated} templates end below half of their "
+            "maximum: these are currents, of negative sign, or behind electronics already; "
+            "give the library of charge pulses"
         )
-    require_complete(inside, library, source)
+    require_complete(inside, library)
     amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
     mode = most_frequent(np.concatenate(amplitudes).astype(float))
 
-    put_column(group, "r", r_mm, "mm")
-    put_column(group, "z", z_mm, "mm")
-    put_column(group, "dt", PERIOD_NS, "ns")
-    put_column(group, "t0", -PEAK * PERIOD_NS, "ns")
+    put(group, "r", r_mm, "mm")
+    put(group, "z", z_mm, "mm")
+    put(group, "dt", PERIOD_NS, "ns")
+    put(group, "t0", -PEAK * PERIOD_NS, "ns")
     padded = healed = 0
     for angle, mask in inside.items():
-        values = put_array(group, f"waveform_{angle}", (*shape, LENGTH), np.float32, "")
-        drift_times = put_array(group, f"drift_time_{angle}", shape, np.float32, "ns")
         currents[angle] /= np.float32(mode)
-        values[...] = with_rings(currents.pop(angle))
-        drift_times[...] = filled = continued(times[angle])
+        put(group, f"waveform_{angle}", with_rings(currents.pop(angle)), "")
+        filled = continued(times[angle])
+        put(group, f"drift_time_{angle}", filled.astype(np.float32), "ns")
         padded += int(np.isfinite(filled).sum() - mask.sum())
         healed += int((np.isfinite(filled[inner]) & ~mask & binary_fill_holes(mask)).sum())
     return LibraryNumbers(library.n_templates, translated, padded, healed, mode, delay_ns)
 
 
-def _blocks(
-    given: h5py.Dataset, library: IdealLibrary, source: Path
-) -> Iterator[tuple[slice, Floats]]:
+def _blocks(given: h5py.Dataset, library: IdealLibrary) -> Iterator[tuple[slice, Floats]]:
     """Rows of charge templates, NaN for those of only zeros.
 
     Raises
@@ -306,9 +300,9 @@ def _blocks(
         if part.any():
             i, j = np.argwhere(part)[0]
             raise CpunetError(
-                f"{source}: {given.name}: {int(part.sum())} templates hold NaN among their "
-                f"samples, the first at r {library.r_mm[first + i]:g}, z "
-                f"{library.z_mm[j]:g} mm; simulate the library again, with longer records if "
+                f"{library.where}: {int(part.sum())} templates hold NaN among their samples, "
+                f"the first at r {library.r_mm[first + i]:g}, z {library.z_mm[j]:g} mm of "
+                f"{given.name}; simulate the library again, with longer records if "
                 "charge was late"
             )
         charge[~charge.any(axis=2)] = np.nan

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -45,14 +44,31 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     figure = Figure(figsize=(7.2, min(max(1.6 + 2.5 * ratio, 3.4), 7.5)))
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     top, low = float(fields.potential_V.max()), _WEIGHTING_LEVELS[0]
-    lines = np.linspace(0, top, 11)[1:-1], _WEIGHTING_LEVELS
-    bar = f"Potential [V], lines every {top / 10:.0f} V"
-    how: dict[str, Any] = {"cmap": "viridis", "vmin": 0, "vmax": top}
-    _map(panels[0], fields, fields.potential_V, lines[0], bar, how)
-    weighting = np.maximum(fields.weighting_potential, low / 10)
-    bar = f"Weighting potential, lines at {low} to {lines[1][-1]}"
-    how = {"cmap": "cividis", "norm": LogNorm(low / 10, 1)}
-    _map(panels[1], fields, weighting, lines[1], bar, how)
+    maps: list[tuple[FloatArray, Any, str, dict[str, Any]]] = [
+        (
+            fields.potential_V,
+            np.linspace(0, top, 11)[1:-1],
+            f"Potential [V], lines every {top / 10:.0f} V",
+            {"cmap": "viridis", "vmin": 0, "vmax": top},
+        ),
+        (
+            np.maximum(fields.weighting_potential, low / 10),
+            _WEIGHTING_LEVELS,
+            f"Weighting potential, lines at {low} to {_WEIGHTING_LEVELS[-1]}",
+            {"cmap": "cividis", "norm": LogNorm(low / 10, 1)},
+        ),
+    ]
+    # values of the germanium extend into the lithium layer and the ditch, so that no gap shows
+    # at the edges of what is drawn there
+    covered = np.isin(fields.region, (LI_CONTACT, DITCH))
+    nearest = distance_transform_edt(covered, return_distances=False, return_indices=True)
+    for axes, (values, levels, label, colours) in zip(panels, maps, strict=True):
+        grid = fields.r_mm, fields.z_mm, values[tuple(nearest)].T
+        image = axes.pcolormesh(*grid, rasterized=True, **colours)
+        axes.contour(*grid, levels, colors="white", linewidths=0.65, alpha=0.9)
+        figure.colorbar(
+            image, ax=axes, label=label, location="bottom", shrink=0.95, pad=0.02, aspect=25
+        )
     r, z = np.meshgrid(
         np.array([0.35, 0.75]) * detector.crystal_radius,
         np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
@@ -103,23 +119,3 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     )
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), title=title)
     return figure
-
-
-def _map(
-    axes: Axes, fields: FieldMaps, values: FloatArray, levels: Any, bar: str, how: Any
-) -> None:
-    """Draw values at the nodes in colour, with lines at some levels.
-
-    Those of the germanium are extended into the lithium layer and the ditch, so that no gap
-    shows at the edges of what is drawn there.
-    """
-    covered = np.isin(fields.region, (LI_CONTACT, DITCH))
-    nearest = distance_transform_edt(covered, return_distances=False, return_indices=True)
-    values = values[tuple(nearest)].T
-    image = axes.pcolormesh(fields.r_mm, fields.z_mm, values, rasterized=True, **how)
-    axes.contour(
-        fields.r_mm, fields.z_mm, values, levels, colors="white", linewidths=0.65, alpha=0.9
-    )
-    axes.figure.colorbar(
-        image, ax=axes, label=bar, location="bottom", shrink=0.95, pad=0.02, aspect=25
-    )

@@ -26,7 +26,6 @@ import numpy.typing as npt
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import RectBivariateSpline
 
-from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.outline import DITCH
@@ -66,13 +65,6 @@ class VelocityTable(NamedTuple):
     fields_per_V_per_cm: float
 
 
-def measured_table() -> FloatArray:
-    """Speeds at 77 K: field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns."""
-    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
-    with source.open(encoding="utf-8") as lines:
-        return np.loadtxt(lines, delimiter=",", comments=("#", "field"))
-
-
 def velocity_table(
     temperature_K: float, factors: VelocityFactors = AS_MEASURED
 ) -> VelocityTable:
@@ -107,7 +99,10 @@ def velocity_table(
     >>> round(carrier_velocity(*table, HOLE, 1000.0, 0.0, 0.0)[0], 3)
     0.081
     """
-    measured = measured_table()
+    # field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns
+    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
+    with source.open(encoding="utf-8") as lines:
+        measured = np.loadtxt(lines, delimiter=",", comments=("#", "field"))
     field = measured[:, 0]
     step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
     grid = np.arange(round(field[-1] / step) + 1) * step
@@ -170,15 +165,6 @@ def carrier_velocity(
 
     positive for holes and negative for electrons. The <100> axes are x, y and z. Beyond the
     last field of the table, its last interval is extrapolated linearly.
-
-    Examples
-    --------
-    Along <100> the speed is that of the table.
-
-    >>> row = measured_table()[8]
-    >>> velocity = carrier_velocity(*velocity_table(77.0), HOLE, row[0], 0.0, 0.0)
-    >>> bool(abs(velocity[0] - row[4]) < 1e-12), velocity[1:3]
-    (True, (0.0, 0.0))
     """
     strength = math.sqrt(ex * ex + ey * ey + ez * ez)
     if strength <= 0.0:
@@ -243,19 +229,12 @@ def drift_maps(
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
-
-    Raises
-    ------
-    CpunetError
-        If no cell of the maps has a field.
     """
     e_r, e_z, volts = fields.e_r_V_per_cm, fields.e_z_V_per_cm, fields.potential_V
     stacked = np.stack([e_r, e_z, fields.weighting_potential, volts], axis=-1).astype(float)
     # nothing drifts in the ditch, and the field is discontinuous at its walls
     ditch = np.asarray(fields.region) == DITCH
     with_field = np.isfinite(stacked).all(-1) & ~ditch & (stacked[..., :2] != 0).any(-1)
-    if not with_field.any():
-        raise CpunetError("the field maps hold no field; compute them again")
     bias = float(np.nanmax(stacked[..., VOLTS]))
     values, filled = with_ghost_nodes(np.where(with_field[..., None], stacked, 0.0), with_field)
     usable = _all_corners(filled) & ~_all_corners(~with_field)

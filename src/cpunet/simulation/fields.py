@@ -195,44 +195,36 @@ class Superposition:
         return total + impurity_tilt * parts.tilt if impurity_tilt else total
 
 
-def solve(detector: Detector, *, cache: bool = True) -> Superposition:
+def solve(detector: Detector) -> Superposition:
     """Solve for the parts of a detector's potential, or load them from the cache.
 
-    Parameters
-    ----------
-    detector
-        Geometry and impurities.
-    cache
-        Whether to keep the parts on disk (in ``$CPUNET_CACHE`` or the user's cache folder)
-        and to load them if the same detector was solved before, at any bias and any scale and
-        tilt of its impurities.
+    They are stored on disk (in ``$CPUNET_CACHE`` or the user's cache folder) and loaded if the
+    same detector was solved before, at any bias and any scale and tilt of its impurities.
 
     Raises
     ------
     CpunetError
         If the grid is too fine.
     """
-    key = detector.fingerprint(exclude=NOT_IN_PARTS)
+    file = cache_file(detector.fingerprint(exclude=NOT_IN_PARTS))
     unit = detector.model_copy(
         update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
     )
-    if cache:
-        with suppress(CpunetError, LookupError):  # if damaged, solved again and overwritten
-            arrays = read_arrays(cache_file(key))
-            stored: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
-            grid = Grid(**{field.name: stored[field.name] for field in fields(Grid)})
-            parts = {field.name: stored[field.name] for field in fields(Potentials)}
-            return Superposition(unit, grid, Potentials(**parts), stored["depletion_V"])
+    with suppress(CpunetError, LookupError):  # if damaged, solved again and overwritten
+        arrays = read_arrays(file)
+        stored: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
+        grid = Grid(**{field.name: stored[field.name] for field in fields(Grid)})
+        parts = {field.name: stored[field.name] for field in fields(Potentials)}
+        return Superposition(unit, grid, Potentials(**parts), stored["depletion_V"])
     grid = make_grid(unit)
     log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
     potentials = solve_potentials(unit, grid)
     fixed = potentials.impurities + potentials.surface
     depletion = depletion_voltage(potentials.bias, fixed, grid.region)
-    if cache:
-        # atomically; a cache that cannot be written is ignored
-        with suppress(CpunetError), written_aside(cache_file(key)) as aside:
-            content = vars(grid) | vars(potentials) | {"depletion_V": depletion}
-            np.savez(aside, allow_pickle=False, **content)
+    # atomically; a cache that cannot be written is ignored
+    with suppress(CpunetError), written_aside(file) as aside:
+        content = vars(grid) | vars(potentials) | {"depletion_V": depletion}
+        np.savez(aside, allow_pickle=False, **content)
     return Superposition(unit, grid, potentials, depletion)
 
 
@@ -260,22 +252,15 @@ class FieldMaps:
     depletion_V: float
 
 
-def compute_fields(detector: Detector, *, cache: bool = True) -> FieldMaps:
+def compute_fields(detector: Detector) -> FieldMaps:
     """Solve for the fields of a fully depleted detector, or load them from the cache.
-
-    Parameters
-    ----------
-    detector
-        Geometry, impurities and bias.
-    cache
-        See `solve`.
 
     Raises
     ------
     CpunetError
         If the detector is not fully depleted, or the grid is too fine.
     """
-    return superposed_fields(solve(detector, cache=cache), detector)
+    return superposed_fields(solve(detector), detector)
 
 
 def superposed_fields(

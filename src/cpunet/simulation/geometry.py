@@ -147,9 +147,7 @@ class Detector(Config):
 
     def _overlaps(self) -> Iterator[str]:
         """Parts that do not fit into each other."""
-        length, radius, li = self.crystal_length, self.crystal_radius, self.li_thickness
-        if 2 * li >= min(length, radius):
-            yield "li_thickness leaves nothing of the crystal"
+        length, radius = self.crystal_length, self.crystal_radius
         if self.outer_taper_length + self.bottom_taper_length > length:
             yield "outer_taper_length and bottom_taper_length exceed crystal_length"
         if self.inner_taper_length > self.bore_length:

@@ -12,18 +12,16 @@ from cpunet.settings import Set, checked, key_values, names, read_text, read_val
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.legend_metadata import (
     LIQUID_ARGON_K,
-    crystal_and_slice,
+    detector_values,
     impurity_values,
-    why_missing,
+    value_at,
 )
-from cpunet.simulation.legend_metadata import detector_values as legend_values
 
 log = logging.getLogger(__name__)
 
 _FOLDER = Path(__file__).parent / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
 _SIGGEN_BYTES = 1 << 16
-_Z0 = "impurity_z0_1e10_per_cm3"
 
 _SIGGEN_FIELDS = {
     "xtal_length": "crystal_length",
@@ -80,9 +78,6 @@ _NOT_OF_THE_DETECTOR = (
     "surface_drift_vel_factor",
 )
 
-# reasons why a file does not give a field
-_Hints = dict[str, str]
-
 
 def detector_names() -> list[str]:
     """Names of the preset detectors."""
@@ -116,26 +111,20 @@ def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
     >>> detector.crystal_length, detector.bias_V
     (96.0, 3500.0)
     """
-    given = key_values(overrides)
+    given, name = key_values(overrides), str(path)
+    values: dict[str, Any]
+    hints: dict[str, str] = {}
     if isinstance(path, Detector):
         if not given:
             return path
-        return _completed(path.model_dump(), given, path.name, {})
-    name = str(path)
-    if name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
-        values = read_values(path, _FOLDER)
+        name, values = path.name, path.model_dump()
+    elif name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
+        values = {"name": Path(name).stem} | read_values(path, _FOLDER)
     else:
-        values = {**siggen_values(read_text(path, _FOLDER), name)}
+        values = {"name": Path(name).stem} | siggen_values(read_text(path, _FOLDER), name)
     if "geometry" in values:
-        return _legend(values, given, name)
-    return _completed({"name": Path(name).stem} | values, given, name, {})
-
-
-def _completed(
-    values: dict[str, Any], given: dict[str, Any], name: str, hints: _Hints
-) -> Detector:
-    """The detector of some values, overridden by those given; see `read_detector`."""
-    values = values | given
+        values, hints = _legend(values, name, argon="temperature_K" not in given)
+    values |= given
     by_depletion = values.get("impurity_scale") == "depletion"
     if by_depletion:
         del values["impurity_scale"]
@@ -161,29 +150,36 @@ def holds_detector(path: str | Path) -> bool:
         return b"xtal_length" in file.read(_SIGGEN_BYTES)
 
 
-def _legend(diode: dict[str, Any], given: dict[str, Any], name: str) -> Detector:
-    """The detector of a LEGEND diode and its crystal; see `read_detector`."""
+def _legend(
+    diode: dict[str, Any], name: str, *, argon: bool
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Fields of a LEGEND diode and its crystal, and why it does not give some others.
+
+    `argon` is whether it is at the temperature of liquid argon.
+    """
     path = Path(name)
-    values = {"name": path.stem} | legend_values(diode, name)
-    if "temperature_K" not in given:
+    values, hints = detector_values(diode, name)
+    if argon:
         values["temperature_K"] = LIQUID_ARGON_K
         log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
-    crystal_name, slice_name = crystal_and_slice(diode, path.stem)
+    boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A
+    slice_name = value_at(diode, "production.slice", f"detector {name}")
     places = [
-        folder / f"{crystal_name}{suffix}"
+        folder / f"{boule}{suffix}"
         for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
         for suffix in _MAPPINGS
     ]
     crystal = next(filter(Path.is_file, places), None)
     content = read_values(crystal) if crystal else {}
-    hints, length = why_missing(), values.get("crystal_length")
+    length = values.get("crystal_length")
     if content.get("impurity_curve") is None:
-        hints[_Z0] = (
+        hints["impurity_z0_1e10_per_cm3"] = (
             f"{crystal} has no impurity_curve" if crystal else f"there is no {places[0]}"
         )
     elif isinstance(length, int | float):  # else refused with the rest of the geometry
+        slice_name = cut if slice_name is None else str(slice_name)
         values |= impurity_values(content, str(crystal), slice_name, length)
-    return _completed(values, given, name, hints)
+    return values, hints
 
 
 def siggen_values(text: str, name: str) -> dict[str, float]:
@@ -205,26 +201,20 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     """
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        if not line.strip() or line[0] in " \t#" or line.split()[0] in _NOT_OF_THE_DETECTOR:
-            continue
         words = line.split("#")[0].split()
-        key = words[0].replace("_diam", "_radius")
-        key = "bottom_taper_length" if key == "taper_length" else key
+        if not words or line[0] in " \t" or words[0] in _NOT_OF_THE_DETECTOR:
+            continue
+        where, key = f"detector {name}: line {number}: {words[0]}", words[0]
+        key = {"taper_length": "bottom_taper_length"}.get(key, key).replace("_diam", "_radius")
         if key not in (*_SIGGEN_FIELDS, *_DERIVED) and not key.startswith(_OFFSETS):
-            raise CpunetError(
-                f"detector {name}: line {number}: unknown key {words[0]}; "
-                "neither siggen nor fieldgen has it"
-            )
+            raise CpunetError(f"{where}: unknown key; neither siggen nor fieldgen has it")
         try:
-            values[key] = float(words[1]) / (2 if key != words[0] else 1)
+            values[key] = float(words[1]) / (2 if words[0].endswith("_diam") else 1)
         except (IndexError, ValueError) as error:
-            raise CpunetError(
-                f"detector {name}: line {number}: {words[0]} has no number; give one"
-            ) from error
+            raise CpunetError(f"{where} has no number; give one") from error
         if key.startswith(_OFFSETS) and values.pop(key):
             raise CpunetError(
-                f"detector {name}: line {number}: {key} is not 0; only axially symmetric "
-                "detectors are simulated"
+                f"{where} is not 0; only axially symmetric detectors are simulated"
             )
         if key == "hole_length_gap":
             values["hole_length"] = values.get("xtal_length", math.nan) - values[key]

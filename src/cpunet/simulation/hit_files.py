@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.hit_tables import StepTable, hit_format, step_tables
+from cpunet.simulation.hit_tables import hit_format, step_tables
 from cpunet.simulation.hits import (
     FARTHEST_MM,
     LATE_NS,
@@ -26,6 +26,8 @@ from cpunet.simulation.hits import (
     IntArray,
 )
 from cpunet.tables import Lines, counted, span
+
+log = logging.getLogger(__name__)
 
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
@@ -62,25 +64,22 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
         If the file cannot be read, has an unknown format, lacks a column, a unit or the
         detector, contains no energy deposit, or has energies of another unit.
     """
-    file = Path(path)
-    with step_tables(file) as tables:
-        detectors, detector = _by_detector(tables), options.hits_detector
+    file, chosen = Path(path), options.hits_detector
+    with step_tables(file) as detectors:
         names = ", ".join(detectors)
-        if detector is None and len(detectors) > 1:
+        if chosen is None and len(detectors) > 1:
             raise CpunetError(
                 f"{file}: holds detectors {names}; choose one with `hits_detector`"
             )
-        if detector is not None and not names:
+        if chosen is not None and not names:
             raise CpunetError(
-                f"{file}: its hits name no detector to pick {detector} by; leave out "
+                f"{file}: its hits name no detector to pick {chosen} by; leave out "
                 "`hits_detector`"
             )
-        if detector is not None and detector not in detectors:
-            raise CpunetError(f"{file}: no detector {detector}; it holds {names}")
-        only = next(iter(detectors.values()))
-        table, label = only if detector is None else detectors[detector]
-        steps = table.steps(options, label)
-        origin = table.origin_mm(label or table.name)
+        if chosen is not None and chosen not in detectors:
+            raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
+        table = detectors[chosen or next(iter(detectors))]
+        steps, origin = table.steps(options.units), table.origin_mm()
     hits = _to_hits(file, steps, origin, options)
     energy_kev = hits.energy_kev
     if not len(hits):
@@ -104,25 +103,13 @@ def holds_hits(path: Path | str) -> bool:
     return False
 
 
-def _by_detector(tables: list[StepTable]) -> dict[str, tuple[StepTable, str | None]]:
-    """Tables by the names of their detectors, with their labels where they share a table."""
-    detectors: dict[str, tuple[StepTable, str | None]] = {}
-    for table in tables:
-        labels = table.detectors()
-        if len(labels) > 1 or (labels and not table.name):
-            detectors |= {label: (table, label) for label in labels}
-        else:
-            detectors[table.name] = (table, None)
-    return detectors
-
-
 def _to_hits(
     path: Path, steps: dict[str, npt.NDArray[Any]], origin_mm: FloatArray, options: HitOptions
 ) -> Hits:
     """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
 
     Positions are moved to the frame of the crystal. An event whose number an earlier one has
-    gets a new one, above the largest.
+    gets a new one, above the largest. Late deposits of an event draw a warning.
 
     Raises
     ------
@@ -130,12 +117,11 @@ def _to_hits(
         If a step has no finite position, time or energy, or a negative energy.
     """
     position = np.stack([steps[axis] for axis in "xyz"], axis=1) - origin_mm
-    event, edep, time = steps["event"], steps["edep"], steps.get("time")
+    event, edep = steps["event"], steps["edep"]
+    time = steps.get("time", np.zeros(len(event)))
     # written so that NaN fails
-    placed = (np.abs(position) <= FARTHEST_MM).all(axis=1)
+    placed = (np.abs(position) <= FARTHEST_MM).all(axis=1) & np.isfinite(time)
     bad = ~(placed & (edep >= 0) & (edep <= MAX_KEV))
-    if time is not None:
-        bad |= ~np.isfinite(time)
     if bad.any():
         raise CpunetError(
             f"{path}: event {event[np.argmax(bad)]}: a step has no finite position or time, or "
@@ -144,8 +130,8 @@ def _to_hits(
         )
     positive = edep > 0
     largest = event.max(initial=-1)
-    event, edep, position = event[positive], edep[positive], position[positive]
-    time = None if time is None else time[positive]
+    event, edep = event[positive], edep[positive]
+    position, time = position[positive], time[positive]
     first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")
@@ -162,14 +148,19 @@ def _to_hits(
         np.concatenate([[0], np.cumsum(counts)]),
         numbers,
     )
-    if time is None or not len(hits):
-        return hits
-    times, begins = time[order], hits.offsets[:-1]
-    spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
-    return replace(hits, n_late=int((spread > LATE_NS).sum()))
+    if len(hits):
+        times, begins = time[order], hits.offsets[:-1]
+        spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
+        if late := int((spread > LATE_NS).sum()):
+            log.warning(
+                f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their "
+                "first, simulated as if at once; if these are other events, give them numbers "
+                "of their own"
+            )
+    return hits
 
 
-def first_of_event(number: IntArray, time_ns: FloatArray | None) -> IntArray:
+def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     """Index of the first step of the event of each step.
 
     Steps of a number are parted where none comes for `WINDOW_US` (the decays of a chain are
@@ -179,14 +170,13 @@ def first_of_event(number: IntArray, time_ns: FloatArray | None) -> IntArray:
     --------
     >>> first_of_event(np.array([4, 4, 9]), np.array([0.0, 3e9, 5.0]))
     array([0, 1, 2])
-    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), None)
+    >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), np.zeros(6))
     array([0, 1, 2, 3, 4, 5])
     """
     job = _job_of_step(number)
-    order = np.lexsort((job, number) if time_ns is None else (time_ns, job, number))
+    order = np.lexsort((time_ns, job, number))
     new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
-    if time_ns is not None:
-        new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
+    new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
     starts = np.flatnonzero(np.append(True, new)[: len(number)])
     first = np.empty(len(number), np.int64)
     counts = np.diff(np.append(starts, len(number)))
@@ -254,7 +244,7 @@ def describe_hits(
     """
     detectors: dict[str, Lines] = {}
     with step_tables(path) as tables:
-        names = list(_by_detector(tables))
+        names = [*tables]
     for name in names:
         try:
             hits = read_hits(path, HitOptions(name or None, units=units))

@@ -20,7 +20,7 @@ from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hits import LATE_NS, WINDOW_US, HitOptions, Hits, OpenHits
+from cpunet.simulation.hits import WINDOW_US, HitOptions, Hits, OpenHits
 
 log = logging.getLogger(__name__)
 
@@ -137,12 +137,6 @@ class HitFile:
             the crystal.
         """
         hits = read_hits(self.path, self.options)
-        if hits.n_late:
-            log.warning(
-                f"{self.path}: {hits.n_late} events have deposits more than {LATE_NS:g} ns "
-                "after their first, simulated as if at once; if these are other events, give "
-                "them numbers of their own"
-            )
         if self.windows:
             # sums of deposits are rounded, in some formats to float32; windows are wider
             energy = hits.energy_kev
@@ -151,32 +145,29 @@ class HitFile:
         if not len(hits):
             names = ", ".join(window.name for window in self.windows)
             raise CpunetError(f"{self.path}: no event in {names}; widen window_kev")
-        if not self.placed:
-            self._require_inside(hits, detector)
+        outside = 0 if self.placed else int((~detector.inside(hits.r_mm, hits.z_mm)).sum())
+        total = len(hits.edep_kev)
+        if outside > _STRAY * total:
+            place = hits.position_mm
+            ends = zip("xyz", place.min(axis=0), place.max(axis=0), strict=True)
+            spans = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends)
+            share = f"{outside} of {total} ({outside / total:.1%})"
+            text = (
+                f"{self.path}: {share if outside < total else f'all {total}'} hits lie outside "
+                f"{detector.name} (radius {detector.crystal_radius:g}, z 0 to "
+                f"{detector.crystal_length:g} mm); they span {', '.join(spans)} mm; "
+            )
+            if outside > _MISPLACED * total:
+                raise CpunetError(
+                    f"{text}move them with `origin` and `flip_z`, or choose others with "
+                    "`hits_detector`"
+                )
+            log.warning(
+                f"{text}their energy is lost; check `origin`, `flip_z` and `hits_detector`"
+            )
         starts = range(0, len(hits), BLOCK_EVENTS)
         blocks = (hits[i : i + BLOCK_EVENTS] for i in starts)
         return OpenHits(len(hits), blocks, merged=self.placed)
-
-    def _require_inside(self, hits: Hits, detector: Detector) -> None:
-        """Warn of hits outside the crystal, or raise an error if these are nearly all."""
-        place, total = hits.position_mm, len(hits.edep_kev)
-        n = int((~detector.inside(hits.r_mm, hits.z_mm)).sum())
-        if n <= _STRAY * total:
-            return
-        ends = zip("xyz", place.min(axis=0), place.max(axis=0), strict=True)
-        spans = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends)
-        share = f"all {total}" if n == total else f"{n} of {total} ({n / total:.1%})"
-        text = (
-            f"{self.path}: {share} hits lie outside {detector.name} "
-            f"(radius {detector.crystal_radius:g}, z 0 to {detector.crystal_length:g} mm); "
-            f"they span {', '.join(spans)} mm; "
-        )
-        if n > _MISPLACED * total:
-            raise CpunetError(
-                f"{text}move them with `origin` and `flip_z`, or choose others with "
-                "`hits_detector`"
-            )
-        log.warning(f"{text}their energy is lost; check `origin`, `flip_z` and `hits_detector`")
 
     def provenance(self) -> dict[str, Any]:
         """Provenance of the hits, for the output."""

@@ -19,13 +19,12 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.pulses.reading.columns import divides, dividing, labels, texts, whole_numbers
-from cpunet.simulation.hits import FloatArray, HitOptions, IntArray
+from cpunet.simulation.hits import FloatArray, IntArray
 from cpunet.units import factor, unit_names
 
 HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
 NTUPLES, STEPS = "default_ntuples", "stp"
-_G4SIMPLE, _G4SIMPLE_TITLE = "g4sntuple", "steps data"
-_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_G4SIMPLE, _G4SIMPLE_TITLE, _G4SIMPLE_UNITS = "g4sntuple", "steps data", "mm,MeV"
 _CSV_MAGIC = b"#class tools::wcsv::ntuple"
 # what a column is, and its names in small letters: the first of these is read
 _NAMES = {
@@ -49,25 +48,40 @@ class StepTable:
 
     Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
     the vectors of deposits give the steps of each row. The `name` is that of the detector,
-    empty without any. Units that neither column nor options tell are those of g4simple, MeV and
-    mm, if the table is `g4simple`'s. A `file` of remage tells where its detectors are.
+    empty without any. `units` are those of columns that name none: MeV and mm in tables of
+    g4simple. A `file` of remage tells where its detectors are. Where detectors share the table,
+    `labels` are those of the steps, and those with the `label` are read.
     """
 
     path: Path
     columns: Mapping[str, Any]
     name: str = ""
-    g4simple: bool = False
+    units: str = ""
     file: h5py.File | None = None
+    label: str = ""
+    labels: npt.NDArray[np.str_] | None = None
 
-    @cached_property
-    def roles(self) -> dict[str, tuple[str, str]]:
-        """Roles of the columns, see `roles`."""
-        return roles(self.columns)
+    def by_detector(self) -> dict[str, StepTable]:
+        """The table, or its parts by the labels of their detectors where several share it.
 
-    def steps(
-        self, options: HitOptions, label: str | None = None
-    ) -> dict[str, npt.NDArray[Any]]:
-        """Steps of all detectors, or of that with a label; events in any order.
+        Labels without deposits are the world or a holder.
+        """
+        if "edep" not in self._roles:
+            return {self.name: self}
+        deposits = self._read(self._roles["edep"][0])[0] > 0
+        of = {name: self._read(name)[0] for name in self.columns if divides(name)}
+        some = {name: values[deposits] for name, values in of.items()}
+        names = dividing(some, int(deposits.sum())) or list(of)[:1]
+        if not names:
+            return {self.name: self}
+        of_steps = texts(of[names[0]]) if len(names) == 1 else labels(of, names)
+        detectors = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
+        if len(detectors) > 1 or (detectors and not self.name):
+            return {label: replace(self, label=label, labels=of_steps) for label in detectors}
+        return {self.name: self}
+
+    def steps(self, units: str) -> dict[str, npt.NDArray[Any]]:
+        """Steps, events in any order; `units` are those of `HitOptions`.
 
         Returns
         -------
@@ -80,16 +94,14 @@ class StepTable:
         CpunetError
             If a column is missing, is no number or names no known unit.
         """
-        if self.g4simple:
-            options = replace(options, units=f"{options.units},mm,MeV")
-        if missing := [role for role in _NEEDED if role not in self.roles]:
+        if missing := [role for role in _NEEDED if role not in self._roles]:
             raise CpunetError(
                 f"{self.path}: no column for {missing[0]}; "
                 f"the file holds {', '.join(self.columns)}"
             )
-        chosen = slice(None) if label is None else self._labels == label
+        chosen = slice(None) if self.labels is None else self.labels == self.label
         steps: dict[str, npt.NDArray[Any]] = {}
-        for role, (name, in_name) in self.roles.items():
+        for role, (name, in_name) in self._roles.items():
             values, unit = self._read(name)
             where = f"{self.path}: column {name}"
             if values.ndim != 1 or values.dtype.kind not in "iuf":
@@ -97,55 +109,34 @@ class StepTable:
                     f"{where} is of {values.dtype} and shape {values.shape}; give one number "
                     "per step (g4simple: its option for steps)"
                 )
-            values = (
-                whole_numbers(values, where)
-                if role == "event"
-                else values * _unit_factor(options, role, where, unit or in_name)
-            )
+            if role == "event":
+                values = whole_numbers(values, where)
+            else:
+                given = unit or in_name, *re.split(r"[\s,]+", units), *self.units.split(",")
+                values = values * _unit_factor(role, where, given)
             steps[role] = values[chosen]
         return steps
 
-    def detectors(self) -> list[str]:
-        """Labels of detectors with deposits; those without are the world or a holder."""
-        if not len(self._labels):
-            return []
-        return sorted(
-            map(str, np.unique(self._labels[self._deposits])),
-            key=lambda label: (len(label), label) if label.isdigit() else (99, label),
-        )
-
-    def origin_mm(self, detector: str) -> FloatArray:
-        """Origin of a detector in mm; zero if it is not in the file."""
+    def origin_mm(self) -> FloatArray:
+        """Origin of the detector in mm; zero if it is not in the file."""
         origin = np.zeros(3)
         for i, axis in enumerate("xyz"):
-            where = f"detector_origins/{detector}/{axis}loc"
+            where = f"detector_origins/{self.label or self.name}/{axis}loc"
             if self.file is not None and where in self.file:
                 # an origin may lack a unit; all lengths of remage are in m
-                unit = units_of(self.file[where]) or "m"
-                factor = _unit_factor(HitOptions(), "x", f"{self.path}: column {where}", unit)
-                origin[i] = self.file[where][()].item() * factor
+                given = units_of(self.file[where]), "m"
+                to_mm = _unit_factor("x", f"{self.path}: column {where}", given)
+                origin[i] = self.file[where][()].item() * to_mm
         return origin
 
     @cached_property
-    def _deposits(self) -> npt.NDArray[np.bool_]:
-        return np.asarray(self._read(self.roles["edep"][0])[0] > 0)
-
-    @cached_property
-    def _labels(self) -> npt.NDArray[np.str_]:
-        """Detector of each step as text, from one column or several; empty if there is none."""
-        if "edep" not in self.roles:
-            return np.empty(0, np.str_)
-        of = {name: self._read(name)[0] for name in self.columns if divides(name)}
-        some = {name: values[self._deposits] for name, values in of.items()}
-        names = dividing(some, int(self._deposits.sum())) or list(of)[:1]
-        if not names:
-            return np.empty(0, np.str_)
-        return texts(of[names[0]]) if len(names) == 1 else labels(of, names)
+    def _roles(self) -> dict[str, tuple[str, str]]:
+        return roles(self.columns)
 
     @cached_property
     def _per_row(self) -> IntArray:
         """Number of steps of each row."""
-        edep = self.columns[self.roles["edep"][0]]
+        edep = self.columns[self._roles["edep"][0]]
         return _lengths(edep) if _has(edep, *_VECTORS) else np.ones(len(edep), np.int64)
 
     def _read(self, name: str) -> tuple[npt.NDArray[Any], str]:
@@ -187,11 +178,12 @@ def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     }
 
 
-def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> float:
-    """Conversion factor of a column with the unit `named` to keV, ns or mm.
+def _unit_factor(role: str, where: str, units: Iterable[str]) -> float:
+    """Conversion factor of a column to keV, ns or mm.
 
-    `role` is ``"edep"``, ``"time"`` or an axis. Units of columns that name none are those of
-    the options; times without a unit are in ns, Geant4's own.
+    `role` is ``"edep"``, ``"time"`` or an axis. The first of the `units` is that of the column,
+    ``""`` if it names none: then it is the first of the others that is of its kind. Times
+    without a unit are in ns, Geant4's own.
 
     Raises
     ------
@@ -199,7 +191,8 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
         If the unit is unknown, or nobody tells it.
     """
     to = {"edep": "keV", "time": "ns"}.get(role, "mm")
-    given = [unit for unit in (*re.split(r"[\s,]+", options.units), "ns") if factor(unit, to)]
+    named, *others = units
+    given = [unit for unit in (*others, "ns") if factor(unit, to)]
     if not (unit := named or next(iter(given), "")):
         raise CpunetError(f"{where} names no unit; give `units`, one of {unit_names(to)}")
     if (to_ours := factor(unit, to)) is None:
@@ -209,12 +202,7 @@ def _unit_factor(options: HitOptions, role: str, where: str, named: str) -> floa
 
 def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
     """Format of a file of hits by its content; `stored` are hits with their pulses."""
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(len(_CSV_MAGIC))
-    except OSError as error:
-        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
-    if start.startswith(_HDF5_MAGIC):
+    if h5py.is_hdf5(path):
         with opened(path) as file:
             if any(isinstance(file.get(folder), h5py.Group) for folder in (STEPS, NTUPLES)):
                 return "tables"
@@ -222,12 +210,16 @@ def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
     if zipfile.is_zipfile(path):
         with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
             return "npz" if {"x_mm.npy", "offsets.npy"} <= {*archive.namelist()} else ""
-    return "csv" if start == _CSV_MAGIC else ""
+    try:
+        with path.open("rb") as stream:
+            return "csv" if stream.read(len(_CSV_MAGIC)) == _CSV_MAGIC else ""
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 @contextmanager
-def step_tables(path: Path) -> Iterator[list[StepTable]]:
-    """Open a file of hits; its tables can be read until it is closed.
+def step_tables(path: Path) -> Iterator[dict[str, StepTable]]:
+    """Open a file of hits; its tables, by detector, can be read until it is closed.
 
     Raises
     ------
@@ -235,40 +227,38 @@ def step_tables(path: Path) -> Iterator[list[StepTable]]:
         If the file cannot be read, is of no known format or has no table of steps.
     """
     kind = hit_format(path)
-    if kind == "csv":
-        yield [_csv_table(path)]
-    elif kind == "npz":
-        yield [_npz_table(path)]
-    elif kind:
-        with opened(path) as file:
-            folders = [item_at(file, folder) for folder in (STEPS, NTUPLES)]
-            groups = [
-                group for held in folders if held is not None for group in members(held).items()
-            ]
-            if kind == "stored":
-                groups = [("", file[HIT_TABLE])]
-            tables = []
-            for name, group in groups:
-                if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys():
-                    # the values of a column of Geant4's HDF5 are its pages
-                    columns = {
-                        key: item["pages"] if _has(item, "pages") else item
-                        for key, item in members(group).items()
-                    }
-                    g4simple = name == _G4SIMPLE  # which writes one table for all detectors
-                    of = "" if g4simple else str(name)
-                    tables.append(StepTable(path, columns, of, g4simple, file))
-            if not tables:
-                raise CpunetError(
-                    f"{path}: no table of {STEPS} or {NTUPLES} has columns for "
-                    f"{', '.join(_NEEDED)}; simulate again and write all steps"
-                )
-            yield tables
-    else:
+    if kind in ("csv", "npz"):
+        yield (_csv_table if kind == "csv" else _npz_table)(path).by_detector()
+        return
+    if not kind:
         raise CpunetError(
             f"{path}: no format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
             f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
         )
+    with opened(path) as file:
+        folders = [item_at(file, folder) for folder in (STEPS, NTUPLES)]
+        groups = [
+            item for held in folders if held is not None for item in members(held).items()
+        ]
+        if kind == "stored":
+            groups = [("", file[HIT_TABLE])]
+        tables: dict[str, StepTable] = {}
+        for name, group in groups:
+            if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys():
+                # the values of a column of Geant4's HDF5 are its pages
+                columns = {
+                    key: item["pages"] if _has(item, "pages") else item
+                    for key, item in members(group).items()
+                }
+                # g4simple writes one table for all detectors
+                of = ("", _G4SIMPLE_UNITS) if name == _G4SIMPLE else (str(name), "")
+                tables |= StepTable(path, columns, *of, file).by_detector()
+        if not tables:
+            raise CpunetError(
+                f"{path}: no table of {STEPS} or {NTUPLES} has columns for "
+                f"{', '.join(_NEEDED)}; simulate again and write all steps"
+            )
+        yield tables
 
 
 def _has(item: Any, *parts: str) -> bool:
@@ -321,4 +311,5 @@ def _csv_table(path: Path) -> StepTable:
     if cells[n - 1].isna().any():
         raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
     columns = {name: cells[at].to_numpy() for at, name in enumerate(names)}
-    return StepTable(path, columns, g4simple=about["title"] == _G4SIMPLE_TITLE)
+    g4simple = about["title"] == _G4SIMPLE_TITLE
+    return StepTable(path, columns, units=_G4SIMPLE_UNITS if g4simple else "")

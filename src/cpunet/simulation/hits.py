@@ -61,9 +61,6 @@ class Hits:
         Int64 array of ``n_events + 1``, from 0 to the number of hits.
     event_number
         Event numbers of the source.
-    n_late
-        Number of events with a deposit more than `LATE_NS` after their first, where a file
-        tells the times.
 
     Raises
     ------
@@ -83,7 +80,6 @@ class Hits:
     edep_kev: FloatArray
     offsets: IntArray
     event_number: IntArray
-    n_late: int = 0
 
     def __post_init__(self) -> None:
         farthest = np.abs(self.position_mm).max(initial=0)
@@ -161,31 +157,6 @@ class Hits:
         ends = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
         left = self.position_mm[keep], self.edep_kev[keep]
         return Hits.of(*left, ends[self.offsets], self.event_number)
-
-    def of_events(self, event_number: npt.ArrayLike) -> Hits:
-        """Events with the given numbers, in their order.
-
-        A number without an event yields an event without hits, so the result has an event for
-        each number. Of several events with the same number it is the first.
-
-        Examples
-        --------
-        >>> hits = Hits.of([[0, 0, 1], [0, 0, 2]], [100, 300], [0, 1, 2], [7, 9])
-        >>> hits.of_events([9, 8, 7]).energy_kev
-        array([300.,   0., 100.])
-        """
-        wanted = np.asarray(event_number, np.int64)
-        order = np.argsort(self.event_number, kind="stable")
-        sorted_numbers = self.event_number[order]
-        first, last = (
-            np.searchsorted(sorted_numbers, wanted, side) for side in ("left", "right")
-        )
-        present = last > first
-        events = self[order[first[present]]]
-        counts = np.zeros(len(wanted), np.int64)
-        counts[present] = np.diff(events.offsets)
-        offsets = np.concatenate([[0], np.cumsum(counts)])
-        return Hits.of(events.position_mm, events.edep_kev, offsets, wanted)
 
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:

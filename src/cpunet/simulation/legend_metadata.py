@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
@@ -82,17 +83,10 @@ _ANOTHER = "correct it, or take another file of the crystal"
 _LARGEST_EXPONENT = 300
 
 
-def why_missing() -> dict[str, str]:
-    """Reasons why a diode does not give a field of `Detector`, by field."""
-    reasons = {field: f"no geometry.{key}" for key, field in _GEOMETRY.items()}
-    return reasons | {
-        field: f"neither {' nor '.join(places)} is above 0"
-        for field, places in _MEASURED.items()
-    }
-
-
-def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Fields of `Detector` from a LEGEND diode. Fields it does not contain are omitted.
+def detector_values(
+    diode: Mapping[str, Any], name: str
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Fields of `Detector` from a LEGEND diode, and reasons why it may not give one, by field.
 
     Bias, measured depletion voltage and lithium thickness (the full charge collection depth,
     FCCD) come from ``characterization``, where 0 means unknown. Impurities are those of the
@@ -104,62 +98,54 @@ def detector_values(diode: Mapping[str, Any], name: str) -> dict[str, Any]:
         If the geometry has an unknown key (for example, one without its unit), lacks one, or
         has a crack, which is not symmetric.
     """
-    kind = diode.get("type")
+    source, kind = f"detector {name}", diode.get("type")
     if kind is not None and kind not in _SIMULATED:  # semi-coaxial ones collect on their bore
         raise CpunetError(
-            f"detector {name}: type {reprlib.repr(kind)} is not simulated; "
+            f"{source}: type {reprlib.repr(kind)} is not simulated; "
             f"give one of type {', '.join(_SIMULATED)}"
         )
     if not isinstance(diode["geometry"], Mapping):
-        raise CpunetError(f"detector {name}: geometry holds no keys; see LEGEND's diodes")
+        raise CpunetError(f"{source}: geometry holds no keys; see LEGEND's diodes")
     geometry = dict(flat(diode["geometry"]))
-    if (
-        _at(diode, "geometry.extra.crack", f"detector {name}")
-        and geometry.get("extra.crack.width_in_mm") != 0
-    ):
+    crack = value_at(diode, "geometry.extra.crack", source)
+    if crack and geometry.get("extra.crack.width_in_mm") != 0:
         raise CpunetError(
-            f"detector {name}: geometry.extra.crack cuts off a side; only axially symmetric "
+            f"{source}: geometry.extra.crack cuts off a side; only axially symmetric "
             "crystals are simulated; remove it to simulate the crystal without it"
         )
-    values: dict[str, Any] = {"name": str(diode["name"])} if "name" in diode else {}
+    values: dict[str, Any] = {"name": str(diode.get("name", Path(name).stem))}
+    reasons = {field: f"no geometry.{key}" for key, field in _GEOMETRY.items()}
     for key, value in geometry.items():
         if key == "extra" or key.startswith("extra.crack"):
             continue
         if key not in _GEOMETRY:
             raise CpunetError(
-                f"detector {name}: unknown key geometry.{key} (units belong to the key); "
+                f"{source}: unknown key geometry.{key} (units belong to the key); "
                 "correct or remove it"
             )
         if field := _GEOMETRY[key]:
             values[field] = value
     outer, inner = (
-        _number_at(diode, f"geometry.groove.radius_in_mm.{side}", f"detector {name}", 0.0)
+        _number_at(diode, f"geometry.groove.radius_in_mm.{side}", source, 0.0)
         for side in ("outer", "inner")
     )
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = outer - inner
     for field, places in _MEASURED.items():
-        numbers = [_number_at(diode, place, f"detector {name}", 0.0) for place in places]
+        reasons[field] = f"neither {' nor '.join(places)} is above 0"
+        numbers = [_number_at(diode, place, source, 0.0) for place in places]
         if min(numbers) < 0:
             raise CpunetError(
-                f"detector {name}: {places[numbers.index(min(numbers))]} is below 0",
+                f"{source}: {places[numbers.index(min(numbers))]} is below 0",
                 "correct it, or write 0 for none",
             )
         if at := next(filter(None, numbers), 0.0):
             values[field] = at
-    return values
+    return values, reasons
 
 
-def crystal_and_slice(diode: Mapping[str, Any], name: str) -> tuple[str, str]:
-    """Name of the crystal and slice of a diode: V99000 and A of V99000A."""
-    diode_name, given = (
-        str(diode.get("name", name)),
-        _at(diode, "production.slice", f"detector {name}"),
-    )
-    return diode_name[:-1], str(diode_name[-1:] if given is None else given)
-
-
-def _at(values: Any, place: str, source: str) -> Any:
+def value_at(values: Any, place: str, source: str) -> Any:
+    """Value at a location such as ``"production.slice"``, None if there is none."""
     for key in place.split("."):
         if not isinstance(values, Mapping | None):
             raise CpunetError(f"{source}: {place}: {values!r} stands before {key}; {_ANOTHER}")
@@ -246,7 +232,7 @@ def _number_at(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
     """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
-    stored = _at(values, place, source)
+    stored = value_at(values, place, source)
     value = default if stored is None else stored
     if value is None:
         raise CpunetError(f"{source}: no {place}; {_ANOTHER}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
+from cpunet.simulation.geometry import Detector
 
 Array = npt.NDArray[np.float64]
 
@@ -18,46 +20,29 @@ _TOLERANCE = 1e-6
 """Surfaces that coincide with a grid line do so despite rounding; in mm."""
 
 
-class Outline(NamedTuple):
-    """Values of a `Detector` that make its outline, as compiled loops take them; in mm."""
+# What of a detector makes its outline, under the same names: its lengths in mm, and more.
+_LENGTHS = ("_length", "_radius", "_depth", "_thickness")
+_VALUES = [name for name in Detector.model_fields if name.endswith(_LENGTHS)]
+_VALUES += ["siggen_conventions", "taper_slopes", "ditch_walls", "steps"]
+if TYPE_CHECKING:
+    Outline: TypeAlias = Detector
+else:
+    Outline = namedtuple("Outline", _VALUES)
 
-    crystal_length: float
-    crystal_radius: float
-    top_bullet_radius: float
-    bottom_bullet_radius: float
-    point_contact_length: float
-    point_contact_radius: float
-    wrap_around_radius: float
-    bore_length: float
-    bore_radius: float
-    bore_bullet_radius: float
-    outer_taper_length: float
-    inner_taper_length: float
-    bottom_taper_length: float
-    top_cylinder_length: float
-    bottom_cylinder_length: float
-    bottom_transition_length: float
-    top_groove_depth: float
-    top_groove_radius: float
-    li_thickness: float
-    siggen_conventions: bool
-    taper_slopes: tuple[float, float, float]
-    ditch_walls: tuple[float, float, float]
-    steps: tuple[float, float]
 
-    @classmethod
-    def of(cls, detector: Any) -> Outline:
-        """Outline of a `Detector`."""
-        return cls(*(getattr(detector, name) for name in cls._fields))
+def outline_of(detector: Detector) -> Outline:
+    """Outline of a detector, in the form that compiled loops take."""
+    made: Any = Outline
+    return cast("Outline", made(*(getattr(detector, name) for name in _VALUES)))
 
 
 def at(
-    loop: Any, kind: type, detector: Any, r: npt.ArrayLike, z: npt.ArrayLike
+    loop: Any, kind: type, detector: Detector, r: npt.ArrayLike, z: npt.ArrayLike
 ) -> npt.NDArray[Any]:
-    """What `fill_regions` or `fill_insides` gives at places of a `Detector`."""
+    """What `fill_regions` or `fill_insides` gives at places of a detector."""
     r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
     values: npt.NDArray[Any] = np.empty(r.shape, kind)
-    loop(Outline.of(detector), r.flatten(), z.flatten(), values.reshape(-1))
+    loop(outline_of(detector), r.flatten(), z.flatten(), values.reshape(-1))
     return values
 
 

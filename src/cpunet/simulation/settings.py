@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.settings import Config, Set, checked, words_and_files
+from cpunet.settings import C, Config, Set, checked, words_and_files
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 
@@ -153,6 +153,10 @@ _SHIFTS = Path(__file__).parent / "shifts"
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
+# keys of `Shift` that stand for another field, and those that replace a value
+_NAMES = {"impurity_factor": "impurity_scale", "li_thickness_mm": "li_thickness"}
+_INSTEAD = ("cloud_fwhm_mm", "diffusion_constant", "self_repulsion")
+
 
 def detector_and_settings(
     detector: str | Path | Detector, overrides: Set, **defaults: float
@@ -209,9 +213,9 @@ hole_velocity_low_factor, hole_velocity_high_factor
     --------
     >>> from cpunet.simulation.geometry_readers import read_detector
     >>> shift = Shift(temperature_K=1.5, hole_velocity_low_factor=0.95)
-    >>> shift.detector(read_detector("icpc")).temperature_K
+    >>> shift.applied(read_detector("icpc")).temperature_K
     91.5
-    >>> shift.settings(SimulationSettings()).hole_velocity_low_factor
+    >>> shift.applied(SimulationSettings()).hole_velocity_low_factor
     0.95
     """
 
@@ -248,36 +252,24 @@ hole_velocity_low_factor, hole_velocity_high_factor
         """
         return checked(cls, words_and_files(parts, _SHIFTS), "shift")
 
-    def detector(self, detector: Detector) -> Detector:
-        """Shifted version of a simulated detector.
-
-        Raises
-        ------
-        CpunetError
-            If the shifted detector is invalid.
-        """
-        values = detector.model_dump()
-        values["impurity_scale"] *= self.impurity_factor
-        values["temperature_K"] += self.temperature_K
-        values["bias_V"] += self.bias_V
-        values["li_thickness"] += self.li_thickness_mm
-        values["impurity_tilt_1e10_per_cm4"] += self.impurity_tilt_1e10_per_cm4
-        return checked(Detector, values, f"detector {detector.name}, shifted")
-
-    def settings(self, settings: SimulationSettings) -> SimulationSettings:
-        """Shifted version of the simulation settings.
+    def applied(self, to: C) -> C:
+        """Shifted version of a detector or of simulation settings.
 
         Raises
         ------
         CpunetError
             If a value is outside the allowed range.
         """
-        values = settings.model_dump()
-        for name in ("cloud_fwhm_mm", "diffusion_constant", "self_repulsion"):
-            values[name] = values[name] if getattr(self, name) is None else getattr(self, name)
-        for carrier in ("electron", "hole"):
-            values[f"{carrier}_trapping_per_us"] += getattr(self, f"{carrier}_trapping_per_us")
-            for at in ("low", "high"):
-                name = f"{carrier}_velocity_{at}_factor"
-                values[name] *= getattr(self, name)
-        return checked(SimulationSettings, values, "settings, shifted")
+        values = to.model_dump()
+        for key, change in self.model_dump(exclude_none=True).items():
+            name = _NAMES.get(key, key)
+            if name not in values:
+                continue
+            if key in _INSTEAD:
+                values[name] = change
+            elif key.endswith("_factor"):
+                values[name] *= change
+            else:
+                values[name] += change
+        what = f"detector {to.name}" if isinstance(to, Detector) else "settings"
+        return checked(type(to), values, f"{what}, shifted")

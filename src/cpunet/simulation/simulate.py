@@ -253,13 +253,11 @@ class StoredSimulation:
     def read(cls, path: Path | str) -> Self:
         """Read a file.
 
-        Hits of events that have no pulse in the file are left out.
-
         Raises
         ------
         CpunetError
-            If the file cannot be read, does not record how it was made, or lacks the hits of
-            a pulse.
+            If the file cannot be read, does not record how it was made, or holds hits of other
+            events than pulses.
         """
         file = Path(path)
         with opened(file) as content:
@@ -279,14 +277,10 @@ class StoredSimulation:
                 f"{file}: what {_PULSES} tells of its simulation cannot be used by this "
                 "version; simulate it again"
             ) from error
-        if len(np.unique(numbers)) < len(numbers):
+        hits = read_hits(file)
+        if not np.array_equal(hits.event_number, numbers):
             raise CpunetError(
-                f"{file}: several pulses have the same event_number; simulate them again"
-            )
-        hits = read_hits(file).of_events(numbers)
-        if (without := np.diff(hits.offsets) == 0).any():
-            raise CpunetError(
-                f"{file}: {HIT_TABLE} has no hit of event {hits.event_number[without][0]}; "
+                f"{file}: {HIT_TABLE} holds other events than {_PULSES}, or in another order; "
                 "simulate it again"
             )
         return cls(detector, settings, hits)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ from cpunet.simulation.field_lookup import (
 )
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hits import FARTHEST_MM, Hits, OpenHits
+from cpunet.simulation.hits import Hits, OpenHits
 from cpunet.simulation.settings import SimulationSettings
 
 _CHUNK = 25  # events per task of a thread
@@ -43,57 +44,30 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
-    """Pulses of single hits, in units of the charge of the hit.
-
-    Parameters
-    ----------
-    waveforms
-        Float32 array of shape ``(n, samples)``; 0 where `valid` is false.
-    dt_ns
-        Sampling period in ns.
-    valid
-        Whether a hit gives a signal. Hits in a contact, outside the crystal or in germanium
-        without a field do not.
-    collected
-        Whether both carriers were collected within the record.
-    collection_time_ns
-        Time in ns at which the last carrier was collected or the record ended; NaN if not
-        valid.
-    cloud_fwhm_ns
-        FWHM in ns of the smearing by the charge cloud; NaN if not valid.
-    trapped
-        Fraction of the signal lost to trapping; NaN if not valid.
-    """
-
-    waveforms: npt.NDArray[np.float32]
-    dt_ns: float
-    valid: BoolArray
-    collected: BoolArray
-    collection_time_ns: FloatArray
-    cloud_fwhm_ns: FloatArray
-    trapped: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class EventPulses:
-    """Pulses of events, in units of the charge that gives a signal.
+    """Pulses of events, and what becomes of their hits.
 
     Parameters
     ----------
     waveforms
-        Float32 array (n_events, samples); zero for events without any signal.
+        Float32 array (n_events, samples), in units of the charge that gives a signal; zero for
+        events without any signal.
     dt_ns
         Sampling period in ns.
     hits
         The events.
-    valid, collected
-        Of each hit, see `Signals`.
-    lost_kev
-        Energy in keV of the hits of each event without a signal: in a contact or its dead
-        layer, outside the crystal, or in germanium without a field.
-    trapped_kev
-        Energy in keV of each event whose signal is lost to trapping.
+    valid
+        Whether a hit gives a signal. Hits in a contact or its dead layer, outside the crystal
+        or in germanium without a field do not.
+    collected
+        Whether both carriers of a hit were collected within the record.
+    collection_time_ns
+        Time in ns at which the last carrier of a hit was collected or the record ended; NaN if
+        not valid.
+    cloud_fwhm_ns
+        FWHM in ns of the smearing by the charge cloud of a hit; NaN if not valid.
+    trapped
+        Fraction of the signal of a hit that is lost to trapping; NaN if not valid.
     """
 
     waveforms: npt.NDArray[np.float32]
@@ -101,8 +75,23 @@ class EventPulses:
     hits: Hits
     valid: BoolArray
     collected: BoolArray
-    lost_kev: FloatArray
-    trapped_kev: FloatArray
+    collection_time_ns: FloatArray
+    cloud_fwhm_ns: FloatArray
+    trapped: FloatArray
+
+    @cached_property
+    def lost_kev(self) -> FloatArray:
+        """Energy in keV of the hits of each event without a signal."""
+        return self._by_event(np.where(self.valid, 0.0, self.hits.edep_kev))
+
+    @cached_property
+    def trapped_kev(self) -> FloatArray:
+        """Energy in keV of each event whose signal is lost to trapping."""
+        return self._by_event(np.where(self.valid, self.hits.edep_kev * self.trapped, 0.0))
+
+    def _by_event(self, of_hits: FloatArray) -> FloatArray:
+        sums = np.bincount(self.hits.event_of_hit, of_hits, len(self.hits))
+        return sums.astype(np.float64)  # integers without any hit
 
     @property
     def collected_kev(self) -> FloatArray:
@@ -224,8 +213,8 @@ class Simulator:
         y_mm: npt.ArrayLike,
         z_mm: npt.ArrayLike,
         edep_kev: npt.ArrayLike,
-    ) -> Signals:
-        """Pulse of each hit.
+    ) -> EventPulses:
+        """Pulse of each hit, in units of its charge.
 
         Parameters
         ----------
@@ -239,17 +228,10 @@ class Simulator:
         CpunetError
             If a coordinate or an energy is not finite.
         """
-        hits = _table(x_mm, y_mm, z_mm, edep_kev)
-        waveforms, facts = self._summed(hits, np.arange(len(hits) + 1), weighted=False)
-        return Signals(
-            waveforms=waveforms,
-            dt_ns=self.settings.dt_ns,
-            valid=np.isfinite(facts[:, 0]),
-            collected=facts[:, 1] == 1.0,
-            collection_time_ns=facts[:, 0] * self._task.step_ns,
-            cloud_fwhm_ns=facts[:, 2] * self._task.step_ns,
-            trapped=facts[:, 3],
-        )
+        columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
+        table = np.stack(columns, axis=-1).astype(np.float64).reshape(-1, 4)
+        hits = Hits.of(table[:, :3], table[:, 3], np.arange(len(table) + 1))
+        return self._pulses(hits, weighted=False)
 
     def events(self, hits: Hits) -> EventPulses:
         r"""Pulse of each event.
@@ -265,24 +247,26 @@ class Simulator:
         CpunetError
             If the position or energy of a hit is not finite.
         """
-        table = _table(hits.x_mm, hits.y_mm, hits.z_mm, hits.edep_kev)
-        waveforms, facts = self._summed(table, hits.offsets, weighted=True)
-        valid = np.isfinite(facts[:, 0])
-        lost_kev, trapped_kev = (
-            np.bincount(hits.event_of_hit, part, len(hits)).astype(float)
-            for part in (
-                np.where(valid, 0.0, hits.edep_kev),
-                np.where(valid, hits.edep_kev * facts[:, 3], 0.0),
-            )
-        )
+        return self._pulses(hits, weighted=True)
+
+    def _pulses(self, hits: Hits, *, weighted: bool) -> EventPulses:
+        table = np.column_stack([hits.position_mm, hits.edep_kev])
+        bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+        if len(bad):
+            raise CpunetError(f"hits: hit {bad[0]}: no finite place or energy; leave it out")
+        waveforms = np.zeros((len(hits), self.settings.n_samples), np.float32)
+        facts = np.full((len(table), 4), np.nan)
+        _sum_events(self._maps, table, hits.offsets, self._task, weighted, waveforms, facts)
+        last_step, all_collected, fwhm_steps, trapped = facts.T
         return EventPulses(
             waveforms=waveforms,
             dt_ns=self.settings.dt_ns,
             hits=hits,
-            valid=valid,
-            collected=facts[:, 1] == 1.0,
-            lost_kev=lost_kev,
-            trapped_kev=trapped_kev,
+            valid=np.isfinite(last_step),
+            collected=all_collected == 1.0,
+            collection_time_ns=last_step * self._task.step_ns,
+            cloud_fwhm_ns=fwhm_steps * self._task.step_ns,
+            trapped=trapped,
         )
 
     def blocks(self, source: OpenHits, title: str) -> Iterator[tuple[int, EventPulses]]:
@@ -312,27 +296,6 @@ class Simulator:
         paths = np.full((2, len(start), self.settings.n_steps, 3), np.nan)
         _fill_paths(self._maps, start, self.settings.step_ns, paths)
         return paths[ELECTRON], paths[HOLE]
-
-    def _summed(
-        self, hits: FloatArray, offsets: npt.NDArray[np.int64], *, weighted: bool
-    ) -> tuple[npt.NDArray[np.float32], FloatArray]:
-        waveforms = np.zeros((len(offsets) - 1, self.settings.n_samples), np.float32)
-        facts = np.full((len(hits), 4), np.nan)
-        _sum_events(self._maps, hits, offsets, self._task, weighted, waveforms, facts)
-        return waveforms, facts
-
-
-def _table(
-    x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike, edep_kev: npt.ArrayLike
-) -> FloatArray:
-    """Hits as rows x, y, z (mm), energy (keV)."""
-    columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
-    table = np.ascontiguousarray(np.stack(columns, axis=-1), dtype=np.float64).reshape(-1, 4)
-    near = (np.abs(table[:, :3]) <= FARTHEST_MM).all(1)  # NaN is not
-    bad = np.flatnonzero(~(near & np.isfinite(table[:, 3])))
-    if len(bad):
-        raise CpunetError(f"hits: hit {bad[0]}: no finite place or energy; leave it out")
-    return table
 
 
 @kernel(parallel=True)

@@ -115,8 +115,10 @@ def electron_table() -> ElectronTable:
     rows = int(np.ceil(np.log(ELECTRON_CUT / 4 / _TOP) / np.log(ratio)))
     energy = np.asarray(_TOP * ratio ** np.arange(rows), np.float64)
     middle = energy * np.sqrt(ratio)
-    stopping = _collision_loss(middle) + np.array([_soft_radiation(t) for t in middle])
-    step = energy * _LOSS_PER_STEP / stopping
+    # to collisions, and to photons below the cut
+    most = np.minimum(middle, PHOTON_CUT)
+    soft = _radiation(middle[:, np.newaxis], (np.arange(32) + 0.5) / 32 * most[:, np.newaxis])
+    step = energy * _LOSS_PER_STEP / (_collision_loss(middle) + soft.mean(axis=1) * most)
     hard, quantiles = zip(*map(_hard_photons, middle), strict=True)
     # inverse of the first transport mean free path: -d<cos>/ds at s = 0
     momentum = np.sqrt(middle * (middle + 2 * ELECTRON_MASS))
@@ -163,7 +165,7 @@ def _collision_loss(kinetic: Array) -> Array:
     return np.asarray(scale / beta2 * (logarithm + form - density))
 
 
-def _radiation(kinetic: float, photon: Array) -> Array:
+def _radiation(kinetic: float | Array, photon: Array) -> Array:
     """K dΣ/dk in 1/mm: photon energy times macroscopic cross section per photon energy."""
     before = kinetic + ELECTRON_MASS
     after = before - photon
@@ -172,13 +174,6 @@ def _radiation(kinetic: float, photon: Array) -> Array:
     logarithm = np.minimum(unscreened, np.log(183 * _Z ** (-1 / 3)))
     scale = 4 * _ALPHA * _RADIUS**2 * _Z * (_Z + 1) * _ATOMS / 10
     return np.asarray(scale * (1 + ratio**2 - 2 / 3 * ratio) * logarithm)
-
-
-def _soft_radiation(kinetic: float) -> float:
-    """Energy loss to photons below the cut in MeV/mm."""
-    top = min(kinetic, PHOTON_CUT)
-    photon = (np.arange(32) + 0.5) / 32 * top
-    return float(_radiation(kinetic, photon).mean() * top)
 
 
 def _hard_photons(kinetic: float) -> tuple[float, Array]:

@@ -41,7 +41,7 @@ from cpunet.simulation.gammas.electrons import (
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.outline import Outline, in_germanium
+from cpunet.simulation.outline import Outline, in_germanium, outline_of
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Medium(NamedTuple):
     @classmethod
     def of(cls, detector: Detector) -> Medium:
         """The crystal of a detector; its lithium layer is treated as germanium."""
-        return cls(Outline.of(detector), photon_table(), electron_table())
+        return cls(outline_of(detector), photon_table(), electron_table())
 
 
 @kernel(error_model="numpy")
