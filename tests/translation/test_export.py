@@ -94,7 +94,7 @@ def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
     export_onnx(run, tmp_path / "ren.onnx")
     session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
     windows, translator = prepared(sim), REN.load(run)
-    channels = translator.backend.network.latent_mean.out_channels
+    channels = translator.backend.network.unet.latent_mean.out_channels
     zeros = np.zeros((5, channels, 50), np.float32)
     (mean,) = session.run(None, {"windows": windows, "epsilon": zeros})
     np.testing.assert_allclose(mean, translator.apply(windows, noise=False), atol=1e-5)
