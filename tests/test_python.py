@@ -237,9 +237,9 @@ def test_a_seed_gives_the_same_pulses_in_each_way(home, run):
     sim = cpunet.open_pulses(home / "sim.lh5").read()
     sim = Pulses.concatenate([sim[sim.energy_kev > 0]] * 4)
     assert len(sim) > 2 * NOISE_ROWS
-    of_run, of_ren = run.translate(sim, seed=5).waveforms, run.ren(sim, seed=5)
-    assert np.array_equal(of_run, of_ren)
-    given = run.ren(sim.waveforms, energy_kev=sim.energy_kev, seed=5)
+    of_ren = run.ren.translate(sim, seed=5).waveforms
+    assert np.array_equal(run.translate(sim, seed=5).waveforms, of_ren)
+    given = run.ren.translate(sim.waveforms, energy_kev=sim.energy_kev, seed=5)
     assert np.array_equal(given, of_ren)
 
 

@@ -69,7 +69,7 @@ def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
 
 def test_too_many_earlier_pulses_are_refused_before_they_fill_the_memory():
     endless = TailsLaw(0.02, 1e12, TH228)
-    with pytest.raises(CpunetError, match="give a lower rate or a shorter decay"):
+    with pytest.raises(CpunetError, match="give a lower rate, or a shorter decay or record"):
         endless.draw(1000, np.random.default_rng(1))
 
 

@@ -6,10 +6,10 @@ Their means can, once both datasets are divided at the same quantiles of rise ti
 one slice then originate from the same regions of the detector.
 
 `fit_gauss_exp` is the method of LEGEND's production: sigma and tau are fitted to the
-superpulses. `fit_superpulse` divides their spectra. In each slice the mean measured current is the mean
-simulated one convolved with the kernel. The transfer function of the kernel is therefore the
-ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener factor suppresses H
-where the measured spectrum does not exceed its statistical error.
+superpulses. `fit_superpulse` divides their spectra. In each slice the mean measured current is
+the mean simulated one convolved with the kernel. The transfer function of the kernel is
+therefore the ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener
+factor suppresses H where the measured spectrum does not exceed its statistical error.
 """
 
 from __future__ import annotations

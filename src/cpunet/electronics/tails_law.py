@@ -145,6 +145,8 @@ def earlier_pulses(
     longest_us: float,
     energies_kev: Sequence[float],
     rng: np.random.Generator,
+    *,
+    most: float = MAX_EXPECTED,
 ) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
     """Draw pulses of a Poisson process within a time interval, for each of `n` traces.
 
@@ -158,6 +160,8 @@ def earlier_pulses(
         Quantiles of the energies in keV, see `TailsLaw`.
     rng
         Random generator.
+    most
+        Largest number that may be expected for a trace.
 
     Returns
     -------
@@ -168,13 +172,13 @@ def earlier_pulses(
     Raises
     ------
     CpunetError
-        If more than `MAX_EXPECTED` pulses are expected for a trace.
+        If more pulses are expected for a trace.
     """
     expected = rate_khz * 1e-3 * longest_us
-    if expected > MAX_EXPECTED:
+    if expected > most:
         raise CpunetError(
             f"other pulses at {rate_khz:g} kHz: {expected:.3g} in {longest_us:.3g} us, more "
-            f"than {MAX_EXPECTED:g}; give a lower rate or a shorter decay"
+            f"than {most:g}; give a lower rate, or a shorter decay or record"
         )
     counts = rng.poisson(expected, size=n)
     row = np.repeat(np.arange(n), counts)

@@ -17,7 +17,7 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import LinearInverse, ResponseGenerator
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray
@@ -138,6 +138,7 @@ def graph_of(network: Any, length: int) -> Graph:
     needed("onnxscript")
     from cpunet.translation import onnx_graphs as graphs
 
+    graph: Any
     latent: tuple[int, int] | None = None  # (channels, samples) of the draw of a network
 
     def example(n: int) -> Inputs:
@@ -151,23 +152,21 @@ def graph_of(network: Any, length: int) -> Graph:
         drawn = np.random.default_rng(n).normal(size=(n, *latent))
         return windows | {"epsilon": drawn.astype(np.float32)}
 
-    if isinstance(network, ResponseGenerator | LinearInverse):
-        chain = isinstance(network, ResponseGenerator)
-        readout = (
-            graphs.ReadoutGraph(network.response, length)
-            if chain
-            else graphs.InverseGraph(network)
-        )
-        model = graphs.onnx_model(readout, example(2), "records" if chain else "pulses")
+    if not hasattr(network, "unet"):
+        if isinstance(network, ResponseGenerator):
+            graph, output = graphs.ReadoutGraph(network.response, length), "records"
+        else:
+            graph, output = graphs.InverseGraph(network), "pulses"
+        model = graphs.onnx_model(graph, example(2), output)
         return Graph(model, example, lambda given: network(given["windows"]))
     latent = network.unet.latent_mean.out_channels, length // 16
-    unet = graphs.NetworkGraph(network.unet)
+    graph = graphs.NetworkGraph(network.unet)
 
     def expected(given: Inputs) -> FloatArray:
         with torch.inference_mode():
-            return np.asarray(unet(*map(torch.from_numpy, given.values())).numpy())
+            return np.asarray(graph(*map(torch.from_numpy, given.values())).numpy())
 
-    return Graph(graphs.onnx_model(unet, example(2), "translated"), example, expected)
+    return Graph(graphs.onnx_model(graph, example(2), "translated"), example, expected)
 
 
 def write_onnx(graph: Graph, path: Path, facts: dict[str, Any]) -> float:

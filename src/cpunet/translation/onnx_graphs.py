@@ -44,7 +44,9 @@ class ReadoutGraph(nn.Module):
             end = risen.int().argmax(1, keepdim=True)
             before = end - torch.arange(last + 1, dtype=torch.float64)
             us = (self.dt_us * before).clamp(0, LONGEST_US)
-            factor = 1 + sum(term * us**i for i, term in enumerate(self.stretch))
+            factor = torch.ones_like(us)
+            for i, term in enumerate(self.stretch):
+                factor = factor + term * us**i
             times = end - before / factor.clamp(min=MIN_STRETCH)
             first = times.floor().clamp(0, last)
             part = (times - first).clamp(0, 1).float()

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,7 @@ from cpunet.pulses.shape_parameters import (
 )
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.file_translation import Counts
+from cpunet.translation.file_translation import Counts, FileTranslation
 from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
@@ -66,6 +66,12 @@ class Translation:
     path: Path | None = None
     in_memory: TranslatedPulses | None = None
     writer: Callable[..., PulseWriter] | None = None
+
+    @classmethod
+    def of(cls, job: FileTranslation, counts: Counts, path: Path | None = None) -> Self:
+        """The result of a translation."""
+        adc = job.options.adc is not None
+        return cls(job.run.name, job.run.recipe, counts, adc, path)
 
     @cached_property
     def pulses(self) -> Pulses:
