@@ -23,7 +23,7 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
-from cpunet.pulses.container import FloatArray
+from cpunet.pulses.container import FloatArray, line_slope
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
@@ -317,11 +317,9 @@ def _band_powers(baselines: Values) -> Values:
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
     """Select baselines that neither slope nor contain another pulse."""
-    lever = np.arange(baselines.shape[1]) - 0.5 * (baselines.shape[1] - 1)
-    slope = baselines @ lever / (lever @ lever)
-    mean = baselines.mean(axis=1)
-    lines = mean[:, np.newaxis] + slope[:, np.newaxis] * lever
-    width = (baselines - lines).std(axis=1)
+    n = baselines.shape[1]
+    slope = baselines @ line_slope(n)
+    width = (baselines - slope[:, np.newaxis] * (np.arange(n) - 0.5 * (n - 1))).std(axis=1)
     flat = np.ones(len(baselines), bool)
     for _ in range(CLIPS):
         for values in (slope, width):

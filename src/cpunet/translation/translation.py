@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 from cpunet.errors import CpunetError, named
-from cpunet.html_pages import notebook_picture, part
 from cpunet.plotting import COLOURS, own_axes, styled
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection
@@ -199,20 +197,3 @@ class Translation:
         where = "in memory" if self.path is None else str(self.path)
         done = f"{self.counts.translated} of {self.counts.read} pulses"
         return f"<Translation {where}: {done}>"
-
-    def _repr_html_(self) -> str:
-        facts: dict[str, object] = {
-            "run": self.run,
-            "file": self.path,
-            "translated": f"{self.counts.translated} of {self.counts.read} pulses",
-            "as": "raw traces in ADC" if self.adc else "normalised windows",
-            "saturated": self.counts.saturated,
-        }
-        facts |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
-        small = self.in_memory is not None  # a file may be large
-        picture: str = ""
-        if small and self.counts.translated:
-            figure = Figure(figsize=(6.4, 3.2))
-            self.plot(ax=figure.subplots())
-            picture = notebook_picture(figure)
-        return part("object", "cpunet translation", facts, picture=picture)
