@@ -381,7 +381,21 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
         # the bins of the periodogram are wider than those of the records
         lines[round(centre * samples)] += excess.sum() * samples / length
         continuum[near] = np.minimum(continuum[near], around[near])
-    return _with_slow_part(continuum, lines, _structure_function(baselines)), lines
+    # From `FIRST_CLEAN_BIN` upwards the continuum is the measured one. Below, it rises towards
+    # 0 by a non-negative sum of Lorentzians with a structure function closest to the measured.
+    drift = _structure_function(baselines)
+    frequency, measured = np.arange(len(lines)) / samples, bins[FIRST_CLEAN_BIN:] / length
+    fast = np.interp(frequency, measured, continuum[FIRST_CLEAN_BIN:])
+    corners = np.geomspace(2 / samples, measured[0], CORNERS)[:, np.newaxis]
+    slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (measured[0] / corners) ** 2)
+    slow = np.maximum(slow, 0)
+    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
+    # both signs of the frequency: a density of 1 is a mean square of 1
+    oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
+    weights = 1 / drift[lags]
+    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
+    heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
+    return np.asarray(fast + heights @ slow, float), lines
 
 
 def _structure_function(baselines: Values) -> Values:
@@ -402,39 +416,3 @@ def _structure_function(baselines: Values) -> Values:
     # sums of squares over samples with a later partner, and over those with an earlier one
     left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
     return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)
-
-
-def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
-    """Continue the spectrum down to the frequencies of its lines.
-
-    Parameters
-    ----------
-    density
-        Periodogram of the baselines without its lines.
-    lines
-        The lines at the frequencies of the result.
-    drift
-        Structure function of the baselines.
-
-    Returns
-    -------
-    array
-        Density at the frequencies of the lines. From `FIRST_CLEAN_BIN`
-        upwards it is the measured one. Below, it rises towards 0 by a non-negative sum of
-        Lorentzians whose structure function is closest to `drift`.
-    """
-    samples, length = 2 * (len(lines) - 1), len(drift)
-    frequency = np.arange(len(lines)) / samples
-    bins = np.arange(len(density)) / length
-    join = bins[FIRST_CLEAN_BIN]
-    fast = np.interp(frequency, bins[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
-    corners = np.geomspace(2 / samples, join, CORNERS)[:, np.newaxis]
-    slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
-    slow = np.maximum(slow, 0)
-    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
-    # both signs of the frequency: a density of 1 is a mean square of 1
-    oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
-    weights = 1 / drift[lags]
-    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
-    heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
-    return np.asarray(fast + heights @ slow, float)

@@ -29,7 +29,6 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, require_seed, words_and_files
-from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
@@ -199,10 +198,24 @@ def make_stand(
     chain = read_electronics(electronics, of_chain)
     crystal, physics = detector_and_settings(detector, values, dt_ns=chain.dt_ns)
     wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
-    sim, data, readout_seed = stand_sides(chain, crystal, wanted, moved, physics, seed)
+    for window, number in wanted.items():
+        if number < 1:
+            raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
+    if physics.step_ns > _COARSEST_NS:
+        raise CpunetError(
+            f"settings: step_ns = {physics.step_ns:g}: a stand needs steps of at most "
+            f"{_COARSEST_NS:g} ns; lower it"
+        )
+    fine = {"dt_ns": _fine_ns(chain.dt_ns, physics.step_ns)}
+    physics = checked(SimulationSettings, physics.model_dump() | fine, "settings")
+    seeds = np.random.SeedSequence(seed).generate_state(3, np.uint32).tolist()
+    source = wanted, physics.source_height_mm, physics.source_radius_mm
+    sim = Side(crystal, physics, GammaSource(*source, seeds[0]))
+    other = moved.detector(crystal), moved.settings(physics)
+    data = Side(*other, GammaSource(*source, seeds[1]))
     with folder_written_aside(Path(out), STAND, force=force) as folder:
         label = _write_sim(folder, sim, chain)
-        columns = _write_data(folder, data, readout_seed, chain)
+        columns = _write_data(folder, data, seeds[2], chain)
         flags = {name: int((columns["flag"] & bit > 0).sum()) for name, bit in FLAGS.items()}
         counts: dict[str, Any] = {
             "n_sim": len(label),
@@ -274,59 +287,6 @@ class Side:
                 f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
                 "give more `events`"
             )
-
-
-def stand_sides(
-    electronics: Electronics,
-    detector: Detector,
-    events: Mapping[EnergyWindow, int],
-    shift: Shift,
-    settings: SimulationSettings,
-    seed: int,
-) -> tuple[Side, Side, int]:
-    """Sides of the simulation and of the data, and the seed of the readout.
-
-    Parameters
-    ----------
-    electronics
-        Readout chain of the data and of the truth.
-    detector
-        Detector of the simulation.
-    events
-        Number of events of each side by window.
-    shift
-        Deviations of the data's detector from the simulated one.
-    settings
-        Settings of the simulation; their period becomes that of the pulses at the input of
-        the chain.
-    seed
-        Seed of all random numbers.
-
-    Raises
-    ------
-    CpunetError
-        If a window has no events, the chain's period is no multiple of the time step, the
-        steps are too long, or the shifted detector is not valid.
-    """
-    for window, number in events.items():
-        if number < 1:
-            raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
-    if settings.step_ns > _COARSEST_NS:
-        raise CpunetError(
-            f"settings: step_ns = {settings.step_ns:g}: a stand needs steps of at most "
-            f"{_COARSEST_NS:g} ns; lower it"
-        )
-    values = settings.model_dump() | {"dt_ns": _fine_ns(electronics.dt_ns, settings.step_ns)}
-    settings = checked(SimulationSettings, values, "settings")
-    # seeds of the events of both sides and of the readout
-    sim_seed, data_seed, readout_seed = map(
-        int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
-    )
-    source = events, settings.source_height_mm, settings.source_radius_mm
-    sim = Side(detector, settings, GammaSource(*source, sim_seed))
-    other = shift.detector(detector), shift.settings(settings)
-    data = Side(*other, GammaSource(*source, data_seed))
-    return sim, data, readout_seed
 
 
 def _fine_ns(dt_ns: float, step_ns: float) -> float:

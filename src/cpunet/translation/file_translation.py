@@ -56,23 +56,22 @@ class Counts:
     read: int = 0
     translated: int = 0
     rejections: dict[str, int] = field(default_factory=dict)
-    saturated: int | None = None
+    saturated: int = 0
     files: int | None = None
     skipped: int = 0
 
     @classmethod
     def of(cls, block: TranslatedPulses) -> Counts:
         """Count the rows of a block."""
-        saturated = None if block.saturated is None else int(block.saturated.sum())
+        saturated = 0 if block.saturated is None else int(block.saturated.sum())
         return cls(len(block.codes), int(block.valid.sum()), block.rejections, saturated)
 
     def __add__(self, other: Counts) -> Counts:
-        saturated = [n for n in (self.saturated, other.saturated) if n is not None]
         return Counts(
             self.read + other.read,
             self.translated + other.translated,
             dict(Counter(self.rejections) + Counter(other.rejections)),
-            sum(saturated) if saturated else None,
+            self.saturated + other.saturated,
             skipped=self.skipped + other.skipped,
         )
 

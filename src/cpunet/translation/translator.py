@@ -295,20 +295,17 @@ class Translator:
         t0_ns[index] = prepared.pulses.t0_ns[rows] + done.begin * self.dt_ns - self.delay_ns
         return TranslatedPulses(replace(pulses, waveforms=waveforms, t0_ns=t0_ns), codes)
 
-    def apply(
-        self,
-        windows: FloatArray,
-        *,
-        energy_kev: Energies | None = None,
-        noise: bool = True,
-        generator: np.random.Generator | None = None,
-        tails_kev: Energies | None = None,
-        piled: InTracePileUp | None = None,
-    ) -> FloatArray:
-        """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        generator = generator or np.random.default_rng()
-        batch = Batch(windows, energy_kev, noise, generator, tails_kev, piled)
-        return self._translated(batch).windows
+    def apply(self, windows: FloatArray, **how: Any) -> FloatArray:
+        """Translate prepared windows, shape (n, window); rejected rows are NaN.
+
+        Parameters
+        ----------
+        windows
+            Prepared windows.
+        how
+            Further fields of a `Batch`.
+        """
+        return self._translated(Batch(windows, **how)).windows
 
     def _translated(self, whole: Batch) -> Translated:
         """Translate some windows at a time."""
