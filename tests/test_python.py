@@ -23,7 +23,7 @@ from matplotlib import pyplot
 
 import cpunet
 from cpunet import demo
-from cpunet.pulses import loading, preparation
+from cpunet.pulses import loading
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
@@ -65,8 +65,7 @@ def opens() -> Iterator[Counter[str]]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(h5py.File, "__init__", count_file)
-        for module in (loading, preparation):
-            patch.setattr(module, "prepare", count_rows)
+        patch.setattr(loading, "prepare", count_rows)
         yield counts
 
 
