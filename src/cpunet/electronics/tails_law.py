@@ -269,6 +269,7 @@ def fit_rate(
     likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
     logs = np.log(likelihood.energies)
     edges = np.concatenate([[-np.inf], 0.5 * (logs[1:] + logs[:-1]), [np.inf]])
+    own = np.histogram(np.log(finite), edges)[0] / max(len(finite), 1)
 
     def weights(shape: FloatArray) -> FloatArray:
         """Those of the file, or of a log-normal spectrum."""
@@ -286,7 +287,6 @@ def fit_rate(
         likely = likelihood(np.exp(expected), level, np.exp(sigma), weights(values[3:]))
         return float(prior - likely)
 
-    own = np.histogram(np.log(finite), edges)[0] / max(len(finite), 1)
     start = [0.0, np.log(sigma_kev)]
     shape = [MEDIAN[0], WIDTH[0]]
     limits = [EXPECTED, None, (start[1] - SIGMA, start[1] + SIGMA)]

@@ -168,8 +168,8 @@ class FileTranslation:
             writer.annotate(TRANSLATION, json.dumps(record, default=np.generic.item), file=True)
         return counts
 
-    def in_memory(self, source: PulseFile) -> tuple[TranslatedPulses, Counts]:
-        """Translated pulses of a file, and their counts, as those of `__call__`.
+    def in_memory(self, source: PulseFile) -> TranslatedPulses:
+        """Translated pulses of a file, the same as those of `__call__`.
 
         Raises
         ------
@@ -177,8 +177,7 @@ class FileTranslation:
             If the source cannot be used, or no pulse can be translated.
         """
         with self._opened(source) as pulses:
-            blocks = list(self._blocks(pulses, None))
-        return TranslatedPulses.joined(blocks), sum(map(Counts.of, blocks), Counts())
+            return TranslatedPulses.joined(list(self._blocks(pulses, None)))
 
     def _opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate."""

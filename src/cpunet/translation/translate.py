@@ -126,8 +126,9 @@ def translate(
             raise CpunetError("several files or tables do not stay in memory; give `out`")
         job = FileTranslation(used_run(run), options)
         job.warn()
-        in_memory, counts = job.in_memory(files[0])
-        return replace(Translation.of(job, counts), in_memory=in_memory, writer=job.writer)
+        done = job.in_memory(files[0])
+        of_job = Translation.of(job, Counts.of(done))
+        return replace(of_job, in_memory=done, writer=job.writer)
     make = partial(FileTranslation, options=options, resume=resume, force=force)
     if channels:
         if len(files) > 1:

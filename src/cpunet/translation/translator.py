@@ -122,7 +122,7 @@ class Translator:
     ) -> None:
         self.backend, self.recipe, self.dt_ns = backend, recipe.at(dt_ns), dt_ns
         self.delay_ns = delay_ns
-        self.needs_energies = backend.needs_energies
+        self.needs_energies = backend.noise is not None
         self.tails: DrawnTails | None = backend.tails
 
     @classmethod
