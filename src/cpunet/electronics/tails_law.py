@@ -210,8 +210,10 @@ MAX_WINGS, MIN_BELOW = 0.5, 100
 # Mean and width of the priors on the logarithms of the median energy and of the spectral width.
 MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
 STARTS = 0.005, 0.1  # pulses per decay time at which fits begin
-# Limits of logarithms: of this number, of the error over its estimate, and of the spectrum.
-EXPECTED, SIGMA, SPECTRUM = (-20.0, 6.0), 5.0, ((0.0, 10.0), (-2.0, 2.0))
+# Limits of logarithms: of this number, of the error over its estimate (below, the grid is too
+# coarse), of the spectrum, and of the wings.
+EXPECTED, SIGMA, SPECTRUM = (-20.0, 6.0), (-1.0, 8.0), ((0.0, 10.0), (-2.0, 2.0))
+WINGS = -5.0, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +291,7 @@ def fit_rate(
 
     start = [0.0, np.log(sigma_kev)]
     shape = [MEDIAN[0], WIDTH[0]]
-    limits = [EXPECTED, None, (start[1] - SIGMA, start[1] + SIGMA)]
+    limits = [EXPECTED, None, (start[1] + SIGMA[0], start[1] + SIGMA[1])]
     starts = [[np.log(n), *start, *shape] for n in STARTS]
     fit = _best(cost, starts, [*limits, *SPECTRUM])
     if len(finite):
@@ -299,9 +301,10 @@ def fit_rate(
     values = np.array(fit.values)
     expected = float(np.exp(values[0]))
     spread = np.log([sigma_kev, max(float(kev.std()), sigma_kev)])
+    alone = [[float(np.median(kev)), sigma] for sigma in spread]
     without = _best(
         lambda v: -likelihood(0.0, v[0], np.exp(v[1]), own),
-        [[float(np.median(kev)), sigma] for sigma in spread],
+        [values[1:3].tolist(), *alone],
         limits[1:],
     )
     # quantiles of the spectrum, evenly spaced in probability
@@ -375,7 +378,7 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
     if len(below) < MIN_BELOW:
         return 0.0, 1.0
     start = float(np.log(sigma_kev))
-    limits = [(start - SIGMA, start + SIGMA), (-SIGMA, SIGMA), (-SIGMA, SIGMA)]
+    limits = [(start + WINGS[0], start + WINGS[1]), WINGS, WINGS]
     alone = _best(lambda v: cost(np.exp(v[0]), 0.0, 1.0), [[start]], limits[:1])
     wide = _best(lambda v: cost(*in_ranges(v)), [[start, -1.0, 0.0]], limits)
     if wide.fval > alone.fval - WORTH:
