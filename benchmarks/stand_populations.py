@@ -15,11 +15,11 @@ import argparse
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.stand import Side, stand_sides
+from cpunet.electronics.stand import Side
 from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.settings import Shift, SimulationSettings
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)
@@ -37,17 +37,15 @@ def main() -> None:
     print("seed", *NAMES, sep=" | ")
     sides: list[list[Values]] = [[], []]
     for seed in range(first, last + 1):
-        sim, data, _ = stand_sides(
-            read_electronics("legend200"),
-            read_detector("icpc"),
-            {FEP: arguments.events},
-            Shift.of(["default"]),
-            SimulationSettings(),
-            seed,
-        )
-        here = [events_of(side) for side in (sim, data)]
-        for all_of_side, events in zip(sides, here, strict=True):
-            all_of_side.append(events)
+        seeds = np.random.SeedSequence(seed).generate_state(3, np.uint32).tolist()
+        here = []
+        for shift, side_seed in zip((Shift(), Shift.of(["default"])), seeds, strict=False):
+            physics = shift.settings(SimulationSettings())
+            source = physics.source_height_mm, physics.source_radius_mm, side_seed
+            events = GammaSource({FEP: arguments.events}, *source)
+            here.append(events_of(Side(shift.detector(read_detector("icpc")), physics, events)))
+        for all_of_side, these in zip(sides, here, strict=True):
+            all_of_side.append(these)
         print(seed, *deviations(*here), sep=" | ", flush=True)
     print("all", *deviations(*map(np.concatenate, sides)), sep=" | ")
 

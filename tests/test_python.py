@@ -23,12 +23,12 @@ from matplotlib import pyplot
 
 import cpunet
 from cpunet import demo
-from cpunet.pulses import loading, preparation
+from cpunet.pulses import loading
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.tables import with_std
-from cpunet.translation.translator import NOISE_ROWS
+from cpunet.translation.translator import NOISE_ROWS, RejectionWarning
 from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {
@@ -65,8 +65,7 @@ def opens() -> Iterator[Counter[str]]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(h5py.File, "__init__", count_file)
-        for module in (loading, preparation):
-            patch.setattr(module, "prepare", count_rows)
+        patch.setattr(loading, "prepare", count_rows)
         yield counts
 
 
@@ -192,19 +191,21 @@ def test_a_run_is_read_once(home, run, tmp_path, undrawn):
     listening.clear()
 
 
-def test_memory_and_file_have_the_same_pulses(home, run, tmp_path):
-    kept = run.translate(home / "sim.lh5", seed=4)
-    stored = cpunet.translate(run.folder, home / "sim.lh5", tmp_path / "t.lh5", seed=4)
-    same = kept.pulses.waveforms, stored.pulses.waveforms
-    assert np.array_equal(*same, equal_nan=True)
+def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, run, tmp_path):
+    """Of more pulses than have a common seed of the noise."""
+    sim = Pulses.concatenate([cpunet.open_pulses(home / "sim.lh5").read()] * 4)
+    assert len(sim) == 4 * N > 2 * NOISE_ROWS
+    kept = run.translate(sim, seed=4)
+    stored = cpunet.translate(run.folder, sim, tmp_path / "t.lh5", seed=4)
+    assert np.array_equal(kept.waveforms, stored.waveforms, equal_nan=True)
     assert (kept.codes.tolist(), kept.counts) == (stored.codes.tolist(), stored.counts)
-    assert kept.rejections == {"energy_unknown": 1}
-    assert np.flatnonzero(~kept.valid).tolist() == [3]
+    assert kept.rejections == {"energy_unknown": 4}
+    assert np.flatnonzero(~kept.valid).tolist() == [3, N + 3, 2 * N + 3, 3 * N + 3]
     assert stored.path == tmp_path / "t.lh5"
-    assert "energy unknown" in stored._repr_html_()
-    assert "data:image/png" not in stored._repr_html_()  # a file may be large
-    assert "data:image/png" in kept._repr_html_()
-    assert repr(kept) == f"<Translation in memory: {N - 1} of {N} pulses>"
+    assert repr(kept) == f"<Translation in memory: {4 * N - 4} of {4 * N} pulses>"
+    with pytest.warns(RejectionWarning):
+        of_ren = run.ren.translate(sim.waveforms, energy_kev=sim.energy_kev, seed=4)
+    assert np.array_equal(kept.waveforms, of_ren, equal_nan=True)
 
 
 def test_histogram_of_translated_pulses(home, run):
@@ -216,6 +217,8 @@ def test_histogram_of_translated_pulses(home, run):
     assert histogram.sum(flow=True) == finite.sum() == N  # without noise none needs an energy
     with pytest.raises(cpunet.CpunetError, match="no parameter 'drift'; there are current"):
         made.hist("drift")
+    with pytest.raises(cpunet.CpunetError, match="raw traces in ADC have no parameters"):
+        run.translate(home / "sim.lh5", adc=True).hist()
 
 
 def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
@@ -232,17 +235,6 @@ def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
         made.hist(bins=0)
 
 
-def test_a_seed_gives_the_same_pulses_in_each_way(home, run):
-    """Of more pulses than have a common seed of the noise."""
-    sim = cpunet.open_pulses(home / "sim.lh5").read()
-    sim = Pulses.concatenate([sim[sim.energy_kev > 0]] * 4)
-    assert len(sim) > 2 * NOISE_ROWS
-    of_run, of_ren = run.translate(sim, seed=5).waveforms, run.ren(sim, seed=5)
-    assert np.array_equal(of_run, of_ren)
-    given = run.ren(sim.waveforms, energy_kev=sim.energy_kev, seed=5)
-    assert np.array_equal(given, of_ren)
-
-
 def test_covariances_have_names(run):
     covariance = run.covariance
     assert list(covariance) == list(covariance.index) == list(run.fit.errors)
@@ -255,18 +247,6 @@ def test_runs_are_compared_by_their_readouts(run):
     assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
     with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
         cpunet.compare(run, run.folder)
-
-
-def test_raw_traces(home, run):
-    made = run.translate(home / "sim.lh5", adc=True)
-    assert made.adc
-    known = made.pulses.waveforms[made.valid]
-    assert (known == np.round(known)).all()
-    assert made.counts.saturated is not None
-    with pytest.raises(cpunet.CpunetError, match="raw traces in ADC have no parameters"):
-        made.hist()
-    back = run.translate(home / "raw.lh5", inverse=True, noise=False)
-    assert back.counts.translated > N // 2
 
 
 def damaged(home, run) -> Path:

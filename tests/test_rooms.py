@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 import cpunet
 
@@ -106,5 +107,7 @@ def test_the_lock_holds_what_the_constraints_say():
     for name, version in locked.items():
         assert constraints.get(name, version).partition("+")[0] == version.partition("+")[0]
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((root / "CITATION.cff").read_text())
+    assert (project["name"], citation["version"]) == ("cpunet-hpge", cpunet.__version__)
     for dependency in project["dependencies"]:
         assert re.split(r"[<>=]", dependency)[0].lower() in locked

@@ -99,9 +99,8 @@ def test_scalars_are_those_of_yaml_1_2_and_come_back_as_written(tmp_path: Path) 
     assert read_values(tmp_path / "two.yaml") == values
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
-def test_comments_may_be_in_any_encoding(tmp_path: Path, encoding: str) -> None:
-    (tmp_path / "one.yaml").write_bytes("a: 1  # H\u00f6he\n# -183 \u00b0C\n".encode(encoding))
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "one.yaml").write_text("a: 1  # H\u00f6he\n", "utf-8-sig")
     assert read_values(tmp_path / "one.yaml") == {"a": 1}
 
 

@@ -17,20 +17,11 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib import rc_context
-from matplotlib.backend_bases import FigureCanvasBase
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from cpunet.plotting import GROUP
 
 NOTEBOOK_DPI = 80
-# in SVG: blanks, L between points, fonts, which the style sheet has, and rotations by nothing
-_NEEDLESS = (
-    r"""\n *(?=<)| \n(?="|z)|\nL |font-family: [^;"]*(; )?| transform="rotate\(-0 [^"]*\""""
-)
-# what an element of a page has from the page and its style sheet
-_ALONE = """xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"
- font-family="DejaVu Sans, Verdana, sans-serif" stroke-linejoin="round\""""
 WIDE = 2.0  # aspect ratio from which a figure takes the full width of the page
 
 
@@ -82,26 +73,15 @@ def figure_html(
     stream = io.StringIO()
     # equal figures give equal text
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": caption}):
-        FigureCanvasSVG(figure).print_svg(  # type: ignore[no-untyped-call]
-            stream, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        )
-    FigureCanvasBase(figure)
-    across, down, content = re.search(  # type: ignore[union-attr]
-        r'<svg[^>]* viewBox="0 0 (\S+) (\S+)"[^>]*>(.*)</svg>', stream.getvalue(), re.DOTALL
-    ).groups()
-    content = re.sub(r"<(style|metadata).*?</\1>|<!--.*?-->", "", content, flags=re.S)
-    content = re.sub(_NEEDLESS, "", content)
-    content = re.sub(rf'<g id="{GROUP}', '<g data-method="', content)
-    content = re.sub(r'<g id="[^"]*"', "<g", content)
-    # digits that are seen: to 0.01 points, or 0.1 beyond 100
-    content = re.sub(
-        r"<[^>]*>", lambda tag: re.sub(r"(\d{3}\.\d|\.\d\d)\d+", r"\1", tag[0]), content
-    )
-    svg = f'<svg viewBox="0 0 {across} {down}" role="img">{content}</svg>'
-    width, height = figure.get_size_inches()
+        metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(stream, format="svg", metadata=metadata)
     if file is not None:
-        size = f'width="{width:g}in" height="{height:g}in"'
-        file.write_text(svg.replace("<svg", f"<svg {_ALONE} {size}", 1), encoding="utf-8")
+        file.write_text(stream.getvalue(), encoding="utf-8")
+    svg = stream.getvalue().partition("<svg ")[2]
+    svg = re.sub(rf'<g id="{GROUP}', '<g data-method="', f'<svg role="img" {svg}')
+    # other figures of a page have the same
+    svg = re.sub(r'(?<=<g) id="[^"]*"| xmlns(:xlink)?="[^"]*"', "", svg)
+    width, height = figure.get_size_inches()
     alt = f"{caption}: {shows}" if shows else caption
     return part("figure", caption, Markup(svg), width, width >= WIDE * height, alt)
 

@@ -11,15 +11,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
+from cpunet.progress import stage
+from cpunet.pulses import provenance
+from cpunet.pulses.doubts import rolled_over
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
+from cpunet.recipes import load_recipe
+from cpunet.recipes.schema import Recipe
 from cpunet.settings import Set, key_values
 from cpunet.simulation.geometry_readers import holds_detector, read_detector
+from cpunet.simulation.hit_files import describe_hits, holds_hits
 from cpunet.tables import Lines, aligned, text_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from cpunet.recipes.schema import Recipe
 
     Loaded: TypeAlias = cpunet.Run | cpunet.Report | cpunet.Stand | PulseFile
 
@@ -177,9 +181,6 @@ def look(
     quality: bool,
 ) -> InfoResult:
     """What is in a file, detector or folder; see `info`."""
-    from cpunet.recipes import load_recipe
-    from cpunet.simulation.hit_files import describe_hits, holds_hits
-
     place, recipe, no_pulses = Path(path), load_recipe("fast"), None
     if place.is_file() and not settings:  # most are pulses: these are opened once
         try:
@@ -187,10 +188,9 @@ def look(
         except CpunetError as error:
             no_pulses = error
     if holds_detector(path):
-        detector = read_detector(path, settings)
-        from cpunet.progress import stage
         from cpunet.simulation.fields import compute_fields, fields_in_words
 
+        detector = read_detector(path, settings)
         with stage(f"Fields of {detector.name}"):
             fields = compute_fields(detector)
 
@@ -252,21 +252,17 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
 
 def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
     """Describe the pulses of one table; of measured traces also their quality, on request."""
-    from cpunet.pulses import provenance
-    from cpunet.pulses.doubts import rolled_over
-    from cpunet.pulses.provenance import describe_pulses, left_out, trace_properties
-
     with file.open() as source:
         blocks = source.blocks()
         first = next(blocks)  # a few thousand
-        lines = describe_pulses(source, chain([first], blocks), recipe.peaks)
+        lines = provenance.describe_pulses(source, chain([first], blocks), recipe.peaks)
         side = provenance.recorded_side(source) or provenance.apparent_side(first.waveforms)
         # translated windows look measured, but are not raw traces
         translated = source.attrs.get(provenance.TRANSLATED_BY)
         if side is None or side.side != "measured" or translated:
             return lines
         try:
-            lines += trace_properties(first, recipe.preparation)
+            lines += provenance.trace_properties(first, recipe.preparation)
         except CpunetError as error:
             lines.append(("", f"cannot be described: {error}"))
         lines.append(("odd", str(rolled_over(first.waveforms) or "")))
@@ -275,7 +271,7 @@ def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
         from cpunet.electronics.pile_up_tails import PileUpTails
         from cpunet.pulses.baselines import Baselines
 
-        lines.append(("left out", left_out(first, recipe)))
+        lines.append(("left out", provenance.left_out(first, recipe)))
         try:
             baselines = Baselines.of(source.blocks(), recipe.preparation)
             return lines + PileUpTails.of(baselines).describe().in_words()

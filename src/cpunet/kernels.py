@@ -24,8 +24,7 @@ from typing import Any, TypeVar, overload
 import numba
 import platformdirs
 import threadpoolctl
-from numba.core import config, entrypoints
-from numba.core.caching import FunctionCache
+from numba.core import config
 
 from cpunet.errors import CpunetError
 
@@ -51,10 +50,17 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         # it was compiled, and a copy compiled with the caller where it was loaded from the
         # cache; their last bits differ.  Inlined into the caller there is only one version.
         options.setdefault("forceinline", True)
-    compiled = numba.njit(nogil=True, **options)(function)
-    if code_folder() is not None:
-        compiled._cache = _Cache(function)  # noqa: SLF001  numba has no public way
-    compiled._compilation_chain_init_hook = lambda: None  # noqa: SLF001  see `_Cache`
+    folder, before = code_folder(), config.CACHE_DIR
+    config.CACHE_DIR = str(folder)
+    try:
+        compiled = numba.njit(nogil=True, cache=folder is not None, **options)(function)
+    finally:
+        config.CACHE_DIR = before
+    if folder is not None:
+        # numba numbers files from 1: of two processes that compile a loop for different types
+        # at once, one would load the other's code
+        stored = compiled._cache._cache_file  # noqa: SLF001  numba has no public way
+        stored._data_name_pattern = f"{function.__name__}-{uuid.uuid4().hex}.{{number:d}}.nbc"  # noqa: SLF001
     if not options.get("parallel"):
         return compiled
 
@@ -146,29 +152,3 @@ def code_folder() -> Path | None:
         for old in folders[:-_MAX_FOLDERS]:
             shutil.rmtree(old)
     return folder
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """The code of a loop in `code_folder`, which is loaded without extensions of numba.
-
-    Those of awkward take 0.4 s, and no loop here needs them.
-    """
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        before, config.CACHE_DIR = config.CACHE_DIR, str(code_folder())
-        try:
-            super().__init__(function)
-        finally:
-            config.CACHE_DIR = before
-        # numba numbers files from 1: of two processes that compile a loop for different types
-        # at once, one would load the other's code
-        name = f"{self._impl.filename_base}.{uuid.uuid4().hex}.{{number:d}}.nbc"
-        self._cache_file._data_name_pattern = name  # noqa: SLF001
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        before = entrypoints._already_initialized  # noqa: SLF001
-        entrypoints._already_initialized = True  # noqa: SLF001
-        try:
-            return super().load_overload(sig, target_context)
-        finally:
-            entrypoints._already_initialized = before  # noqa: SLF001

@@ -59,13 +59,9 @@ def refuse_inputs(out: Path, *inputs: Given) -> None:
     """
     place, sources = Path(out).resolve(), list[Path]()
     for text in map(str, filter(None, inputs)):
-        file = text.rpartition(":")[0]
-        if os.path.lexists(text):
-            sources.append(Path(text))
-        elif file and os.path.lexists(file):
-            sources.append(Path(file))
-        elif glob.has_magic(text):  # of absolute names, too
-            sources += map(Path, glob.glob(text, recursive=True))  # noqa: PTH207
+        file = next((f for f in (text, text.rpartition(":")[0]) if os.path.lexists(f)), None)
+        names = [file] if file else glob.glob(text, recursive=True)  # noqa: PTH207 absolute, too
+        sources += map(Path, names)
     for source in sources:
         real = source.resolve()
         if _same(place, real):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from tqdm.auto import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -24,25 +24,14 @@ class Stage(tqdm):  # type: ignore[misc]
 
 
 class _Logged(Stage):
-    """The same as a line."""
+    """The same as lines of the log."""
 
-    @property
-    def format_dict(self) -> dict[str, Any]:
-        left = "/{total}, {rate_noinv_fmt}, {remaining} left"
-        ends = self.total and self.n < self.total
-        form = "{desc}: {n}" + (left if ends else ", {rate_noinv_fmt}") + "{postfix}"
-        return {**super().format_dict, "bar_format": form}
-
-
-class _Lines:
-    """A file whose lines go to the log."""
-
-    def write(self, text: str) -> None:
-        if line := text.strip():
-            log.info(line)
-
-    def flush(self) -> None:
-        pass
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        if msg is None:  # else the bar is cleared
+            left = "/{total}, {rate_noinv_fmt}, {remaining} left"
+            ends = self.total and self.n < self.total
+            form = "{desc}: {n}" + (left if ends else ", {rate_noinv_fmt}") + "{postfix}"
+            log.info(self.format_meter(**{**self.format_dict, "bar_format": form}))
 
 
 @contextmanager
@@ -74,7 +63,7 @@ def stage(title: str, total: int | None = None) -> Iterator[Stage]:
             yield bar
         return
     often = {"miniters": 1, "mininterval": LOG_EVERY_S, "delay": LOG_EVERY_S}
-    with _Logged(None, title, total, leave=False, file=_Lines(), unit="", **often) as bar:
+    with _Logged(None, title, total, leave=False, file=io.StringIO(), unit="", **often) as bar:
         start = time.monotonic()
         yield bar
     log.info("%s: done in %.1f s", title, time.monotonic() - start)

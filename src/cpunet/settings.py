@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import json
 import math
 import re
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
 
@@ -191,10 +189,7 @@ def names(folder: Path) -> list[str]:
 
 
 def read_text(name: str | Path, folder: Path | None = None) -> str:
-    """Text of a file, given by its path or by its name in `folder`.
-
-    It is in UTF-8 or, with a byte order mark, UTF-16; comments may be in any encoding.
-    """
+    """Text of a file in UTF-8, given by its path or by its name in `folder`."""
     choices = names(folder) if folder else []
     file = folder / f"{name}.yaml" if folder and str(name) in choices else Path(name)
     try:
@@ -204,14 +199,11 @@ def read_text(name: str | Path, folder: Path | None = None) -> str:
         raise CpunetError(f"{name}: {wrong}") from error
     except OSError as error:
         raise CpunetError(f"{name}: cannot be read ({error.strerror}); check it") from error
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", "replace")
-    with suppress(UnicodeDecodeError):
+    try:
         return content.decode("utf-8-sig")
-    for number, line in enumerate(content.splitlines(), 1):
-        if b"\0" in line or not line.split(b"#")[0].isascii():
-            raise CpunetError(f"{name}: line {number} is not UTF-8; save it as UTF-8")
-    return content.decode("latin-1")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise CpunetError(f"{name}: line {line} is not UTF-8; save it as UTF-8") from error
 
 
 def read_values(name: str | Path, folder: Path | None = None) -> dict[str, Any]:

@@ -238,19 +238,7 @@ def test_traces_without_noise_are_refused() -> None:
 
 
 FAST = load_recipe("fast").preparation
-DT_NS, WHITE_KEV, DECAY_SAMPLES = 16.0, 2.0, 4000.0
-# prepared pulses are 0.8 where a step has come down for 397 samples
-WANTED = WHITE_KEV * 0.8 / np.exp(-397 / DECAY_SAMPLES)
-
-
-def white_traces(n: int = 300, start: int = 560, seed: int = 0) -> Pulses:
-    """Raw white_traces of different energies with white noise of one size in keV."""
-    rng = np.random.default_rng(seed)
-    energy = rng.uniform(1500, 2700, n)
-    time = np.arange(start + 700) - start
-    pulse = np.clip(time / 40, 0, 1) * np.exp(-np.maximum(time - 40, 0) / DECAY_SAMPLES)
-    kev = energy[:, np.newaxis] * pulse + rng.normal(0, WHITE_KEV, (n, len(time)))
-    return Pulses.of(15_000 + 10 * kev, dt_ns=DT_NS, energy_kev=energy)
+WANTED = NOISE_KEV * TO_PREPARED
 
 
 def as_input(raw: Pulses) -> InputSet:
@@ -260,7 +248,7 @@ def as_input(raw: Pulses) -> InputSet:
 
 
 def test_energies_that_are_not_known_do_not_matter() -> None:
-    raw = white_traces(400)
+    raw = traces(400)
     raw.energy_kev[::4] = np.nan
     raw.energy_kev[1::4] = 0
     raw.waveforms[::4] += np.random.default_rng(1).normal(0, 500, raw.waveforms[::4].shape)
@@ -271,13 +259,13 @@ def test_energies_that_are_not_known_do_not_matter() -> None:
 
 @pytest.mark.parametrize("start", [560, 300, 240])
 def test_short_baselines_tell_the_noise(start: int) -> None:
-    noise = noise_of(as_input(white_traces(1200, start=start)))
+    noise = noise_of(as_input(traces(1200, start=start)))
     assert noise.rms == pytest.approx(WANTED, rel=0.03 if start == 560 else 0.05)
     assert noise.n_baselines > 1000
 
 
 def test_prepared_windows_tell_the_noise() -> None:
-    noise = noise_of(as_input(prepare(white_traces(), FAST, "measured").pulses))
+    noise = noise_of(as_input(prepare(traces(), FAST, "measured").pulses))
     assert noise.rms == pytest.approx(WANTED, rel=0.05)
     drawn = noise.draw(np.full(300, 2000.0), 1400, np.random.default_rng(2))
     assert drawn.std() == pytest.approx(WANTED / 2000, rel=0.05)

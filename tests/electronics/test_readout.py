@@ -85,11 +85,8 @@ def test_sampled_steps_equal_the_analytic_ones(name: str, per_sample: int):
         assert np.abs(trace - means).max() < 1e-4
 
 
-def test_legend200_rises_as_measured():
+def test_presets_rise_and_decay_as_measured():
     assert 146 <= rise_ns(read_electronics("legend200").transfer.step(T_NS)) <= 172
-
-
-def test_ornl_decays_as_measured():
     chain = read_electronics("ornl")
     late = chain.transfer.step([40e3, 60e3])
     assert -20 / np.log(late[1] / late[0]) == pytest.approx(54.6, rel=0.01)

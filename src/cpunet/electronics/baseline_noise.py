@@ -22,7 +22,7 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
-from cpunet.pulses.container import FloatArray
+from cpunet.pulses.container import FloatArray, line_slope
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
@@ -320,11 +320,9 @@ def _band_powers(baselines: Values) -> Values:
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
     """Select baselines that neither slope nor contain another pulse."""
-    lever = np.arange(baselines.shape[1]) - 0.5 * (baselines.shape[1] - 1)
-    slope = baselines @ lever / (lever @ lever)
-    mean = baselines.mean(axis=1)
-    lines = mean[:, np.newaxis] + slope[:, np.newaxis] * lever
-    width = (baselines - lines).std(axis=1)
+    n = baselines.shape[1]
+    slope = baselines @ line_slope(n)
+    width = (baselines - slope[:, np.newaxis] * (np.arange(n) - 0.5 * (n - 1))).std(axis=1)
     flat = np.ones(len(baselines), bool)
     for _ in range(CLIPS):
         for off in (np.abs(slope - np.median(slope[flat])), width - np.median(width[flat])):
@@ -341,8 +339,8 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     .. math:: S(\nu) = \frac{\langle |\sum_j w_j (x_j - \bar x)
         e^{-2\pi i \nu j}|^2 \rangle}{\sum_j w_j^2},
 
-    without its lines, continued to low frequencies by a sum of Lorentzians that is fitted to
-    the structure function :math:`\frac{1}{2} \langle (x_{j+k} - x_j)^2 \rangle`.
+    without its lines, continued to low frequencies by a constant and Lorentzians fitted to the
+    structure function :math:`\frac{1}{2} \langle (x_{j+k} - x_j)^2 \rangle`.
 
     Parameters
     ----------
@@ -386,7 +384,22 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
         # the bins of the periodogram are wider than those of the records
         lines[round(centre * samples)] += excess.sum() * samples / length
         continuum[near] = np.minimum(continuum[near], around[near])
-    return _with_slow_part(continuum, lines, _structure_function(baselines)), lines
+    # From `FIRST_CLEAN_BIN` upwards the continuum is the measured one. Below, it is a sum of a
+    # constant and Lorentzians, not negative, with a structure function closest to the measured.
+    drift = _structure_function(baselines)
+    frequency, measured = np.arange(len(lines)) / samples, bins[FIRST_CLEAN_BIN:] / length
+    fast = np.interp(frequency, measured, continuum[FIRST_CLEAN_BIN:])
+    constant, fast = np.where(frequency < measured[0], (fast, 0 * fast), (0 * fast, fast))
+    corners = np.geomspace(2 / samples, measured[0], CORNERS)[:, np.newaxis]
+    slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (measured[0] / corners) ** 2)
+    slow = np.vstack([constant, np.maximum(slow, 0)])
+    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
+    # both signs of the frequency: a density of 1 is a mean square of 1
+    oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
+    weights = 1 / drift[lags]
+    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
+    heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
+    return np.asarray(fast + heights @ slow, float), lines
 
 
 def _structure_function(baselines: Values) -> Values:
@@ -407,40 +420,3 @@ def _structure_function(baselines: Values) -> Values:
     # sums of squares over samples with a later partner, and over those with an earlier one
     left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
     return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)
-
-
-def _with_slow_part(density: Values, lines: Values, drift: Values) -> Values:
-    """Continue the spectrum down to the frequencies of its lines.
-
-    Parameters
-    ----------
-    density
-        Periodogram of the baselines without its lines.
-    lines
-        The lines at the frequencies of the result.
-    drift
-        Structure function of the baselines.
-
-    Returns
-    -------
-    array
-        Density at the frequencies of the lines. From `FIRST_CLEAN_BIN`
-        upwards it is the measured one. Below, it is a non-negative sum of a constant and
-        Lorentzians whose structure function is closest to `drift`.
-    """
-    samples, length = 2 * (len(lines) - 1), len(drift)
-    frequency = np.arange(len(lines)) / samples
-    bins = np.arange(len(density)) / length
-    join = bins[FIRST_CLEAN_BIN]
-    fast = np.interp(frequency, bins[FIRST_CLEAN_BIN:], density[FIRST_CLEAN_BIN:])
-    constant, fast = np.where(frequency < join, (fast, 0 * fast), (0 * fast, fast))
-    corners = np.geomspace(2 / samples, join, CORNERS)[:, np.newaxis]
-    slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (join / corners) ** 2)
-    slow = np.vstack([constant, np.maximum(slow, 0)])
-    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
-    # both signs of the frequency: a density of 1 is a mean square of 1
-    oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
-    weights = 1 / drift[lags]
-    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
-    heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
-    return np.asarray(fast + heights @ slow, float)

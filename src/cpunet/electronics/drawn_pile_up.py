@@ -10,7 +10,7 @@ In-trace pile-up, pulses within the record of a trace, is drawn by a Poisson pro
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, Self
 
@@ -21,7 +21,6 @@ from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import PileUpTails, tail_shape
 from cpunet.electronics.tails_law import TailsLaw, earlier_pulses
-from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
 from cpunet.recipes.schema import PreparationConfig
@@ -185,7 +184,7 @@ def passing(
 
 MAX_EXPECTED = 4.0  # maximum expected number of piled-up pulses per trace
 
-Columns = dict[str, tuple[npt.NDArray[np.generic], str]]
+Columns = dict[str, tuple[npt.NDArray[Any], str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +212,54 @@ class InTracePileUp:
     after_ns: Values
     partner: npt.NDArray[np.int64]
 
+    @classmethod
+    def draw(
+        cls,
+        n: int,
+        rate_khz: float,
+        energies_kev: Sequence[float],
+        dt_ns: float,
+        before: int,
+        length: int,
+        rng: np.random.Generator,
+    ) -> Self:
+        """Draw pulses of a Poisson process for records, with shapes of random traces.
+
+        Parameters
+        ----------
+        n
+            Number of traces.
+        rate_khz, energies_kev
+            Rate in kHz, and quantiles of the energies, see
+            `cpunet.electronics.tails_law.TailsLaw`.
+        dt_ns
+            Sampling period in ns.
+        before, length
+            Samples of a record before the trace's own pulse, and all.
+        rng
+            Random generator.
+
+        Raises
+        ------
+        CpunetError
+            If more than `MAX_EXPECTED` pulses are expected in a record.
+
+        Examples
+        --------
+        1 kHz in a record of 20 us corresponds to 0.02 pulses per trace.
+
+        >>> rng = np.random.default_rng(1)
+        >>> piled = InTracePileUp.draw(10_000, 1.0, (10, 2615), 20.0, 250, 1000, rng)
+        >>> 150 < len(piled.row) < 250, bool((piled.after_ns >= -5e3).all())
+        (True, True)
+        """
+        record_us = 1e-3 * (length * dt_ns)
+        row, kev, time_us = earlier_pulses(
+            n, rate_khz, record_us, energies_kev, rng, most=MAX_EXPECTED
+        )
+        partner = rng.integers(max(n, 1), size=len(row))
+        return cls(n, row, kev, 1e3 * time_us - before * dt_ns, partner)
+
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Self:
         """Piled-up pulses of selected traces, with the traces renumbered."""
         place = np.full(self.n, -1)
@@ -226,22 +273,18 @@ class InTracePileUp:
             self.partner[inside] % max(len(rows), 1),
         )
 
-    def largest(self) -> tuple[npt.NDArray[np.int64], Values, Values]:
-        """Number of piled-up pulses in each trace, and energy and time of the largest.
+    def columns(self) -> Columns:
+        """What is in each trace, as columns of a table with their units.
 
-        Energies (keV) and times (ns) are NaN where there is none. All of shape ``(n,)``.
+        ``n_piled``: number of piled-up pulses; ``piled_kev``, ``piled_ns``: energy and time of
+        the largest, NaN where there is none. All of shape ``(n,)``.
         """
         kev, after_ns = np.full(self.n, np.nan), np.full(self.n, np.nan)
         order = np.argsort(self.kev, kind="stable")  # the largest is written last
         kev[self.row[order]] = self.kev[order]
         after_ns[self.row[order]] = self.after_ns[order]
-        return np.bincount(self.row, minlength=self.n), kev, after_ns
-
-    def columns(self) -> Columns:
-        """Results of `largest` as columns of a table, with their units."""
-        count, kev, after_ns = self.largest()
         return {
-            "n_piled": (count, ""),
+            "n_piled": (np.bincount(self.row, minlength=self.n), ""),
             "piled_kev": (kev, "keV"),
             "piled_ns": (after_ns, "ns"),
         }
@@ -299,50 +342,3 @@ class InTracePileUp:
             first = max(0, start)
             total[row, first : first + len(part)] += self.kev[i] / energy_kev[row] * part
         return total
-
-
-@dataclass(frozen=True)
-class DrawnPileUp:
-    """Parameters of the piled-up pulses to be drawn.
-
-    Parameters
-    ----------
-    rate_khz
-        Rate of the pulses in kHz.
-    energies_kev
-        Quantiles of their energies in keV, see `cpunet.electronics.tails_law.TailsLaw`.
-    dt_ns
-        Sampling period in ns.
-    """
-
-    rate_khz: float
-    energies_kev: tuple[float, ...]
-    dt_ns: float
-
-    def draw(self, n: int, before: int, length: int, rng: np.random.Generator) -> InTracePileUp:
-        """Draw pulses for records of `length` samples, `before` before the own pulse.
-
-        Raises
-        ------
-        CpunetError
-            If more than `MAX_EXPECTED` pulses are expected in a record.
-
-        Examples
-        --------
-        1 kHz in a record of 20 us corresponds to 0.02 pulses per trace.
-
-        >>> rng = np.random.default_rng(1)
-        >>> piled = DrawnPileUp(1.0, (10, 2615), 20.0).draw(10_000, 250, 1000, rng)
-        >>> 150 < len(piled.row) < 250, bool((piled.after_ns >= -5e3).all())
-        (True, True)
-        """
-        record_us = 1e-3 * (length * self.dt_ns)
-        expected = self.rate_khz * 1e-3 * record_us
-        if expected > MAX_EXPECTED:
-            raise CpunetError(
-                f"pile-up at {self.rate_khz:g} kHz: {expected:.3g} pulses in a record of "
-                f"{record_us:.3g} us, more than {MAX_EXPECTED:g}; give a lower rate"
-            )
-        row, kev, time_us = earlier_pulses(n, self.rate_khz, record_us, self.energies_kev, rng)
-        partner = rng.integers(max(n, 1), size=len(row))
-        return InTracePileUp(n, row, kev, 1e3 * time_us - before * self.dt_ns, partner)

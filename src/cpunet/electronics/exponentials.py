@@ -62,7 +62,7 @@ class Exponentials:
     @classmethod
     def low_pass(cls, tau_ns: float) -> Exponentials:
         r"""RC integration, :math:`1 / (1 + s\tau)`."""
-        return cls.of_real(0.0, [tau_ns], [1 / tau_ns])
+        return cls.mixed(1.0, tau_ns)
 
     @classmethod
     def mixed(cls, fraction: float, tau_ns: float) -> Exponentials:

@@ -43,22 +43,20 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         If there are too few flat baselines.
     """
     pile_up, reason = tails_of(data)
-    drawn: DrawnTails | None = None
-    info = TailsInfo(missing=reason)
     if pile_up is None:
         log.info(f"pile-up tails are not measured: {reason}")
-    else:
-        likely = drawn_like(pile_up, data, config)
-        info = pile_up.describe().model_copy(update={"drawn": likely.describe()})
-    if pile_up is not None and pile_up.law is not None:
-        drawn, tenth = likely, info.percent_above["10_kev"]["measured"]
+        return TraceNoise(noise_of(data)), TailsInfo(missing=reason)
+    drawn = drawn_like(pile_up, data, config)
+    info = pile_up.describe().model_copy(update={"drawn": drawn.describe()})
+    if pile_up.law is not None:
+        tenth = info.percent_above["10_kev"]["measured"]
         alone = "" if pile_up.coupled else " (by slopes alone: levels do not follow the tilts)"
         log.info(
             f"pile-up tails: {pile_up.law.rate_khz:.2f} ± {pile_up.fit.rate_error_khz:.2f} "
             f"kHz{alone}, {tenth:.2g} % of the traces above 10 keV; translations are "
             "given them"
         )
-    return TraceNoise(noise_of(data, pile_up), drawn), info
+    return TraceNoise(noise_of(data, pile_up), drawn if pile_up.law else None), info
 
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:

@@ -163,8 +163,8 @@ MANY = 0.1
 LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
 # The rate is significant above SURE errors, with a log-likelihood gain above SURE_GAIN.
 SURE, SURE_GAIN = 4.0, 12.0
-MAX_FULL = 0.97  # maximum fraction of traces with a tail larger than the error
-MIN_EXPECTED = 1e-3  # pulses per decay time, below which the rate counts as zero
+# Maximum fraction of traces with a tail larger than the error, at a significant rate or not.
+MAX_FULL, MAX_UNSURE = 0.97, 0.5
 SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
 
 
@@ -315,14 +315,7 @@ class PileUpTails:
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
         fit = fit_rate(kev[quiet], guess, decay, baselines.first.energy_kev)
-        # no curvature despite a rate: the fit did not find the level of empty baselines
-        blind = fit.law.expected > MIN_EXPECTED and not fit.rate_error_khz > 0
-        if blind or float(fit.law.share_above(fit.sigma_kev)) > MAX_FULL:
-            raise CpunetError(
-                "nearly all traces lie on pile-up tails, so that the level of an empty "
-                "baseline is not seen and they cannot be measured; measure at a lower rate"
-            )
-        return cls(
+        tails = cls(
             kev=np.where(quiet, kev - fit.level_kev, np.nan),
             error_kev=fit.sigma_kev,
             coupled=coupled,
@@ -337,6 +330,14 @@ class PileUpTails:
             samples=samples,
             dt_ns=dt_ns,
         )
+        # with many tails and no precise rate, the level of empty baselines is not seen either
+        most = MAX_FULL if tails.law else MAX_UNSURE
+        if float(fit.law.share_above(fit.sigma_kev)) > most:
+            raise CpunetError(
+                "nearly all traces lie on pile-up tails, so that the level of an empty "
+                "baseline is not seen and they cannot be measured; measure at a lower rate"
+            )
+        return tails
 
     def measure(self, raw: Pulses) -> FloatArray:
         r"""Tail at the first sample of raw traces in keV; NaN where undetermined.

@@ -17,7 +17,7 @@ from numba import prange
 from scipy import fft
 
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum
-from cpunet.electronics.drawn_pile_up import DrawnPileUp, InTracePileUp
+from cpunet.electronics.drawn_pile_up import InTracePileUp
 from cpunet.electronics.exponentials import ComplexArray, FloatArray
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
@@ -296,8 +296,9 @@ def draw_other_pulses(
     added_kev = np.ascontiguousarray((heights @ decays).real)
     # before piled-up pulses are added
     tails_kev = added_kev[:, 0].copy()
-    others = DrawnPileUp(electronics.pile_up.rate_kHz, energies_kev, electronics.dt_ns)
-    piled = others.draw(n, electronics.n_pre, electronics.length, within)
+    rate_khz, dt_ns = electronics.pile_up.rate_kHz, electronics.dt_ns
+    record = electronics.n_pre, electronics.length
+    piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, *record, within)
     # with shapes of randomly chosen pulses
     shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
     np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
@@ -410,7 +411,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     shift_ns += clock.normal(0, electronics.trigger_jitter_ns, size=n)
     response = linear_response(pulses, electronics, shift_ns)
     added_kev, tails_kev, piled = draw_other_pulses(pulses, electronics, others)
-    n_piled, piled_kev, piled_ns = piled.largest()
+    n_piled, piled_kev, piled_ns = (values for values, _ in piled.columns().values())
     spectrum, length, dt_ns = electronics.noise.spectrum, electronics.length, electronics.dt_ns
     unit = coloured_noise(spectrum, n, length, dt_ns, noise)
     total_kev = energy[:, None] * response + added_kev

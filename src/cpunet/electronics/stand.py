@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +13,14 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.readout import SATURATED, linear_response, of_energy, read_out
+from cpunet.electronics.readout import (
+    DECAYING_BASELINE,
+    PILE_UP,
+    SATURATED,
+    linear_response,
+    of_energy,
+    read_out,
+)
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import Pulses
@@ -23,7 +29,6 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, read_json, require_seed, words_and_files
-from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
@@ -41,10 +46,9 @@ STAND = FolderKind(
     command="cpunet stand",
     own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
 )
+FLAGS = {"decaying baseline": DECAYING_BASELINE, "pile-up": PILE_UP, "saturated": SATURATED}
 # Truth about each measured trace besides its line, in ``data_labels.npz``.
 OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
-# What ``stand.json`` counts.
-COUNTS = ("n_sim", "n_data", "sim_lines", "data_lines", "flags")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
 LABELS = {"DEP": 0, "SEP": 1, "FEP": 2, "other": 3}
 OTHER = LABELS["other"]
@@ -52,7 +56,7 @@ OTHER = LABELS["other"]
 _COARSEST_NS = 4.0
 
 
-@dataclass(repr=False)
+@dataclass(frozen=True, repr=False)
 class Stand:
     """A virtual test stand: two sides of independent events, and the truth.
 
@@ -72,11 +76,11 @@ class Stand:
 
     folder: Path
     electronics: Electronics
-    n_sim: int = 0
-    n_data: int = 0
-    sim_lines: Counter[str] = field(default_factory=Counter)
-    data_lines: Counter[str] = field(default_factory=Counter)
-    flags: Counter[str] = field(default_factory=Counter)
+    n_sim: int
+    n_data: int
+    sim_lines: Mapping[str, int]
+    data_lines: Mapping[str, int]
+    flags: Mapping[str, int]
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -90,11 +94,10 @@ class Stand:
         path = Path(folder) / MARKER
         stored = read_json(path, "give the folder of a stand, or make one with cpunet stand")
         try:
-            counts = {**stored["counts"]}
             electronics = checked(Electronics, stored["electronics"], str(path))
+            return cls(Path(folder), electronics, **stored["counts"])
         except (KeyError, TypeError) as error:
             raise CpunetError(f"{path}: damaged; make the stand again") from error
-        return cls(Path(folder), electronics, **counts)
 
     @property
     def sim(self) -> PulseFile:
@@ -195,11 +198,32 @@ def make_stand(
     chain = read_electronics(electronics, of_chain)
     crystal, physics = detector_and_settings(detector, values, dt_ns=chain.dt_ns)
     wanted = wanted_events(events, load_recipe("fast").peaks, physics.window_kev)
-    sim, data, readout_seed = stand_sides(chain, crystal, wanted, moved, physics, seed)
-    stand = Stand(Path(out), chain)
-    with folder_written_aside(stand.folder, STAND, force=force) as folder:
-        _write_sim(folder, sim, stand)
-        _write_data(folder, data, readout_seed, stand)
+    for window, number in wanted.items():
+        if number < 1:
+            raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
+    if physics.step_ns > _COARSEST_NS:
+        raise CpunetError(
+            f"settings: step_ns = {physics.step_ns:g}: a stand needs steps of at most "
+            f"{_COARSEST_NS:g} ns; lower it"
+        )
+    fine = {"dt_ns": _fine_ns(chain.dt_ns, physics.step_ns)}
+    physics = checked(SimulationSettings, physics.model_dump() | fine, "settings")
+    seeds = np.random.SeedSequence(seed).generate_state(3, np.uint32).tolist()
+    source = wanted, physics.source_height_mm, physics.source_radius_mm
+    sim = Side(crystal, physics, GammaSource(*source, seeds[0]))
+    other = moved.applied(crystal), moved.applied(physics)
+    data = Side(*other, GammaSource(*source, seeds[1]))
+    with folder_written_aside(Path(out), STAND, force=force) as folder:
+        label = _write_sim(folder, sim, chain)
+        columns = _write_data(folder, data, seeds[2], chain)
+        flags = {name: int((columns["flag"] & bit > 0).sum()) for name, bit in FLAGS.items()}
+        counts: dict[str, Any] = {
+            "n_sim": len(label),
+            "n_data": len(columns["label"]),
+            "sim_lines": _by_line(label),
+            "data_lines": _by_line(columns["label"]),
+            "flags": flags,
+        }
         made = {
             "cpunet": cpunet.__version__,
             "shift": moved.model_dump(mode="json") if shift else None,
@@ -207,10 +231,10 @@ def make_stand(
             "electronics": chain.model_dump(mode="json"),
             "sim": sim.provenance(),
             "data": data.provenance(),
-            "counts": {name: getattr(stand, name) for name in COUNTS},
+            "counts": counts,
         }
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-    return stand
+    return Stand(Path(out), chain, **counts)
 
 
 @dataclass(frozen=True)
@@ -265,59 +289,6 @@ class Side:
             )
 
 
-def stand_sides(
-    electronics: Electronics,
-    detector: Detector,
-    events: Mapping[EnergyWindow, int],
-    shift: Shift,
-    settings: SimulationSettings,
-    seed: int,
-) -> tuple[Side, Side, int]:
-    """Sides of the simulation and of the data, and the seed of the readout.
-
-    Parameters
-    ----------
-    electronics
-        Readout chain of the data and of the truth.
-    detector
-        Detector of the simulation.
-    events
-        Number of events of each side by window.
-    shift
-        Deviations of the data's detector from the simulated one.
-    settings
-        Settings of the simulation; their period becomes that of the pulses at the input of
-        the chain.
-    seed
-        Seed of all random numbers.
-
-    Raises
-    ------
-    CpunetError
-        If a window has no events, the chain's period is no multiple of the time step, the
-        steps are too long, or the shifted detector is not valid.
-    """
-    for window, number in events.items():
-        if number < 1:
-            raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
-    if settings.step_ns > _COARSEST_NS:
-        raise CpunetError(
-            f"settings: step_ns = {settings.step_ns:g}: a stand needs steps of at most "
-            f"{_COARSEST_NS:g} ns; lower it"
-        )
-    values = settings.model_dump() | {"dt_ns": _fine_ns(electronics.dt_ns, settings.step_ns)}
-    settings = checked(SimulationSettings, values, "settings")
-    # seeds of the events of both sides and of the readout
-    sim_seed, data_seed, readout_seed = map(
-        int, np.random.SeedSequence(seed).generate_state(3, np.uint32)
-    )
-    source = events, settings.source_height_mm, settings.source_radius_mm
-    sim = Side(detector, settings, GammaSource(*source, sim_seed))
-    other = shift.applied(detector), shift.applied(settings)
-    data = Side(*other, GammaSource(*source, data_seed))
-    return sim, data, readout_seed
-
-
 def _fine_ns(dt_ns: float, step_ns: float) -> float:
     """Period of the pulses that the chain follows: whole steps, and a part of `dt_ns`.
 
@@ -337,10 +308,9 @@ def _fine_ns(dt_ns: float, step_ns: float) -> float:
     )
 
 
-def _write_sim(folder: Path, side: Side, stand: Stand) -> None:
-    """Write ``sim.lh5`` and the truth of its pulses."""
+def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
+    """Write ``sim.lh5`` and the truth of its pulses; return their lines."""
     labels: list[Labels] = []
-    electronics = stand.electronics
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
     # the truth grows in a file of its own: it may be larger than memory
     rows = folder / "truth.rows"
@@ -374,13 +344,13 @@ def _write_sim(folder: Path, side: Side, stand: Stand) -> None:
         n_pre=np.array(electronics.n_pre),
     )
     rows.unlink()
-    stand.n_sim = len(label)
-    stand.sim_lines = _by_line(label)
+    return label
 
 
-def _write_data(folder: Path, side: Side, seed: int, stand: Stand) -> None:
-    """Write ``data.lh5`` and the lines and flags of its traces."""
-    electronics = stand.electronics
+def _write_data(
+    folder: Path, side: Side, seed: int, electronics: Electronics
+) -> dict[str, npt.NDArray[Any]]:
+    """Write ``data.lh5``, and the lines and flags of its traces, which it returns."""
     columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("label", *OF_DATA)}
     path, attrs = folder / "data.lh5", MADE | {SIDE: "measured"}
     with PulseWriter(path, table="geds/raw", waveform_units="ADC", attrs=attrs) as writer:
@@ -391,20 +361,17 @@ def _write_data(folder: Path, side: Side, seed: int, stand: Stand) -> None:
             columns["label"].append(label)
             for name in OF_DATA:
                 columns[name].append(getattr(traces, name))
-        whole: dict[str, Any] = {n: np.concatenate(values) for n, values in columns.items()}
-        flag = whole["flag"]
-        saturated = int((flag & SATURATED > 0).sum())
-        if 2 * saturated > len(flag):
-            raise CpunetError(
-                f"electronics {electronics.name}: {saturated} of {len(flag)} traces leave the "
-                "ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
-            )
+    whole: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
+    saturated = whole["flag"] & SATURATED > 0
+    if 2 * saturated.sum() > len(saturated):
+        raise CpunetError(
+            f"electronics {electronics.name}: {saturated.sum()} of {len(saturated)} traces "
+            "leave the ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and "
+            "adc_bits"
+        )
     np.savez(folder / "data_labels.npz", **whole)
-    stand.n_data = len(flag)
-    stand.data_lines = _by_line(whole["label"])
-    for bit, name in ((1, "decaying baseline"), (2, "pile-up"), (SATURATED, "saturated")):
-        stand.flags[name] = int((flag & bit > 0).sum())
+    return whole
 
 
-def _by_line(labels: Labels) -> Counter[str]:
-    return Counter({name: int((labels == i).sum()) for name, i in LABELS.items()})
+def _by_line(labels: Labels) -> dict[str, int]:
+    return {name: int((labels == i).sum()) for name, i in LABELS.items()}

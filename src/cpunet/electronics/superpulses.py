@@ -5,18 +5,18 @@ Simulated and measured pulses are of different events, so single pulses cannot b
 Their means can, once both datasets are divided at the same quantiles of rise time. Pulses of
 one slice then originate from the same regions of the detector.
 
-`GaussExp` is the method of LEGEND's production: sigma and tau are fitted to the superpulses.
-`SuperpulseKernel` divides their spectra. In each slice the mean measured current is the mean
-simulated one convolved with the kernel. The transfer function of the kernel is therefore the
-ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener factor suppresses H
-where the measured spectrum does not exceed its statistical error.
+`fit_gauss_exp` is the method of LEGEND's production: sigma and tau are fitted to the
+superpulses. `fit_superpulse` divides their spectra. In each slice the mean measured current is
+the mean simulated one convolved with the kernel. The transfer function of the kernel is
+therefore the ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener
+factor suppresses H where the measured spectrum does not exceed its statistical error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -25,14 +25,13 @@ import scipy.optimize
 
 from cpunet.electronics.baseline_methods import (
     LONGEST_NS,
-    RC,
     BaselineMethod,
     Spectrum,
     Values,
     currents,
+    fit_rc,
     fitted_decay,
     fitted_tail_slope,
-    respond,
 )
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
@@ -40,7 +39,6 @@ from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import last_below
 
 Groups = list[npt.NDArray[np.int64]]
-Superpulses = tuple[Spectrum, Values]  # see `superpulses`
 
 SLICES = 8
 SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is used
@@ -99,7 +97,7 @@ def slices(current: Values) -> Groups:
     ]
 
 
-def superpulses(spectra: Spectrum, response: Values) -> Superpulses:
+def superpulses(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
     r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
 
     .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
@@ -140,88 +138,59 @@ def _aligned(spectra: Spectrum, steps: Values, groups: Groups) -> Iterator[Spect
         yield spectra[rows] * phases.reshape(len(rows), -1)[:, :bins]
 
 
-# maximum number of pulses of either dataset in the fit of sigma and tau, and its iterations,
+# maximum number of pulses of either dataset in the fit of parameters, and its iterations,
 # each with slices from the response fitted so far
-GAUSS_PULSES, GAUSS_ROUNDS = 2000, 3
+FITTED_PULSES, FITTED_ROUNDS = 2000, 3
 # Time compared before and after the half maximum; initial sigma and tau.
 EDGE_NS, START_NS = 1536.0, 32.0
 START_SHARE, LATE_NS = 0.05, 400.0  # the same of the late charge
 
 
-@dataclass(frozen=True)
-class GaussExp(BaselineMethod):
-    r"""A Gaussian and an exponential kernel followed by an exponential decay.
+def fit_gauss_exp(
+    sim: FloatArray, data: FloatArray, dt_ns: float, align: int
+) -> BaselineMethod:
+    r"""A Gaussian and an exponential kernel, fitted to superpulses.
 
     .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
 
-    Parameters
-    ----------
-    sigma_ns, tau_ns
-        Standard deviation of the Gaussian and time constant of the exponential, in ns.
-    tail_slope_per_ms
-        Logarithmic slope of the tail in 1/ms.
+    For the parameters see `fitted_decay`.
     """
-
-    sigma_ns: float
-    tau_ns: float
-    tail_slope_per_ms: float
-    name: ClassVar[str] = "gauss_exp"
-
-    @classmethod
-    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
-        longest = np.full(2, LONGEST_NS)
-        how = (np.full(2, START_NS), longest, longest)
-        (sigma, tau), slope = _fitted(sim, data, dt_ns, align, _gauss_exp, how)
-        return cls(dt_ns, sigma, tau, slope)
-
-    def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
-        length = record_length(waveforms.shape[1], self.dt_ns)
-        transfer = _gauss_exp(length, self.dt_ns, np.array([self.sigma_ns, self.tau_ns]))
-        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+    scale = {"sigma_ns": LONGEST_NS, "tau_ns": LONGEST_NS}
+    high, start = np.full(2, LONGEST_NS), np.full(2, START_NS)
+    return _fitted(sim, data, dt_ns, align, gauss_exp, start, high, scale)
 
 
-@dataclass(frozen=True)
-class RCLate(BaselineMethod):
-    r"""An RC integration with a part of the charge that comes late, and a decay.
+def gauss_exp(dt_ns: float, sigma_ns: float, tau_ns: float, length: int) -> Spectrum:
+    """Transfer function of `fit_gauss_exp` at the frequencies of a record."""
+    omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
+    gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
+    return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
+
+
+def fit_rc_late(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> BaselineMethod:
+    r"""An RC integration with a part of the charge that comes late, fitted to superpulses.
 
     .. math:: H(\omega) = \frac{1}{1 + i \omega \tau}
         \left(1 - w + \frac{w}{1 + i \omega T}\right)
 
-    Parameters
-    ----------
-    tau_ns, late_share, late_ns
-        Time constant of the integration, share :math:`w` of the late charge and its time
-        constant :math:`T`, times in ns.
-    tail_slope_per_ms
-        Logarithmic slope of the tail in 1/ms.
+    with the share :math:`w` of the late charge and its time constant :math:`T`. Charges are
+    compared, since late charge counts for little in currents. For the parameters see
+    `fitted_decay`.
     """
+    scale = {"tau_ns": LONGEST_NS, "late_share": 1.0, "late_ns": LONGEST_NS}
+    start = np.array([START_NS, START_SHARE, LATE_NS])
+    high = np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS])
+    method = _fitted(sim, data, dt_ns, align, rc_late, start, high, scale, charge=True)
+    return _with_own_decay(method, sim[:FITTED_PULSES], align)
 
-    tau_ns: float
-    late_share: float
-    late_ns: float
-    tail_slope_per_ms: float
-    name: ClassVar[str] = "rc_late"
 
-    @classmethod
-    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Fit superpulses in slices of rise time, see `BaselineMethod.fit`."""
-        start = np.array([START_NS, START_SHARE, LATE_NS])
-        scale = np.array([LONGEST_NS, 1.0, LONGEST_NS])
-        how = (start, np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS]), scale)
-        fitted = _fitted(sim, data, dt_ns, align, _rc_late, how, charge=True)
-        (tau, share, late), slope = fitted
-        method = cls(dt_ns, tau, share, late, slope)
-        own = _own_decay(method, slope, sim[:GAUSS_PULSES], align)
-        return replace(method, tail_slope_per_ms=own)
-
-    def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
-        length = record_length(waveforms.shape[1], self.dt_ns)
-        values = np.array([self.tau_ns, self.late_share, self.late_ns])
-        transfer = _rc_late(length, self.dt_ns, values)
-        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
+def rc_late(
+    dt_ns: float, tau_ns: float, late_share: float, late_ns: float, length: int
+) -> Spectrum:
+    """Transfer function of `fit_rc_late` at the frequencies of a record."""
+    s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
+    late = late_share / (1 + s * late_ns)
+    return np.asarray((1 - late_share + late) / (1 + s * tau_ns), complex)
 
 
 def _fitted(
@@ -229,35 +198,44 @@ def _fitted(
     data: FloatArray,
     dt_ns: float,
     align: int,
-    kernel: Callable[[int, float, Values], Spectrum],
-    how: tuple[Values, Values, Values],
+    transfer: Callable[..., Spectrum],
+    best: Values,
+    high: Values,
+    scale: Mapping[str, float],
     *,
     charge: bool = False,
-) -> tuple[list[float], float]:
-    """Parameters of a kernel fitted to superpulses, and the tail slope in 1/ms.
+) -> BaselineMethod:
+    """A method whose kernel has parameters, fitted to superpulses.
 
     Parameters
     ----------
     sim, data, dt_ns, align
-        As of `BaselineMethod.fit`.
-    kernel
-        Fourier transform of the kernel at a length and a period in ns.
-    how
-        Where the parameters start, their largest values (the smallest are 0), and scales.
+        See `fitted_decay`.
+    transfer
+        Transfer function: a function of the period in ns, the parameters and the length.
+    best, high, scale
+        Where the parameters start, their largest values (the smallest are 0), and their
+        scales by name.
     charge
-        Compare charges in place of currents, in which late charge counts for little.
+        Compare charges in place of currents.
     """
-    slope, steps = fitted_decay(sim, data, dt_ns, align, GAUSS_PULSES)
+    slope, steps = fitted_decay(sim, data, dt_ns, align, FITTED_PULSES)
     measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
     length = record_length(sim.shape[1], dt_ns)
-    of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
-    wanted = _mean_currents(of_data, slices(measured), length, edge)
-    spectra = np.asarray(scipy.fft.rfft(currents(sim[:GAUSS_PULSES], dt_ns), axis=1), complex)
 
-    best, high, scale = how
-    for _ in range(GAUSS_ROUNDS):
-        transfer = kernel(length, dt_ns, best)
-        groups = slices(scipy.fft.irfft(spectra * transfer, length, axis=1))
+    def mean_currents(spectra: Spectrum, groups: Groups) -> Values:
+        """Superpulses of currents around the half maximum, shape ``(slices, 2 * edge)``."""
+        steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
+        means = [moved.mean(axis=0) for moved in _aligned(spectra, steps, groups)]
+        around = np.roll(scipy.fft.irfft(np.array(means), length, axis=1), edge, axis=1)
+        return np.asarray(around[:, : 2 * edge], float)
+
+    of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
+    wanted = mean_currents(of_data, slices(measured))
+    spectra = np.asarray(scipy.fft.rfft(currents(sim[:FITTED_PULSES], dt_ns), axis=1), complex)
+    for _ in range(FITTED_ROUNDS):
+        response = spectra * transfer(dt_ns, *best, length)
+        groups = slices(scipy.fft.irfft(response, length, axis=1))
         # pulses outside the slices do not enter the fit
         sliced = spectra[np.concatenate(groups)]
         ends = np.cumsum([len(group) for group in groups])
@@ -266,37 +244,27 @@ def _fitted(
         def residual(
             parameters: Values, sliced: Spectrum = sliced, places: Groups = places
         ) -> Values:
-            response = sliced * kernel(length, dt_ns, parameters)
-            off = _mean_currents(response, places, length, edge) - wanted
+            off = mean_currents(sliced * transfer(dt_ns, *parameters, length), places) - wanted
             return np.asarray(np.cumsum(off, axis=1) if charge else off).ravel()
 
         best = scipy.optimize.least_squares(
-            residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
+            residual,
+            best,
+            bounds=(0.0, high),
+            x_scale=[*scale.values()],
+            diff_step=1e-3,
+            xtol=1e-4,
         ).x
-    return best.tolist(), slope
+    values = dict(zip(scale, best.tolist(), strict=True))
+    return BaselineMethod(dt_ns, slope, partial(transfer, dt_ns, *values.values()), values)
 
 
-def _rc_late(length: int, dt_ns: float, values: Values) -> Spectrum:
-    """Fourier transform of the kernel of `RCLate` at the frequencies of a record."""
-    s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
-    tau, share, late = values
-    return np.asarray((1 - share + share / (1 + s * late)) / (1 + s * tau), complex)
-
-
-def _gauss_exp(length: int, dt_ns: float, values: Values) -> Spectrum:
-    """Fourier transform of the kernel of `GaussExp` at the frequencies of a record."""
-    sigma_ns, tau_ns = values
-    omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
-    gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
-    return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
-
-
-def _mean_currents(spectra: Spectrum, groups: Groups, length: int, edge: int) -> Values:
-    """Superpulses of currents around the half maximum, shape ``(slices, 2 * edge)``."""
-    steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
-    means = [moved.mean(axis=0) for moved in _aligned(spectra, steps, groups)]
-    around = np.roll(scipy.fft.irfft(np.array(means), length, axis=1), edge, axis=1)
-    return np.asarray(around[:, : 2 * edge], float)
+def _with_own_decay(method: BaselineMethod, sim: FloatArray, align: int) -> BaselineMethod:
+    """A method whose decay lacks what a kernel's late part contributes to the tail."""
+    before, slope = padding(method.dt_ns)[0], method.tail_slope_per_ms
+    windows = method.translate(sim)[:, before : before + sim.shape[1]]
+    added = fitted_tail_slope(windows, method.dt_ns, align) - slope
+    return replace(method, tail_slope_per_ms=slope - added)
 
 
 # the same of the free kernel, whose iterations take half maxima of the response so far
@@ -306,99 +274,64 @@ LEAD_NS, LAG_NS = 512.0, 4096.0
 FADE_IN_NS, FADE_OUT_NS = 128.0, 1024.0
 
 
-@dataclass(frozen=True, eq=False)
-class SuperpulseKernel(BaselineMethod):
-    r"""A free kernel followed by an exponential decay.
+def fit_superpulse(
+    sim: FloatArray, data: FloatArray, dt_ns: float, align: int
+) -> BaselineMethod:
+    r"""A free kernel: `LEAD_NS` before zero delay and `LAG_NS` from it on, with a sum of 1.
 
     .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad
         W = \max\left(0, 1 - \frac{\sum \sigma_D^2}{\sum |D|^2}\right)
 
     The sums run over the slices. :math:`D` and :math:`S` are the mean spectra of data and
-    simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors.
-
-    Parameters
-    ----------
-    kernel
-        Weights with a sum of 1: `LEAD_NS` before zero delay and `LAG_NS` from it on.
-    tail_slope_per_ms
-        Logarithmic slope of the tail in 1/ms.
+    simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors. For the
+    parameters see `fitted_decay`.
     """
-
-    kernel: Values
-    tail_slope_per_ms: float
-    name: ClassVar[str] = "superpulse"
-
-    @classmethod
-    def fit(cls, sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Self:
-        """Divide the mean spectra, see `BaselineMethod.fit`."""
-        slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
-        length, lead = record_length(sim.shape[1], dt_ns), round(LEAD_NS / dt_ns)
-        current = currents(steps, dt_ns)
-        wanted = superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
-
-        spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES], dt_ns), axis=1))
-        kernel = np.zeros(lead + round(LAG_NS / dt_ns))
-        kernel[lead] = 1.0
-        for _ in range(FREE_ROUNDS):
-            # The simulated pulses are placed by the half maximum of their response. A shift
-            # of their own half maximum does not give this exactly.
-            response = scipy.fft.irfft(
-                spectra * _transfer(kernel, lead, length), length, axis=1
-            )
-            kernel = _kernel(wanted, superpulses(spectra, response), length, dt_ns)
-        method = cls(dt_ns, kernel, slope)
-        own = _own_decay(method, slope, sim[:FREE_PULSES], align)
-        return replace(method, tail_slope_per_ms=own)
-
-    def translate(self, waveforms: FloatArray) -> FloatArray:
-        """Apply the kernel and the decay, see `BaselineMethod.translate`."""
-        length = record_length(waveforms.shape[1], self.dt_ns)
-        transfer = _transfer(self.kernel, round(LEAD_NS / self.dt_ns), length)
-        return respond(waveforms, transfer, self.tail_slope_per_ms, self.dt_ns)
-
-    def describe(self) -> Mapping[str, float]:
-        """Mean and standard deviation of the kernel, and tail slope."""
-        time = np.arange(len(self.kernel)) * self.dt_ns
-        mean = float(self.kernel @ time)
-        variance = float(self.kernel @ (time - mean) ** 2)
-        return {
-            "kernel_mean_ns": mean - LEAD_NS,
-            "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
-            "tail_slope_per_ms": self.tail_slope_per_ms,
-        }
-
-
-def _own_decay(method: BaselineMethod, slope: float, sim: FloatArray, align: int) -> float:
-    """Slope of the decay (1/ms) without what a kernel's late part contributes to the tail."""
-    before = padding(method.dt_ns)[0]
-    windows = method.translate(sim)[:, before : before + sim.shape[1]]
-    return slope - (fitted_tail_slope(windows, method.dt_ns, align) - slope)
-
-
-def _kernel(data: Superpulses, sim: Superpulses, length: int, dt_ns: float) -> Values:
-    """Regularised ratio as weights around zero delay with a sum of 1."""
-    (measured, data_error), (simulated, sim_error) = data, sim
+    slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
+    length, current = record_length(sim.shape[1], dt_ns), currents(steps, dt_ns)
+    measured, data_error = superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
     wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
-    below = (np.abs(simulated) ** 2 + sim_error).sum(axis=0)
-    ratio = wiener * (measured * simulated.conj()).sum(axis=0) / below
     lead, lag, fade_in, fade_out = (
         round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
     )
-    weights = np.roll(scipy.fft.irfft(ratio, length), lead)[: lead + lag]
-    rise, fall = (
-        np.sin(0.5 * np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (fade_in, fade_out)
-    )
-    weights[:fade_in] *= rise
-    weights[-fade_out:] *= fall[::-1]
-    return np.asarray(weights / weights.sum(), float)
+    fades = np.ones(lead + lag)
+    fades[:fade_in] = np.sin(0.5 * np.pi * (np.arange(fade_in) + 0.5) / fade_in) ** 2
+    fall = np.sin(0.5 * np.pi * (np.arange(fade_out) + 0.5) / fade_out) ** 2
+    fades[-fade_out:] = fall[::-1]
+
+    spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES], dt_ns), axis=1))
+    kernel = np.zeros(lead + lag)
+    kernel[lead] = 1.0
+    for _ in range(FREE_ROUNDS):
+        # The simulated pulses are placed by the half maximum of their response. A shift
+        # of their own half maximum does not give this exactly.
+        response = scipy.fft.irfft(spectra * free(kernel, lead, length), length, axis=1)
+        simulated, sim_error = superpulses(spectra, response)
+        below = (np.abs(simulated) ** 2 + sim_error).sum(axis=0)
+        ratio = wiener * (measured * simulated.conj()).sum(axis=0) / below
+        kernel = np.roll(scipy.fft.irfft(ratio, length), lead)[: lead + lag] * fades
+        kernel /= kernel.sum()
+    time_ns = np.arange(len(kernel)) * dt_ns
+    mean_ns = float(kernel @ time_ns)
+    variance = float(kernel @ (time_ns - mean_ns) ** 2)
+    values = {
+        "kernel_mean_ns": mean_ns - LEAD_NS,
+        "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
+    }
+    method = BaselineMethod(dt_ns, slope, partial(free, kernel, lead), values)
+    return _with_own_decay(method, sim[:FREE_PULSES], align)
 
 
-def _transfer(kernel: Values, lead: int, length: int) -> Spectrum:
+def free(kernel: Values, lead: int, length: int) -> Spectrum:
+    """Transfer function of a kernel that begins `lead` samples before zero delay."""
     around_zero = np.zeros(length)
     around_zero[: len(kernel)] = kernel
     return np.asarray(scipy.fft.rfft(np.roll(around_zero, -lead)), complex)
 
 
-BASELINE_METHODS: dict[str, type[BaselineMethod]] = {
-    method.name: method for method in (RC, RCLate, GaussExp, SuperpulseKernel)
+Fit = Callable[[FloatArray, FloatArray, float, int], BaselineMethod]
+BASELINE_METHODS: dict[str, Fit] = {
+    "rc": fit_rc,
+    "rc_late": fit_rc_late,
+    "gauss_exp": fit_gauss_exp,
+    "superpulse": fit_superpulse,
 }

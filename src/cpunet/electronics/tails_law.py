@@ -30,16 +30,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from iminuit import Minuit
 
 from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
-
-if TYPE_CHECKING:
-    from scipy.optimize import OptimizeResult
 
 # After this many decay times the tail is below the noise: 0.02 keV of 2615 keV.
 LIFETIMES = 12.0
@@ -145,6 +142,8 @@ def earlier_pulses(
     longest_us: float,
     energies_kev: Sequence[float],
     rng: np.random.Generator,
+    *,
+    most: float = MAX_EXPECTED,
 ) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
     """Draw pulses of a Poisson process within a time interval, for each of `n` traces.
 
@@ -158,6 +157,8 @@ def earlier_pulses(
         Quantiles of the energies in keV, see `TailsLaw`.
     rng
         Random generator.
+    most
+        Largest number that may be expected for a trace.
 
     Returns
     -------
@@ -168,13 +169,13 @@ def earlier_pulses(
     Raises
     ------
     CpunetError
-        If more than `MAX_EXPECTED` pulses are expected for a trace.
+        If more pulses are expected for a trace.
     """
     expected = rate_khz * 1e-3 * longest_us
-    if expected > MAX_EXPECTED:
+    if expected > most:
         raise CpunetError(
             f"other pulses at {rate_khz:g} kHz: {expected:.3g} in {longest_us:.3g} us, more "
-            f"than {MAX_EXPECTED:g}; give a lower rate or a shorter decay"
+            f"than {most:g}; give a lower rate, or a shorter decay or record"
         )
     counts = rng.poisson(expected, size=n)
     row = np.repeat(np.arange(n), counts)
@@ -192,8 +193,6 @@ def energies_at(share: FloatArray, energies_kev: Sequence[float]) -> FloatArray:
     return np.asarray(np.exp(np.interp(share, at, logs)), float)
 
 
-Function = Callable[[FloatArray], float]
-
 # Range and number of energies of a spectrum; the lowest still leaves a visible tail.
 LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
 QUANTILES = 41  # quantiles of the returned spectrum
@@ -210,6 +209,11 @@ WORTH = 5.0
 MAX_WINGS, MIN_BELOW = 0.5, 100
 # Mean and width of the priors on the logarithms of the median energy and of the spectral width.
 MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
+STARTS = 0.005, 0.1  # pulses per decay time at which fits begin
+# Limits of logarithms: of this number, of the error over its estimate (below, the grid is too
+# coarse), of the spectrum, and of the wings.
+EXPECTED, SIGMA, SPECTRUM = (-20.0, 6.0), (-1.0, 8.0), ((0.0, 10.0), (-2.0, 2.0))
+WINGS = -5.0, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,25 +269,56 @@ def fit_rate(
     finite = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
     highest = float(np.clip(finite.max(initial=0.0), 100.0, HIGHEST_KEV))
     likelihood = _Likelihood(kev, sigma_kev, np.geomspace(LOWEST_KEV, highest, NODES))
-    fixed = None
-    vector, gain = likelihood.best()
+    logs = np.log(likelihood.energies)
+    edges = np.concatenate([[-np.inf], 0.5 * (logs[1:] + logs[:-1]), [np.inf]])
+    own = np.histogram(np.log(finite), edges)[0] / max(len(finite), 1)
+
+    def weights(shape: FloatArray) -> FloatArray:
+        """Those of the file, or of a log-normal spectrum."""
+        if not len(shape):
+            return own
+        parts = np.exp(-0.5 * ((logs - shape[0]) / np.exp(shape[1])) ** 2)
+        return np.asarray(parts / parts.sum(), float)
+
+    def cost(values: FloatArray) -> float:
+        expected, level, sigma = values[:3]
+        prior = sum(
+            0.5 * ((value - centre) / width) ** 2
+            for value, (centre, width) in zip(values[3:], (MEDIAN, WIDTH), strict=False)
+        )
+        likely = likelihood(np.exp(expected), level, np.exp(sigma), weights(values[3:]))
+        return float(prior - likely)
+
+    start = [0.0, np.log(sigma_kev)]
+    shape = [MEDIAN[0], WIDTH[0]]
+    limits = [EXPECTED, None, (start[1] + SIGMA[0], start[1] + SIGMA[1])]
+    starts = [[np.log(n), *start, *shape] for n in STARTS]
+    fit = _best(cost, starts, [*limits, *SPECTRUM])
     if len(finite):
-        own = np.histogram(np.log(finite), _edges(likelihood.energies))[0] / len(finite)
-        recorded, of_recorded = likelihood.best(own)
-        if gain <= of_recorded + WORTH:
-            fixed, vector, gain = own, recorded, of_recorded
-    curvature = _curvature(lambda v: -likelihood.value(v, fixed), vector, likelihood.sigma)
-    variance = float(np.linalg.pinv(curvature, hermitian=True)[0, 0])
-    expected = float(np.exp(vector[0]))
-    error = expected * float(np.sqrt(max(variance, 0.0)))
-    energies = _quantiles(likelihood.energies, likelihood.weights(vector, fixed))
+        of_file = _best(cost, [[np.log(n), *start] for n in STARTS], limits)
+        fit = of_file if of_file.fval <= fit.fval + WORTH else fit
+    fit.hesse()
+    values = np.array(fit.values)
+    expected = float(np.exp(values[0]))
+    spread = np.log([sigma_kev, max(float(kev.std()), sigma_kev)])
+    alone = [[float(np.median(kev)), sigma] for sigma in spread]
+    without = _best(
+        lambda v: -likelihood(0.0, v[0], np.exp(v[1]), own),
+        [values[1:3].tolist(), *alone],
+        limits[1:],
+    )
+    # quantiles of the spectrum, evenly spaced in probability
+    edges[[0, -1]] = logs[[0, -1]]
+    spectrum = weights(values[3:])
+    share = np.concatenate([[0.0], np.cumsum(spectrum)]) / spectrum.sum()
+    quantiles = np.exp(np.interp(np.linspace(0, 1, QUANTILES), share, edges))
     return RateFit(
-        law=TailsLaw(1e3 * expected / decay_us, decay_us, energies),
-        rate_error_khz=1e3 * error / decay_us,
-        level_kev=float(vector[1]),
-        sigma_kev=float(np.exp(vector[2])),
-        recorded=fixed is not None,
-        gain_of_law=gain - likelihood.without(),
+        law=TailsLaw(1e3 * expected / decay_us, decay_us, tuple(quantiles.tolist())),
+        rate_error_khz=1e3 * expected * fit.errors[0] / decay_us,
+        level_kev=float(values[1]),
+        sigma_kev=float(np.exp(values[2])),
+        recorded=len(values) == len(start) + 1,
+        gain_of_law=without.fval - fit.fval,
     )
 
 
@@ -291,7 +326,7 @@ class _Likelihood:
     """Likelihood of the tails as a function of rate, level, error and spectrum."""
 
     def __init__(self, kev: FloatArray, sigma_kev: float, energies: FloatArray) -> None:
-        self.kev, self.sigma, self.energies = kev, sigma_kev, energies
+        self.kev, self.energies = kev, energies
         self.step = sigma_kev / STEPS_OF_SIGMA
         # number of grid points for tails and their noise; the first quarter is below 0
         above = max(2 * float(energies[-1]), float(kev.max())) + ROOM * sigma_kev
@@ -327,100 +362,43 @@ class _Likelihood:
         at = np.interp(self.kev, self.grid, density, left=0.0, right=0.0)
         return float(np.log((1 - OUTLIERS) * at + self.floor).sum())
 
-    def value(self, vector: FloatArray, fixed: FloatArray | None) -> float:
-        """Log-likelihood, with priors, at a vector of logarithms and the level."""
-        prior = 0.0
-        if fixed is None:
-            for value, (centre, width) in zip(vector[3:], (MEDIAN, WIDTH), strict=True):
-                prior -= 0.5 * ((value - centre) / width) ** 2
-        expected, sigma = np.exp(np.clip(vector[[0, 2]], -20.0, 6.0))
-        weights = self.weights(vector, fixed)
-        return self(float(expected), float(vector[1]), float(sigma), weights) + prior
-
-    def weights(self, vector: FloatArray, fixed: FloatArray | None) -> FloatArray:
-        """Weights of the energies: fixed ones, or those of a log-normal spectrum."""
-        if fixed is not None:
-            return fixed
-        width = np.exp(np.clip(vector[4], -2.0, 2.0))
-        logs = -0.5 * ((np.log(self.energies) - vector[3]) / width) ** 2
-        weights = np.exp(logs - logs.max())
-        return np.asarray(weights / weights.sum(), float)
-
-    def best(self, fixed: FloatArray | None = None) -> tuple[FloatArray, float]:
-        """Vector and log-likelihood of the best fit, with fixed weights or a spectrum."""
-        rest = [0.0, np.log(self.sigma)]
-        if fixed is None:
-            rest += [MEDIAN[0], WIDTH[0]]
-        starts = ((start, *rest) for start in np.log([0.005, 0.1]))
-        fits = [_minimum(lambda v: -self.value(v, fixed), start) for start in starts]
-        best = min(fits, key=lambda fit: float(fit.fun))
-        return np.asarray(best.x, float), -float(best.fun)
-
-    def without(self) -> float:
-        """Maximum log-likelihood without any tails."""
-        weights = np.zeros(len(self.energies))
-        spread = max(float(self.kev.std()), self.sigma)
-        starts = [(np.median(self.kev), np.log(s)) for s in (self.sigma, spread)]
-        fits = [_minimum(lambda v: -self(0.0, v[0], np.exp(v[1]), weights), s) for s in starts]
-        return -min(float(fit.fun) for fit in fits)
-
 
 def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
     """Fraction and relative width of a second, wider Gaussian fitted to the side below 0."""
     below = kev[kev < 0]
 
-    def cost(vector: FloatArray) -> float:
-        sigma = np.exp(vector[0])
-        share, width = MAX_WINGS / (1 + np.exp(-vector[1])), 1.5 + np.exp(vector[2])
+    def cost(sigma: float, share: float, width: float) -> float:
         core, wide = below / sigma, below / (width * sigma)
         density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
         return -float(np.log(density / sigma + 1e-30).sum())
 
+    def in_ranges(values: FloatArray) -> tuple[float, float, float]:
+        return np.exp(values[0]), MAX_WINGS / (1 + np.exp(-values[1])), 1.5 + np.exp(values[2])
+
     if len(below) < MIN_BELOW:
         return 0.0, 1.0
-    alone = _minimum(lambda v: cost(np.array([v[0], -50.0, 0.0])), (np.log(sigma_kev),))
-    wide_fit = _minimum(cost, (np.log(sigma_kev), -1.0, 0.0))
-    if float(wide_fit.fun) > float(alone.fun) - WORTH:
+    start = float(np.log(sigma_kev))
+    limits = [(start + WINGS[0], start + WINGS[1]), WINGS, WINGS]
+    alone = _best(lambda v: cost(np.exp(v[0]), 0.0, 1.0), [[start]], limits[:1])
+    wide = _best(lambda v: cost(*in_ranges(v)), [[start, -1.0, 0.0]], limits)
+    if wide.fval > alone.fval - WORTH:
         return 0.0, 1.0
-    _, share, width = wide_fit.x
-    return MAX_WINGS / (1 + float(np.exp(-share))), 1.5 + float(np.exp(width))
+    _, share, width = in_ranges(np.array(wide.values))
+    return float(share), float(width)
 
 
-def _minimum(function: Function, start: Sequence[float]) -> OptimizeResult:
-    import scipy.optimize  # costs more than all the rest, and few channels come so far
-
-    steps = np.diag([0.5, *[0.4] * (len(start) - 1)])
-    simplex = np.asarray(start, float) + np.concatenate([np.zeros((1, len(start))), steps])
-    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-2, "maxfev": 900}
-    return scipy.optimize.minimize(function, start, method="Nelder-Mead", options=options)
-
-
-def _curvature(function: Function, at: FloatArray, sigma_kev: float) -> FloatArray:
-    """Second derivatives by finite differences."""
-    steps = np.array([0.1, 0.2 * sigma_kev, 0.05, 0.1, 0.1])[: len(at)]
-    moves = np.diag(steps)
-    n = len(at)
-    curvature = np.empty((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
-            corners = [function(at + a * moves[i] + b * moves[j]) for a, b in signs]
-            second = corners[0] - corners[1] - corners[2] + corners[3]
-            curvature[i, j] = curvature[j, i] = second / (4 * steps[i] * steps[j])
-    return curvature
-
-
-def _edges(energies: FloatArray) -> FloatArray:
-    """Edges of bins around the logarithms of the energies; the outer bins are open."""
-    logs = np.log(energies)
-    inner = 0.5 * (logs[1:] + logs[:-1])
-    return np.concatenate([[-np.inf], inner, [np.inf]])
-
-
-def _quantiles(energies: FloatArray, weights: npt.NDArray[np.float64]) -> tuple[float, ...]:
-    """Quantiles of a spectrum, evenly spaced in probability."""
-    edges = _edges(energies)
-    edges[[0, -1]] = np.log(energies[[0, -1]])
-    share = np.concatenate([[0.0], np.cumsum(weights)]) / weights.sum()
-    at = np.interp(np.linspace(0, 1, QUANTILES), share, edges)
-    return tuple(float(kev) for kev in np.exp(at))
+def _best(
+    cost: Callable[[FloatArray], float],
+    starts: Sequence[Sequence[float]],
+    limits: Sequence[tuple[float, float] | None],
+) -> Minuit:
+    """The best fit from several starts, with limits of each parameter."""
+    fits = []
+    for start in starts:
+        fit = Minuit(cost, np.array(start))
+        fit.errordef = Minuit.LIKELIHOOD
+        fit.errors = [0.5, *[0.4] * (len(start) - 1)]
+        for place, limit in enumerate(limits):
+            fit.limits[place] = limit
+        fits.append(fit.simplex().migrad())
+    return min(fits, key=lambda fit: fit.fval)

@@ -104,13 +104,11 @@ class Backend(ABC):
     config, dt_ns
         Preparation of the pulses that it gives, and their sampling period in ns.
     noise
-        Noise that is added to the output of the network, if any.
+        Noise that is added in proportion to 1/energy, if any.
     tails
         Distribution of the pile-up tails under the data, if it was measured.
     by_height
         What the electronics do by the height of a pulse, if anything.
-    needs_energies
-        Whether the noise depends on the energies.
     """
 
     network: Generator | ResponseGenerator | Inverse
@@ -119,7 +117,6 @@ class Backend(ABC):
     noise: BaselineNoise | None = None
     tails: DrawnTails | None = None
     by_height: ByHeight | None = None
-    needs_energies: bool = False
 
     @property
     def chain(self) -> ResponseGenerator | None:
@@ -289,9 +286,7 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
         if not forward or recipe.cyclegan.training.noise == "none":
             return NetworkBackend(network, config, config.sampled_ns)
         noise = run.fill(NOISE, KeptNoise(dt_ns)).noise
-        return NetworkBackend(
-            network, config, config.sampled_ns, noise, run.tails, needs_energies=True
-        )
+        return NetworkBackend(network, config, config.sampled_ns, noise, run.tails)
     residual, name = None, f"{part}_residual"  # what a network adds to the pulses
     if any(key.startswith(f"{name}.") for key in run.weights):
         require_torch()
@@ -312,5 +307,5 @@ def response_backend(chain: ResponseGenerator, config: PreparationConfig) -> Res
     """The backend of a readout chain."""
     response = chain.response
     return ResponseBackend(
-        chain, config, float(response.dt_ns), chain.noise, chain.tails, response.by_height, True
+        chain, config, float(response.dt_ns), chain.noise, chain.tails, response.by_height
     )

@@ -25,7 +25,7 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.writing import PulseWriter, other_columns
 from cpunet.training.run import RunLike, as_run, resolve_device
-from cpunet.translation.forms import form_of
+from cpunet.translation.forms import Form
 from cpunet.translation.options import TranslateOptions
 from cpunet.translation.translator import (
     IREN,
@@ -56,23 +56,22 @@ class Counts:
     read: int = 0
     translated: int = 0
     rejections: dict[str, int] = field(default_factory=dict)
-    saturated: int | None = None
+    saturated: int = 0
     files: int | None = None
     skipped: int = 0
 
     @classmethod
     def of(cls, block: TranslatedPulses) -> Counts:
         """Count the rows of a block."""
-        saturated = None if block.saturated is None else int(block.saturated.sum())
+        saturated = 0 if block.saturated is None else int(block.saturated.sum())
         return cls(len(block.codes), int(block.valid.sum()), block.rejections, saturated)
 
     def __add__(self, other: Counts) -> Counts:
-        saturated = [n for n in (self.saturated, other.saturated) if n is not None]
         return Counts(
             self.read + other.read,
             self.translated + other.translated,
             dict(Counter(self.rejections) + Counter(other.rejections)),
-            sum(saturated) if saturated else None,
+            self.saturated + other.saturated,
             skipped=self.skipped + other.skipped,
         )
 
@@ -86,6 +85,10 @@ class FileTranslation:
         A trained run, or its folder.
     options
         How to translate.
+    resume
+        Whether an output that was made from this source with this run and options stays.
+    force
+        Whether to replace an existing file.
 
     Raises
     ------
@@ -93,11 +96,17 @@ class FileTranslation:
         If the run cannot be used, or lacks information for output in ADC counts.
     """
 
-    def __init__(self, run: RunLike, options: TranslateOptions) -> None:
-        self.run, self.options = as_run(run), options
+    def __init__(
+        self,
+        run: RunLike,
+        options: TranslateOptions,
+        resume: bool = False,
+        force: bool = False,
+    ) -> None:
+        self.run, self.options, self.resume, self.force = as_run(run), options, resume, force
         self.kind: type[Translator] = IREN if options.inverse else REN
         self.translator = self.kind.of(self.run, resolve_device("auto", self.run.recipe))
-        self.form = form_of(self.run, self.translator, options)
+        self.form = Form(self.run, self.translator, options)
         identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
         self._print = hashlib.sha256(identity.encode()).hexdigest()
 
@@ -110,15 +119,7 @@ class FileTranslation:
                 "baseline and decay without noise"
             )
 
-    def __call__(
-        self,
-        source: PulseFile,
-        out: Path,
-        *,
-        noise_key: str | None = None,
-        resume: bool = False,
-        force: bool = False,
-    ) -> Counts:
+    def __call__(self, source: PulseFile, out: Path, noise_key: str | None = None) -> Counts:
         """Translate a file, block by block, with its rows and other columns.
 
         Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
@@ -133,10 +134,6 @@ class FileTranslation:
         noise_key
             Name that is combined with the seed, so that the noise of files or channels
             differs; None for the noise of `cpunet.translation.translator.Translator.translate`.
-        resume
-            Whether an output that was made from this source with this run and options stays.
-        force
-            Whether to replace an existing file.
 
         Raises
         ------
@@ -148,12 +145,12 @@ class FileTranslation:
         before = source_print(source)
         options = asdict(self.options) | {"noise_key": noise_key}
         provenance = {"source": before, "run": self._print, "options": options}
-        if resume and not force and out.exists():
+        if self.resume and not self.force and out.exists():
             return replace(finished(out, provenance), skipped=1)
-        refuse_existing(out, force=force)
+        refuse_existing(out, force=self.force)
         counts = Counts()
         give_back_large_arrays()
-        with self._opened(source) as pulses, self.writer(out, force=force) as writer:
+        with self._opened(source) as pulses, self.writer(out, force=self.force) as writer:
             read_others, left_out = other_columns(pulses, OWN_COLUMNS)
             for column, reason in left_out.items():
                 log.warning(f"{source.path.name}: column {column} is left out: {reason}")
@@ -171,8 +168,8 @@ class FileTranslation:
             writer.annotate(TRANSLATION, json.dumps(record, default=np.generic.item), file=True)
         return counts
 
-    def in_memory(self, source: PulseFile) -> tuple[TranslatedPulses, Counts]:
-        """Translated pulses of a file, and their counts, as those of `__call__`.
+    def in_memory(self, source: PulseFile) -> TranslatedPulses:
+        """Translated pulses of a file, the same as those of `__call__`.
 
         Raises
         ------
@@ -180,8 +177,7 @@ class FileTranslation:
             If the source cannot be used, or no pulse can be translated.
         """
         with self._opened(source) as pulses:
-            blocks = list(self._blocks(pulses, None))
-        return TranslatedPulses.joined(blocks), sum(map(Counts.of, blocks), Counts())
+            return TranslatedPulses.joined(list(self._blocks(pulses, None)))
 
     def _opened(self, source: PulseFile) -> PulseSource:
         """Open a file of pulses that this run can translate."""
@@ -212,7 +208,7 @@ class FileTranslation:
             for number, block in enumerate(regrouped(pulses.blocks(size), NOISE_ROWS)):
                 seed = noise_seed(self.options.seed, noise_key, number)
                 generator = np.random.default_rng(seed)
-                done = self.form(block, noise=self.options.noise, generator=generator)
+                done = self.form(block, generator)
                 counts += Counts.of(done)
                 yield done
                 bar.update(len(block))

@@ -10,12 +10,13 @@ baseline before them and with the decay fitted to their end after them, both wit
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.drawn_pile_up import Columns, DrawnPileUp, DrawnTails
+from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
 from cpunet.electronics.finishing import extended
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import padding, record_length
@@ -33,39 +34,65 @@ RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
 
-@dataclass(frozen=True)
 class Form:
     """Prepared windows, NaN for rejected pulses, or raw traces in ADC counts, 0 for these.
 
     Parameters
     ----------
-    translator
-        Trained run.
+    run, translator
+        Trained run, and its translator.
+    options
+        What is asked for.
+
+    Attributes
+    ----------
     n_pre, length
         Samples of a trace before the alignment of a pulse without noise, and all.
     tails
         Distribution of the pile-up tails, which raise the baseline at the start of a trace;
         None for none.
-    pile_up
-        Rate and energies of piled-up pulses; None for none.
     scale
         ADC counts per prepared unit and keV, and baseline in ADC counts; None for windows.
     ends
         Lowest and highest count.
+    samples
+        Type of the stored samples.
+
+    Raises
+    ------
+    CpunetError
+        If the run lacks information, or `n_pre` is not within the trace.
     """
 
-    translator: Translator
-    n_pre: int
-    length: int
-    tails: DrawnTails | None = None
-    pile_up: DrawnPileUp | None = None
-    scale: tuple[float, float] | None = None
-    ends: tuple[int, int] = (0, HIGHEST)
-
-    @property
-    def samples(self) -> npt.DTypeLike:
-        """Type of the stored samples."""
-        return np.float32 if self.scale is None else _kind(self.ends)
+    def __init__(self, run: Run, translator: Translator, options: TranslateOptions) -> None:
+        self.translator, self.options, adc = translator, options, options.adc
+        config, rate_khz = translator.recipe.preparation, options.pile_up_khz
+        self.tails = wanted_tails(translator, options.tails, raw=adc is not None)
+        if not (np.isfinite(rate_khz) and rate_khz >= 0):
+            raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
+        self.energies_kev: tuple[float, ...] = ()  # of piled-up pulses
+        if rate_khz:
+            learned = _tails_of(translator, f"`pile_up_khz` {rate_khz:g}")
+            self.energies_kev = learned.law.energies_kev
+        self.n_pre, self.length = config.samples_before, config.length
+        self.scale: tuple[float, float] | None = None
+        self.ends, self.samples = (0, HIGHEST), np.dtype(np.float32)
+        if adc is None:
+            return
+        self.scale, self.ends = adc_scale(run, translator, adc), adc_ends(run, adc)
+        self.samples = _kind(self.ends)
+        if rate_khz and translator.backend.chain is None:
+            raise CpunetError(
+                "a network knows no shapes beyond its windows, so it gives no raw traces with "
+                "piled-up pulses; leave out `pile_up_khz` or `adc`"
+            )
+        self.length = self.length if adc.length is None else adc.length
+        self.n_pre = self.n_pre if adc.n_pre is None else adc.n_pre
+        if not 0 <= self.n_pre < self.length:
+            raise CpunetError(
+                f"`n_pre` {self.n_pre} is not within a trace of {self.length} samples; "
+                "give less, or a longer `length`"
+            )
 
     @property
     def fills_in(self) -> bool:
@@ -75,9 +102,7 @@ class Form:
         beyond = self.n_pre > config.samples_before or after > config.samples_after
         return self.translator.backend.chain is None and beyond
 
-    def __call__(
-        self, pulses: Pulses, *, noise: bool, generator: np.random.Generator
-    ) -> TranslatedPulses:
+    def __call__(self, pulses: Pulses, generator: np.random.Generator) -> TranslatedPulses:
         """Translate pulses, of which all rows stay; raw traces need energies."""
         translator, dt_ns = self.translator, self.translator.dt_ns
         left, piled, n = None, None, len(pulses)
@@ -85,16 +110,17 @@ class Form:
         if self.tails is not None:
             left = self.tails.draw_kev(n, generator)
             truth = {"tails_kev": (left, "keV")}
-        if self.pile_up is not None:
+        if self.options.pile_up_khz:
             record = self.n_pre, self.length
             if self.scale is None:
                 record = padding(dt_ns)[0] + self.n_pre, record_length(self.length, dt_ns)
-            piled = self.pile_up.draw(n, *record, generator)
+            rate = self.options.pile_up_khz
+            piled = InTracePileUp.draw(n, rate, self.energies_kev, dt_ns, *record, generator)
             truth |= piled.columns()
         chain = translator.backend.chain is not None
         done = translator.translate_pulses(
             pulses,
-            noise=noise,
+            noise=self.options.noise,
             generator=generator,
             tails_kev=left if chain or self.scale is None else None,
             piled=piled,
@@ -120,36 +146,6 @@ class Form:
         # single precision represents these integers exactly
         whole = replace(pulses, waveforms=traces.astype(np.float32), t0_ns=t0_ns)
         return TranslatedPulses(whole, codes, saturated, truth)
-
-
-def form_of(run: Run, translator: Translator, options: TranslateOptions) -> Form:
-    """The form that options ask for.
-
-    Raises
-    ------
-    CpunetError
-        If the run lacks information for it, or `n_pre` is not within the trace.
-    """
-    adc, config = options.adc, translator.recipe.preparation
-    tails = wanted_tails(translator, options.tails, raw=adc is not None)
-    pile_up = wanted_pile_up(translator, options.pile_up_khz)
-    n_pre, length = config.samples_before, config.length
-    if adc is None:
-        return Form(translator, n_pre, length, tails, pile_up)
-    scale, ends = adc_scale(run, translator, adc), adc_ends(run, adc)
-    if pile_up is not None and translator.backend.chain is None:
-        raise CpunetError(
-            "a network knows no shapes beyond its windows, so it gives no raw traces with "
-            "piled-up pulses; leave out `pile_up_khz` or `adc`"
-        )
-    length = length if adc.length is None else adc.length
-    n_pre = n_pre if adc.n_pre is None else adc.n_pre
-    if not 0 <= n_pre < length:
-        raise CpunetError(
-            f"`n_pre` {n_pre} is not within a trace of {length} samples; "
-            "give less, or a longer `length`"
-        )
-    return Form(translator, n_pre, length, tails, pile_up, scale, ends)
 
 
 def adc_ends(run: Run, adc: Adc) -> tuple[int, int]:
@@ -212,7 +208,7 @@ def to_adc(
     return counts.clip(*ends).astype(_kind(ends)), saturated
 
 
-def _kind(ends: tuple[int, int]) -> npt.DTypeLike:
+def _kind(ends: tuple[int, int]) -> np.dtype[Any]:
     """The smallest type of integers, of 16 bits or more, that has both ends."""
     kinds = [np.iinfo(kind) for kind in ("u2", "i2", "u4", "i4")]
     return next(kind.dtype for kind in kinds if kind.min <= ends[0] and ends[1] <= kind.max)
@@ -297,29 +293,6 @@ def wanted_tails(
     elif raw:
         tails = tails.uncut()
     return tails if tails.law.rate_khz > 0 else None
-
-
-def wanted_pile_up(translator: Translator, rate_khz: float) -> DrawnPileUp | None:
-    """Piled-up pulses to add to translations, with the energies learned by a run.
-
-    Parameters
-    ----------
-    translator
-        Trained run.
-    rate_khz
-        Rate in kHz; 0 for none.
-
-    Raises
-    ------
-    CpunetError
-        If the rate is negative or not finite, or the run has no energies.
-    """
-    if not (np.isfinite(rate_khz) and rate_khz >= 0):
-        raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
-    if rate_khz == 0:
-        return None
-    tails = _tails_of(translator, f"`pile_up_khz` {rate_khz:g}")
-    return DrawnPileUp(rate_khz, tails.law.energies_kev, translator.dt_ns)
 
 
 def _tails_of(translator: Translator, asked: str) -> DrawnTails:

@@ -11,7 +11,7 @@ NONE, LEARNED = "none", "learned"  # pile-up tails
 
 @dataclass(frozen=True)
 class Adc:
-    """Raw traces in ADC counts, see `cpunet.translation.forms.AdcTraces`.
+    """Raw traces in ADC counts, see `cpunet.translation.forms.Form`.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -124,20 +124,19 @@ def translate(
     if out is None:
         if several or channels:
             raise CpunetError("several files or tables do not stay in memory; give `out`")
-        run = used_run(run)
-        job = FileTranslation(run, options)
+        job = FileTranslation(used_run(run), options)
         job.warn()
-        in_memory, counts = job.in_memory(files[0])
-        return Translation(run.name, run.recipe, counts, adc, None, in_memory, job.writer)
-    to_files = _ToFiles(options, resume, force)
+        done = job.in_memory(files[0])
+        of_job = Translation.of(job, Counts.of(done))
+        return replace(of_job, in_memory=done, writer=job.writer)
+    make = partial(FileTranslation, options=options, resume=resume, force=force)
     if channels:
         if len(files) > 1:
             raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
-        return to_files.of_channels(run, files[0], Path(out))
-    run = used_run(run)
+        return _channels(make, run, files[0], Path(out))
     if several:
-        return to_files.several(run, files, Path(out), jobs)
-    return to_files.single(run, files[0], Path(out))
+        return _several(make, used_run(run), files, Path(out), jobs)
+    return _one(make, used_run(run), files[0], Path(out))
 
 
 def _files(
@@ -158,118 +157,110 @@ def _files(
         yield from (pulse_file(name, read, insist) for name in names)
 
 
-@dataclass(frozen=True)
-class _ToFiles:
-    """How to translate files into files; see `cpunet.translate`."""
+Make = Callable[[RunLike], FileTranslation]
 
-    options: TranslateOptions
-    resume: bool
-    force: bool
 
-    def single(
-        self, run: Run, source: PulseFile, out: Path, noise_key: str | None = None
-    ) -> Translation:
-        job = FileTranslation(run, self.options)
-        job.warn()
-        counts = job(source, out, noise_key=noise_key, resume=self.resume, force=self.force)
-        return Translation(run.name, run.recipe, counts, self.options.adc is not None, out)
+def _one(
+    make: Make, run: RunLike, source: PulseFile, out: Path, noise_key: str | None = None
+) -> Translation:
+    job = make(run)
+    job.warn()
+    return Translation.of(job, job(source, out, noise_key), out)
 
-    def of_channels(self, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:
-        """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
 
-        A single table, such as a simulation that serves all channels, is translated with each
-        run.  The noise depends on the seed and the name of the channel, so that of channels
-        differs.
-        """
-        channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
-        if len(channels) == 1 and not isinstance(runs, Run):
-            (name, single), *_ = channels.items()
-            if not own_folder(Path(runs), name, INFO).is_dir():
-                trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
-                channels = dict.fromkeys(trained, single) or channels
-        return each_channel(channels, out, partial(self.of_channel, runs))
+def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:
+    """Translate each table of a file with ``RUNS/CHANNEL`` into ``OUT/CHANNEL.lh5``.
 
-    def of_channel(self, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
-        run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-        return self.single(used_run(run), pair[0], place.with_name(f"{name}.lh5"), name)
+    A single table, such as a simulation that serves all channels, is translated with each
+    run.  The noise depends on the seed and the name of the channel, so that of channels
+    differs.
+    """
+    channels: dict[str, Pair] = {n: (file, file) for n, file in channels_of(source).items()}
+    if len(channels) == 1 and not isinstance(runs, Run):
+        (name, single), *_ = channels.items()
+        if not own_folder(Path(runs), name, INFO).is_dir():
+            trained = sorted(info.parent.name for info in Path(runs).glob(f"*/{INFO}"))
+            channels = dict.fromkeys(trained, single) or channels
+    return each_channel(channels, out, partial(_channel, make, runs))
 
-    def several(
-        self, run: Run, sources: Sequence[PulseFile], out: Path, jobs: int
-    ) -> Translation:
-        """Translate files into files of the same names in a folder.
 
-        The output depends on the seed and the name of a file, not on the number of processes
-        or on the other files.  A file that cannot be translated does not stop the others.
+def _channel(make: Make, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
+    run = used_run(runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO))
+    return _one(make, run, pair[0], place.with_name(f"{name}.lh5"), name)
 
-        Raises
-        ------
-        CpunetError
-            Before the translation, if the run cannot be used, or outputs exist (without
-            `resume` or `force`) or would have the same names; at the end, if files failed.
-        """
-        tasks = [(file, out / file.path.name) for file in sources]
-        tasks = [
-            (file, to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5"))
-            for file, to in tasks
-        ]
-        if out.exists() and not out.is_dir():
-            raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-        self._check(tasks, run.folder)
-        FileTranslation(run, self.options).warn()  # what is wrong is said once
-        done: list[Counts] = []
-        failed: list[str] = []
-        with (
-            stage("Translating", len(tasks)) as bar,
-            closing(outcomes(partial(self.work, run), tasks, jobs, once=True)) as results,
-        ):
-            for (source, target), outcome in results:
-                bar.update()
-                if isinstance(outcome, CpunetError):
-                    text = str(outcome)
-                    named = str(source.path) in text or str(target) in text
-                    failed.append(text if named else f"{source.path}: {text}")
-                    log.error(failed[-1])
-                else:
-                    done.append(outcome)
-        if failed:
-            others = f"; {len(done)} are in {out}" if done else ""
-            raise CpunetError(
-                f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{others}; "
-                "continue with `resume`"
-            )
-        counts = replace(sum(done, Counts()), files=len(done))
-        return Translation(run.name, run.recipe, counts, self.options.adc is not None, out)
 
-    def work(self, run: Run) -> Callable[[Task], Counts]:
-        """Return a function that translates a file after the other."""
-        translation = FileTranslation(run, self.options)
-        how = {"resume": self.resume, "force": self.force}
-        return lambda task: translation(task[0], task[1], noise_key=task[1].name, **how)
+def _several(
+    make: Make, run: Run, sources: Sequence[PulseFile], out: Path, jobs: int
+) -> Translation:
+    """Translate files into files of the same names in a folder.
 
-    def _check(self, tasks: Sequence[Task], run: Path | None) -> None:
-        """Raise a `CpunetError` if an output is an input, exists, or has the name of another.
+    The output depends on the seed and the name of a file, not on the number of processes
+    or on the other files.  A file that cannot be translated does not stop the others.
 
-        Thousands of files are compared by their identity, and not each with each other.
-        """
-        several = [name for name, n in Counter(out.name for _, out in tasks).items() if n > 1]
-        if several:
-            raise CpunetError(
-                f"{len(several)} names occur twice among the files, as {several[0]}; "
-                "translate these into folders of their own"
-            )
-        shared = next((s.energy for s, _ in tasks if s.energy and ":" in s.energy), None)
-        if shared is not None and len(tasks) > 1:
-            raise CpunetError(
-                f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
-                "translate them one by one"
-            )
-        inputs = {_identity(source.path) for source, _ in tasks} - {None}
-        for source, out in tasks:
-            refuse_inputs(out, run, *source.files)
-            if _identity(out) in inputs:
-                raise CpunetError(f"{out}: is the input; choose another `out`")
-            if not self.resume:
-                refuse_existing(out, force=self.force)
+    Raises
+    ------
+    CpunetError
+        Before the translation, if the run cannot be used, or outputs exist (without
+        `resume` or `force`) or would have the same names; at the end, if files failed.
+    """
+    targets = [out / file.path.name for file in sources]
+    tasks = [
+        (file, to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5"))
+        for file, to in zip(sources, targets, strict=True)
+    ]
+    if out.exists() and not out.is_dir():
+        raise CpunetError(f"{out}: is a file, but several outputs need a folder")
+    twice = [name for name, n in Counter(to.name for _, to in tasks).items() if n > 1]
+    if twice:
+        raise CpunetError(
+            f"{len(twice)} names occur twice among the files, as {twice[0]}; "
+            "translate these into folders of their own"
+        )
+    shared = next((s.energy for s in sources if s.energy and ":" in s.energy), None)
+    if shared is not None and len(tasks) > 1:
+        raise CpunetError(
+            f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
+            "translate them one by one"
+        )
+    job = make(run)
+    job.warn()  # what is wrong is said once
+    # thousands of files are compared by their identity, and not each with each other
+    inputs = {_identity(source.path) for source in sources} - {None}
+    for source, to in tasks:
+        refuse_inputs(to, run.folder, *source.files)
+        if _identity(to) in inputs:
+            raise CpunetError(f"{to}: is the input; choose another `out`")
+        if not job.resume:
+            refuse_existing(to, force=job.force)
+    done: list[Counts] = []
+    failed: list[str] = []
+    with (
+        stage("Translating", len(tasks)) as bar,
+        closing(outcomes(partial(_worker, make, run), tasks, jobs, once=True)) as results,
+    ):
+        for (source, to), outcome in results:
+            bar.update()
+            if isinstance(outcome, CpunetError):
+                text = str(outcome)
+                named = str(source.path) in text or str(to) in text
+                failed.append(text if named else f"{source.path}: {text}")
+                log.error(failed[-1])
+            else:
+                done.append(outcome)
+    if failed:
+        others = f"; {len(done)} are in {out}" if done else ""
+        raise CpunetError(
+            f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{others}; "
+            "continue with `resume`"
+        )
+    counts = replace(sum(done, Counts()), files=len(done))
+    return Translation.of(job, counts, out)
+
+
+def _worker(make: Make, run: Run) -> Callable[[Task], Counts]:
+    """Return a function that translates a file after the other."""
+    job = make(run)
+    return lambda task: job(*task, task[1].name)
 
 
 def expanded(name: Path) -> list[Path]:

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 
 from cpunet.errors import CpunetError, named
-from cpunet.html_pages import notebook_picture, part
 from cpunet.plotting import COLOURS, own_axes, styled
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Rejection
@@ -27,7 +25,7 @@ from cpunet.pulses.shape_parameters import (
 )
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.file_translation import Counts
+from cpunet.translation.file_translation import Counts, FileTranslation
 from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
@@ -66,6 +64,12 @@ class Translation:
     path: Path | None = None
     in_memory: TranslatedPulses | None = None
     writer: Callable[..., PulseWriter] | None = None
+
+    @classmethod
+    def of(cls, job: FileTranslation, counts: Counts, path: Path | None = None) -> Self:
+        """The result of a translation."""
+        adc = job.options.adc is not None
+        return cls(job.run.name, job.run.recipe, counts, adc, path)
 
     @cached_property
     def pulses(self) -> Pulses:
@@ -193,20 +197,3 @@ class Translation:
         where = "in memory" if self.path is None else str(self.path)
         done = f"{self.counts.translated} of {self.counts.read} pulses"
         return f"<Translation {where}: {done}>"
-
-    def _repr_html_(self) -> str:
-        facts: dict[str, object] = {
-            "run": self.run,
-            "file": self.path,
-            "translated": f"{self.counts.translated} of {self.counts.read} pulses",
-            "as": "raw traces in ADC" if self.adc else "normalised windows",
-            "saturated": self.counts.saturated,
-        }
-        facts |= {reason.replace("_", " "): n for reason, n in self.rejections.items()}
-        small = self.in_memory is not None  # a file may be large
-        picture: str = ""
-        if small and self.counts.translated:
-            figure = Figure(figsize=(6.4, 3.2))
-            self.plot(ax=figure.subplots())
-            picture = notebook_picture(figure)
-        return part("object", "cpunet translation", facts, picture=picture)

@@ -8,12 +8,11 @@ of any length are accepted.  Preparation leaves prepared pulses unchanged.
 from __future__ import annotations
 
 import hashlib
-import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +26,7 @@ from cpunet.tables import counted
 from cpunet.training.run import Run
 from cpunet.translation.backends import Backend, Batch, Energies, Translated, backend_of
 
-if TYPE_CHECKING:
-    import torch
-
-Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], "torch.Tensor", Pulses)
+Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], Pulses)
 
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
@@ -126,7 +122,7 @@ class Translator:
     ) -> None:
         self.backend, self.recipe, self.dt_ns = backend, recipe.at(dt_ns), dt_ns
         self.delay_ns = delay_ns
-        self.needs_energies = backend.needs_energies
+        self.needs_energies = backend.noise is not None
         self.tails: DrawnTails | None = backend.tails
 
     @classmethod
@@ -152,12 +148,6 @@ class Translator:
         """
         return cls.of(Run.load(run), device)
 
-    def __call__(self, pulses: Pulses | Waveforms, **how: Any) -> Any:
-        """Translate pulses with their energies, or waveforms, as `translate` does."""
-        if not isinstance(pulses, Pulses):
-            return self.translate(pulses, **how)
-        return self.translate(pulses.waveforms, **{"energy_kev": pulses.energy_kev} | how)
-
     def translate(
         self,
         waveforms: Waveforms,
@@ -167,7 +157,7 @@ class Translator:
         seed: int | None = None,
         tails_kev: npt.ArrayLike | None = None,
     ) -> Waveforms:
-        """Translate waveforms, given as a NumPy array, a torch tensor or `cpunet.Pulses`.
+        """Translate waveforms, given as an array or as `cpunet.Pulses`.
 
         Parameters
         ----------
@@ -186,9 +176,8 @@ class Translator:
 
         Returns
         -------
-        array, tensor or Pulses
-            Translated windows of the type of the input, float32, shape (n, window) or
-            (window,).
+        array or Pulses
+            Translated windows as they were given, float32, shape (n, window) or (window,).
 
         Raises
         ------
@@ -201,19 +190,15 @@ class Translator:
             If pulses cannot be translated, with their numbers by reason; their rows are NaN.
             `translate_pulses` returns a code for each instead.
         """
-        torch: Any = sys.modules.get("torch")  # without which there are no tensors
-        given: Any = waveforms
         if isinstance(waveforms, Pulses):
-            energy_kev = waveforms.energy_kev if energy_kev is None else energy_kev
-            given = waveforms.waveforms
-        tensor = torch is not None and isinstance(given, torch.Tensor)
-        # NumPy has no bfloat16
-        array = given.detach().cpu().float().numpy() if tensor else np.asarray(given)
-        if not array.ndim:
+            pulses, ndim = waveforms, 2
+            energy_kev = pulses.energy_kev if energy_kev is None else energy_kev
+        else:
+            array = np.asarray(waveforms)
+            ndim, pulses = array.ndim, Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
+        if not ndim:
             raise CpunetError("waveforms is a single number; expected (pulses, samples)")
         self._by_energy(energy_kev, noise)
-        rows_of = Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
-        pulses = waveforms if isinstance(waveforms, Pulses) else rows_of
         kev: dict[str, Energies] = {}
         for name, values in {"energy_kev": energy_kev, "tails_kev": tails_kev}.items():
             shape = np.shape(np.asarray(values))
@@ -240,7 +225,7 @@ class Translator:
             blocks.append(block)
         done = TranslatedPulses.joined(blocks)
         reasons = counted(done.rejections)
-        if array.ndim == 1 and reasons:
+        if ndim == 1 and reasons:
             raise CpunetError(f"the pulse cannot be translated: {reasons}")
         if reasons:
             warnings.warn(
@@ -249,11 +234,10 @@ class Translator:
                 RejectionWarning,
                 stacklevel=2,
             )
-        if isinstance(waveforms, Pulses):
-            return done.pulses
-        result: Any = done.pulses.waveforms[0] if array.ndim == 1 else done.pulses.waveforms
-        translated: Waveforms = torch.from_numpy(result).to(given.device) if tensor else result
-        return translated
+        result: Any = done.pulses
+        if not isinstance(waveforms, Pulses):
+            result = result.waveforms if ndim == 2 else result.waveforms[0]
+        return result  # type: ignore[no-any-return]
 
     def translate_pulses(
         self,
@@ -311,20 +295,17 @@ class Translator:
         t0_ns[index] = prepared.pulses.t0_ns[rows] + done.begin * self.dt_ns - self.delay_ns
         return TranslatedPulses(replace(pulses, waveforms=waveforms, t0_ns=t0_ns), codes)
 
-    def apply(
-        self,
-        windows: FloatArray,
-        *,
-        energy_kev: Energies | None = None,
-        noise: bool = True,
-        generator: np.random.Generator | None = None,
-        tails_kev: Energies | None = None,
-        piled: InTracePileUp | None = None,
-    ) -> FloatArray:
-        """Translate prepared windows, shape (n, window); rejected rows are NaN."""
-        generator = generator or np.random.default_rng()
-        batch = Batch(windows, energy_kev, noise, generator, tails_kev, piled)
-        return self._translated(batch).windows
+    def apply(self, windows: FloatArray, **how: Any) -> FloatArray:
+        """Translate prepared windows, shape (n, window); rejected rows are NaN.
+
+        Parameters
+        ----------
+        windows
+            Prepared windows.
+        how
+            Further fields of a `Batch`.
+        """
+        return self._translated(Batch(windows, **how)).windows
 
     def _translated(self, whole: Batch) -> Translated:
         """Translate some windows at a time."""

@@ -225,7 +225,7 @@ def fit_baseline_methods(
         ThreadPoolExecutor(usable_cores()) as pool,
     ):
         how = (fit_sim, fit_data, sim.dt_ns, config.samples_before)
-        fits = {name: pool.submit(kind.fit, *how) for name, kind in kinds.items()}
+        fits = {name: pool.submit(kind, *how) for name, kind in kinds.items()}
         for name, fit in fits.items():
             try:
                 result.methods[name] = fit.result()
