@@ -17,7 +17,7 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.closed_forms import learned_chain, propagated, true_chain_of
+from cpunet.training.closed_forms import learned_chain, moved_along_axes, true_chain_of
 from cpunet.training.diagnosis import beyond
 from cpunet.training.figures import response_figure
 from cpunet.training.response import Response, response
@@ -183,18 +183,13 @@ def test_the_closed_form_is_the_chain_of_the_stand():
     response.slow_weights[2], response.decay_weights[0] = 0.065, 0.04
     chain, truth = learned_chain(response, "run"), electronics()
     time_ns = np.arange(-20.0, 20_000.0, 8.0)
-    np.testing.assert_allclose(
-        chain.whole.step(time_ns), truth.transfer.step(time_ns), atol=1e-12
-    )
-    np.testing.assert_allclose(
-        chain.whole.impulse(time_ns), truth.transfer.impulse(time_ns), atol=1e-14
-    )
-    undecayed = true_chain_of(truth).undecayed.step(time_ns)
-    np.testing.assert_allclose(chain.undecayed.step(time_ns), undecayed, atol=1e-6)
+    np.testing.assert_allclose(chain.step(time_ns), truth.transfer.step(time_ns), atol=1e-12)
+    undecayed = true_chain_of(truth).undecayed(time_ns)
+    np.testing.assert_allclose(chain.undecayed(time_ns), undecayed, atol=1e-6)
     # beyond the first samples, where the layer's spline cannot follow a step
     layer = scipy.fft.irfft(response.transfer(2400), 2400)[:600]
     middle_ns = (np.arange(600) + 0.5) * DT_NS
-    np.testing.assert_allclose(layer[20:], chain.whole.step(middle_ns)[20:], atol=1e-3)
+    np.testing.assert_allclose(layer[20:], chain.step(middle_ns)[20:], atol=1e-3)
 
 
 def test_a_folder_with_numbers_and_figure(run, tmp_path):
@@ -342,9 +337,9 @@ def numbers(response: ElectronicsResponse) -> dict[str, float]:
 def test_what_is_known_together_has_a_small_error() -> None:
     covariance = np.diag([0.04, 0.04, 1.0, 1.0, 1.0])
     covariance[0, 1] = covariance[1, 0] = -0.0399
-    found = propagated(RESPONSE, covariance.tolist(), numbers)
-    assert found["sum"] == pytest.approx(np.sqrt(2e-4))
-    assert found["difference"] == pytest.approx(np.sqrt(0.08 + 2 * 0.0399))
+    found = moved_along_axes(RESPONSE, covariance.tolist(), numbers)
+    assert np.linalg.norm(found["sum"]) == pytest.approx(np.sqrt(2e-4))
+    assert np.linalg.norm(found["difference"]) == pytest.approx(np.sqrt(0.08 + 2 * 0.0399))
 
 
 def test_a_number_that_is_not_always_defined_has_no_error() -> None:
@@ -354,13 +349,13 @@ def test_a_number_that_is_not_always_defined_has_no_error() -> None:
         found = numbers(response)
         return found if response.slow_weights.item() > -0.1 else {"sum": found["sum"]}
 
-    found = propagated(RESPONSE, np.diag([0.04, 0.04, 1.0, 1.0, 1.0]).tolist(), partly)
+    found = moved_along_axes(RESPONSE, np.diag([0.04, 0.04, 1.0, 1.0, 1.0]).tolist(), partly)
     assert list(found) == ["sum"]
 
 
 @pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((5, 5), np.nan).tolist()])
 def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]]) -> None:
-    assert propagated(RESPONSE, covariance, numbers) == {}
+    assert moved_along_axes(RESPONSE, covariance, numbers) == {}
 
 
 def test_shares_that_no_readout_has():
