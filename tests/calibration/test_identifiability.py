@@ -49,14 +49,14 @@ def test_a_degenerate_pair_is_told_as_its_known_combination(correlation, n):
     covariance = np.eye(3)
     covariance[:2, :2] = 0.64 * np.array([[1, correlation], [correlation, 1]])
     covariance[2, 2] = 0.01
-    found = together(["a", "b", "c"], covariance)
+    found = together(["a", "b", "c"], covariance, np.zeros(3))
     assert len(found) == n
     for pair in found:
         combination = np.array([pair.components["a"], pair.components["b"], 0])
         assert combination @ covariance @ combination == pytest.approx(pair.error**2)
         assert pair.error == pytest.approx(0.8 * 0.1)
     # both known far better than before: two numbers
-    assert not together(["a", "b"], 0.01 * covariance[:2, :2])
+    assert not together(["a", "b"], 0.01 * covariance[:2, :2], np.zeros(2))
 
 
 def test_errors_follow_the_number_of_pulses(alike):

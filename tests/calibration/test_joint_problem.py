@@ -93,8 +93,10 @@ def test_chi_square_is_that_of_the_definition(problem, functions):
     shrunk = (1 - SHRUNK) * covariance + SHRUNK * np.diag(covariance.diagonal())
     deviation = np.mean(simulated, axis=(0, 1)) - functions.data.mean(axis=0)
     expected = deviation @ np.linalg.solve(shrunk, deviation)
-    assert both.chi_square() == pytest.approx(expected, rel=1e-4)
-    assert both.pulls() == pytest.approx(deviation / np.sqrt(covariance.diagonal()), abs=1e-3)
+    assert both.compared()[0] == pytest.approx(expected, rel=1e-4)
+    assert both.compared()[1] == pytest.approx(
+        deviation / np.sqrt(covariance.diagonal()), abs=1e-3
+    )
     assert both.moments == len(both.names) == len(deviation)
 
 
@@ -114,7 +116,7 @@ def test_far_from_the_data_only_their_covariance_counts(problem, functions):
     each = np.cov(functions.data.T) * (1 / len(functions.sides) + 1 / len(functions.data))
     assert np.diag(weights) == pytest.approx(each.diagonal(), rel=1e-6)
     near = problem(weights=[weights])
-    assert near.chi_square() == pytest.approx(problem(held=True).chi_square())
+    assert near.compared()[0] == pytest.approx(problem(held=True).compared()[0])
 
 
 def test_priors_and_further_knowledge_follow_the_deviations(problem):
@@ -178,7 +180,7 @@ def test_deviations_of_the_readout_are_free_with_the_physics(problem, fitted):
     both = problem(response=other, modes=modes)
     n = both.parameters.n_chain
     assert both.parameters.vector()[n - 2 : n] == pytest.approx([2.0, -1.0])
-    before, end = both.chi_square(), both.fitted()
+    (before, _), end = both.compared(), both.fitted()
     assert before > 1.5 * end.chi_square
     errors = np.sqrt(np.linalg.inv(end.information).diagonal()[n - 2 : n])
     assert np.abs(both.parameters.along / errors).max() < 5
@@ -187,7 +189,7 @@ def test_deviations_of_the_readout_are_free_with_the_physics(problem, fitted):
 def test_the_fit_finds_chain_and_physics(problem, fitted):
     """Both sides have the same physics, and the chain can be described exactly."""
     both = problem(response=fitted, free=[1], at=(0.0, 0.01))
-    before = both.chi_square()
+    before, _ = both.compared()
     end = both.fitted()
     assert end.chi_square < 1.2 * both.by_chance[0] + 4 * both.by_chance[1]
     assert before > 2 * end.chi_square

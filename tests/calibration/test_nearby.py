@@ -80,8 +80,8 @@ def test_only_derivatives_from_afar_are_simulated_again():
         2: Derivative(base[:3], far, np.zeros(3)),
     }
     nearby = Nearby(None, far, base, known)
-    assert nearby.outdated([0, 1, 2], reach) == [1, 2]  # the last of too few events
-    assert nearby.outdated([1], reach) == []  # what is not free does not count
+    assert nearby.outdated([0, 1, 2], reach, 4) == [1, 2]  # the last of too few events
+    assert nearby.outdated([1], reach, 4) == []  # what is not free does not count
     assert Nearby(None, far, base, {}).outdated([0], reach) == [0]
 
 

@@ -11,7 +11,6 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training import network_runs
-from cpunet.training.network_runs import Scale
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.export import export_onnx
@@ -76,7 +75,7 @@ def kept(files, tmp_path_factory) -> Run:
     out = tmp_path_factory.mktemp("kept") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network_runs, "ENOUGH", 100)
-        patch.setattr(Scale, "of", lambda best, gain, error, text: Scale(0.5, f"used; {text}"))
+        patch.setattr(network_runs, "_scale", lambda *of: (0.5, f"used; {of[-1]}"))
         return train(*files, out, recipe=RECIPE, device="cpu")
 
 
@@ -125,7 +124,7 @@ def test_losses_and_accuracies_are_drawn(kept):
 
 @pytest.mark.parametrize(("gain", "scale"), [(-0.1, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.5)])
 def test_what_gains_by_two_standard_errors_is_used(gain, scale):
-    assert Scale.of(1, gain, 0.1, "AUC") == (
+    assert network_runs._scale(1, gain, 0.1, "AUC") == (
         scale,
         f"{'used, scaled by 0.5' if scale else 'left out'}; AUC",
     )

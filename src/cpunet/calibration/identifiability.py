@@ -132,15 +132,15 @@ class Information:
         return directions
 
 
-def together(names: Sequence[str], covariance: Values) -> list[Direction]:
+def together(names: Sequence[str], covariance: Values, off: Values) -> list[Direction]:
     """Combinations of two parameters of which only the combination is determined.
 
     Parameters
     ----------
     names
         Names of the parameters.
-    covariance
-        Their covariance in units of the priors.
+    covariance, off
+        Their covariance, and their distances from the centres, in units of the priors.
 
     Returns
     -------
@@ -149,9 +149,10 @@ def together(names: Sequence[str], covariance: Values) -> list[Direction]:
 
     Examples
     --------
-    >>> pair = together(["a", "b"], np.array([[0.5, -0.49], [-0.49, 0.5]]))
-    >>> pair[0].words, round(pair[0].error, 6)
-    ('0.71 a + 0.71 b', 0.1)
+    >>> covariance = np.array([[0.5, -0.49], [-0.49, 0.5]])
+    >>> (pair,) = together(["a", "b"], covariance, np.array([1.0, 0.0]))
+    >>> pair.words, round(pair.error, 6), round(pair.value, 2)
+    ('0.71 a + 0.71 b', 0.1, 0.71)
     """
     pairs = []
     for i, j in combinations(range(len(names)), 2):
@@ -162,7 +163,8 @@ def together(names: Sequence[str], covariance: Values) -> list[Direction]:
         if errors.max() > DETERMINED and error < PARALLEL * errors.min():
             axis = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
             components = {names[i]: float(axis[0]), names[j]: float(axis[1])}
-            pairs.append(Direction(components=components, error=error))
+            value = float(axis[0] * off[i] + axis[1] * off[j])
+            pairs.append(Direction(components=components, error=error, value=value))
     return pairs
 
 

@@ -16,7 +16,9 @@ losses, an iteration, the loop.  Critics see views of pulses (`cpunet.training.v
 from __future__ import annotations
 
 import copy
+import logging
 import math
+import signal
 from collections.abc import Callable
 
 import torch
@@ -30,8 +32,10 @@ from cpunet.training.judging import JUDGED, Judge, judged
 from cpunet.training.optimisers import Optimisers
 from cpunet.training.run import Record
 from cpunet.training.sides import Sides
-from cpunet.training.unfinished import Interruption, State, restore, state_of
+from cpunet.training.unfinished import State, waiting_signals
 from cpunet.training.views import View, half_sample
+
+log = logging.getLogger(__name__)
 
 SIZE, FAST_NS, AROUND_NS = 0.1, 128.0, 2048.0  # of a change by U, its current, and its stretch
 SLOPE, SHARP, TOP = 0.2, 4.0, 6.0  # of the critic
@@ -180,6 +184,24 @@ class Game:
         names = "generators", "critics", "average", "good", "optimisers", "judge"
         self.parts = {name: getattr(self, name) for name in names}  # which a state is of
 
+    def state(self) -> State:
+        """All that the next iterations depend on, except pulses and settings."""
+        return {
+            "iteration": self.iteration,
+            "right": dict(self.right),
+            "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
+            "parts": {name: part.state_dict() for name, part in self.parts.items()},
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from a state of the same pulses and settings."""
+        self.iteration, self.right = state["iteration"], dict(state["right"])
+        for name, part in self.parts.items():
+            part.load_state_dict(state["parts"][name])
+        torch.set_rng_state(state["random"][0])
+        if torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(state["random"][1:])
+
     @torch.no_grad()
     def with_noise(self, rows: Tensor) -> Tensor:
         """Simulated pulses, with the noise that IREN's linear part leaves."""
@@ -269,15 +291,16 @@ def train(
     and at Ctrl-C or SIGTERM, which act between iterations.  A loss or weight that is not finite
     is a `CpunetError`.
     """
-    with torch.random.fork_rng(), Interruption() as interruption:
+    with torch.random.fork_rng(), waiting_signals() as waiting:
         torch.manual_seed(seed)
         game, records = make(), list[Record]()
-        restore(game, start)
+        if start is not None:
+            game.restore(start)
         c = game.config
         while game.iteration < c.iterations and not game.judge.ended:
             losses, done = game.step(), game.iteration
             records.append({"iteration": done - 1, "rate": game.rate, "losses": losses})
-            stop = interruption.signal if done < c.iterations else 0
+            stop = waiting and done < c.iterations
             keep = stop or done == c.iterations or done % c.checkpoint_interval == 0
             if done % JUDGED == 0:
                 records[-1]["accuracy"] = judged(game)
@@ -290,10 +313,11 @@ def train(
                 listener(records)
                 records = []
             if keep:
-                save(state_of(game))
+                save(game.state())
             if stop:
                 text = f"stopped after {done} of {c.iterations} iterations"
-                interruption.act(f"{text}; resume goes on from it")
+                log.info(f"{text}; resume goes on from it")
+                signal.raise_signal(waiting[0])
         if records:
             listener(records)
     if game.judge.over.get("data") == "won":

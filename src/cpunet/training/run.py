@@ -17,7 +17,7 @@ import json
 import logging
 import platform
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -104,12 +104,15 @@ class Run(InfoPart):
         Versions of the software.
     imported
         Files of imported weights, by part.
+    log
+        Records of the training, if it was not read from a folder.
     """
 
     dt_ns: Annotated[float, Field(gt=0, le=1e9)]
     recipe: Recipe = Field(**_NOT_STORED)
     weights: dict[str, Array] = Field(**_NOT_STORED)
     folder: Path | None = Field(None, **_NOT_STORED)
+    log: list[Record] | None = Field(None, **_NOT_STORED)
     peak: str
     seed: Annotated[int, Field(ge=0)] | None
     device: str
@@ -178,7 +181,10 @@ class Run(InfoPart):
             raise CpunetError(f"{path}: damaged ({wrong}); train again") from error
 
     def write(self, folder: Path) -> None:
-        """Write weights, recipe and provenance into an existing folder."""
+        """Write weights, log, recipe and provenance into an existing folder."""
+        lines = [json.dumps(record) + "\n" for record in self.records]
+        if lines:
+            (folder / LOSSES).write_text("".join(lines), encoding="utf-8")
         (folder / WEIGHTS).write_bytes(save(self.weights))
         settings = yaml_text(self.recipe.model_dump(mode="json"))
         (folder / RECIPE).write_text(settings, encoding="utf-8")
@@ -187,18 +193,15 @@ class Run(InfoPart):
         (folder / INFO).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
     def save(self, folder: str | Path, force: bool = False) -> Self:
-        """Write the run, with its losses, to a folder; return the run of that folder.
+        """Write the run to a folder, and return the run of that folder.
 
         Raises
         ------
         CpunetError
             If the folder exists and `force` is off, or is not a run.
         """
-        records = self.records
         with folder_written_aside(Path(folder), RUN, self.folder, force=force) as aside:
             self.write(aside)
-            if records:
-                append_losses(aside, records)
         return self.model_copy(update={"folder": Path(folder)})
 
     def fill(self, part: str, network: Network, device: str = "cpu") -> Network:
@@ -258,7 +261,13 @@ class Run(InfoPart):
     @cached_property
     def records(self) -> list[Record]:
         """Records of the training's log; empty without a log."""
-        return [] if self.folder is None else read_losses(self.folder)
+        path = (self.folder or Path()) / LOSSES
+        if self.log is not None or self.folder is None or not path.is_file():
+            return self.log or []
+        try:
+            return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        except ValueError as error:
+            raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
 
     @cached_property
     def losses(self) -> DataFrame:
@@ -434,20 +443,3 @@ def versions() -> dict[str, str]:
         with suppress(PackageNotFoundError):  # torch is needed by networks only
             numbers[name] = version(name)
     return numbers
-
-
-def append_losses(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
-    """Add training records to the folder's log."""
-    with (folder / LOSSES).open("a") as stream:
-        stream.writelines(json.dumps(record) + "\n" for record in records)
-
-
-def read_losses(folder: Path) -> list[Record]:
-    """Return the training records; empty if the log is missing."""
-    path = folder / LOSSES
-    if not path.is_file():
-        return []
-    try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    except ValueError as error:
-        raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
