@@ -159,7 +159,7 @@ class Game:
     """Generators, critics of both sides, and an iteration of their training."""
 
     def __init__(
-        self, ren: Generator, iren: Generator, sides: Sides, settings: schema.CycleGanSettings
+        self, ren: Generator, iren: Generator, sides: Sides, settings: schema.CycleGanConfig
     ) -> None:
         self.ren, self.iren, self.sides, self.config = ren, iren, sides, settings.training
         c, critic, device = settings.training, settings.discriminator, sides.data.pulses.device

@@ -153,7 +153,7 @@ def _played(
     if min(sim.seen, data.seen) < MANY:  # which a large critic knows by heart
         critic = settings.discriminator
         small = critic.model_copy(update=SMALL.get(critic.name))
-        settings = settings._replace(discriminator=small)
+        settings = settings.model_copy(update={"discriminator": small})
     sides = Sides(sim, data, recipe.preparation, noise, settings.generator.linear != "none")
     left = settings.training.iterations - (state["iteration"] if state else 0)
     with stage("Training", left) as bar:

@@ -93,7 +93,7 @@ def import_weights(
     # windows of as many samples, whatever the period
     parts = {
         "preparation": published.preparation,
-        "training.losses": published.cyclegan[2].losses,
+        "training.losses": published.cyclegan.training.losses,
     }
     for part, config in parts.items():
         for name, value in config.model_dump().items():
