@@ -39,11 +39,6 @@ def test_what_moves_pulses_alike_is_one_direction(alike):
     assert best.words.startswith("0.7")
 
 
-def test_alone_each_is_known_and_together_neither(alike):
-    assert alike.errors([0])[0] < 0.01 * WIDTHS[0]
-    assert alike.errors()[0] > 0.2 * WIDTHS[0]
-
-
 @pytest.mark.parametrize(("correlation", "n"), [(-0.99, 1), (0.99, 1), (0.5, 0)])
 def test_a_degenerate_pair_is_told_as_its_known_combination(correlation, n):
     covariance = np.eye(3)
@@ -57,11 +52,6 @@ def test_a_degenerate_pair_is_told_as_its_known_combination(correlation, n):
         assert pair.error == pytest.approx(0.8 * 0.1)
     # both known far better than before: two numbers
     assert not together(["a", "b"], 0.01 * covariance[:2, :2], np.zeros(2))
-
-
-def test_errors_follow_the_number_of_pulses(alike):
-    ratio = alike.errors([0]) / alike.for_pulses(4000).errors([0])
-    assert ratio == pytest.approx(2, rel=0.01)
 
 
 ROWS, ACTS = 200, 2
@@ -127,7 +117,3 @@ def test_what_is_told_begins_with_what_held_out_pulses_need():
     )
     alike = Information(nuisances, np.full((2, 2), 100.0) / np.outer(widths, widths), widths, 1)
     assert one.begin(alike) == [1]
-
-
-def test_other_sets_lack_or_exchange_one():
-    assert list(selection().others([1])) == [[], [0], [2], [3]]

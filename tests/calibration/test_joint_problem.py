@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cpunet.calibration.identifiability import Information
-from cpunet.calibration.joint_problem import HOLD, JointParameters, JointProblem, first
+from cpunet.calibration.joint_problem import JointParameters, JointProblem, first
 from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.sliced_functions import SlicedJoint
@@ -147,13 +147,6 @@ def test_what_else_is_known_makes_errors_smaller(problem):
     np.testing.assert_allclose(after.matrix, before.matrix, rtol=1e-4)
 
 
-def test_steps_from_far_away_are_held_within_reach(problem):
-    held = problem(held=True, few=True)
-    vector = held.parameters.vector()
-    vector[-2:] = PHYSICS.nuisances[0].reach, -0.5 * PHYSICS.nuisances[1].reach
-    assert held.residuals(vector)[-2:] == pytest.approx([HOLD, -0.5 * HOLD])
-
-
 def test_derivatives_are_those_of_wide_differences(problem, fitted):
     """Noise makes readings of a pulse jump; over wide steps of many that is a motion."""
     both = problem(response=fitted)
@@ -219,14 +212,3 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby)
         # a jump by a sample is 0.01; the scale to a highest value of 1 changes by 1e-4
         assert there == pytest.approx(here + x * (one_more - here), abs=2e-4)
     assert (prepared(0.3).align_sample != prepared(0.0).align_sample).any()
-
-
-def test_what_is_not_free_stays(problem, nearby):
-    one = problem(free=[1], at=(1.0, 0.0), weights=[np.eye(2)])
-    parameters = one.parameters
-    assert parameters.names[-1] == "impurity_factor"
-    vector = parameters.vector()
-    vector[-1] = 1e3  # far beyond its bound
-    parameters.set(vector)
-    assert parameters.coordinates[0] == 1.0
-    assert parameters.coordinates[1] == pytest.approx(np.log(PHYSICS.nuisances[1].highest))

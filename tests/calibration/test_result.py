@@ -87,13 +87,6 @@ def test_what_cannot_be_is_no_finding(values, name, why):
     assert result.comment.count("\n") == 1
 
 
-def test_what_can_be_is_a_finding():
-    result = calibrated((93.9, 1.1, 0.4, 1.0, 0.11))
-    assert not any(each.doubt for each in result.parameters.values())
-    assert not result.comment
-    assert not result.together
-
-
 def test_of_a_degenerate_pair_the_direction_is_told():
     (pair,) = calibrated((93.0, 1.05), degenerate=True).together
     assert pair.components == pytest.approx(

@@ -137,28 +137,6 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
 
 
-def test_data_without_tails_are_given_none(run: Run) -> None:
-    assert run.fit.tails.rate_khz == 0
-    assert dict(run.summary())["pile-up tails"] == "none significant"
-    tails = REN.load(run.folder).tails
-    assert tails is not None
-    assert tails.law.rate_khz == 0
-
-
-@pytest.mark.thorough
-def test_a_simulation_of_other_physics_is_told(
-    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    # edges of many widths, as no pole makes them of the right ones
-    other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
-    recipe = load_recipe("fast", [*ONE_START, *SHORT])
-    made = train(other, files.data, tmp_path / "run", recipe=recipe, device="cpu")
-    fit = made.fit.model_dump()
-    assert not made.fit.checks.good
-    (said,) = (note for note in caplog.messages if note.startswith("the fit is bad"))
-    assert fit["verdict"] in said
-
-
 @pytest.mark.thorough
 def test_a_stretched_drift_is_told_and_translated(
     run: Run, files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training import network_runs
 from cpunet.training.run import Run
@@ -18,12 +15,10 @@ from cpunet.translation.translator import IREN, REN
 from cpunet.validation.run_figures import loss_curves
 from games import SMALL
 from synthetic import (
-    after_pole,
-    decay,
     load_recipe,
     phased_edges,
     require_drawn,
-    write_pulses,
+    write_line,
 )
 
 SHORT = (
@@ -40,22 +35,10 @@ GAME = (
 RECIPE = load_recipe("cpunet", [*SHORT, *GAME])
 
 
-def write(path: Path, seed: int, pole: float | None, n: int = 240) -> PulseFile:
-    """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
-    rng = np.random.default_rng(seed)
-    pulses = phased_edges(n, rng, 450, 1100)
-    if pole is not None:
-        decayed = after_pole(pulses, pole, 90) * decay(450, 4000, 1100)
-        pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
-    kev = np.full(n, 2614.5)
-    write_pulses(path, Pulses.of(pulses, dt_ns=16.0, energy_kev=kev), table="geds/raw")
-    return PulseFile(path)
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> tuple[PulseFile, PulseFile]:
     folder = tmp_path_factory.mktemp("files")
-    return write(folder / "sim.lh5", 1, None), write(folder / "data.lh5", 2, 4.0)
+    return write_line(folder / "sim.lh5", 1, None), write_line(folder / "data.lh5", 2, 4.0)
 
 
 def test_with_few_pulses_it_is_the_readout_alone(files, tmp_path, caplog):

@@ -300,7 +300,7 @@ def train(
         while game.iteration < c.iterations and not game.judge.ended:
             losses, done = game.step(), game.iteration
             records.append({"iteration": done - 1, "rate": game.rate, "losses": losses})
-            stop = waiting and done < c.iterations
+            stop = bool(waiting) and done < c.iterations
             keep = stop or done == c.iterations or done % c.checkpoint_interval == 0
             if done % JUDGED == 0:
                 records[-1]["accuracy"] = judged(game)
