@@ -33,9 +33,6 @@ def test_a_search_that_goes_back_and_forth_ends_between(slope, begin):
         last = _relaxed((slope - 1) * where, last)
         where = where + last
     assert abs(where[0]) < 1e-9 * begin
-
-
-def test_a_search_that_goes_on_is_not_held():
     assert _relaxed(np.array([1.0, -2.0]), np.array([3.0, 0.0])).tolist() == [1.0, -2.0]
 
 

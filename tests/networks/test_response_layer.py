@@ -12,7 +12,7 @@ from cpunet.electronics.readout import linear_response
 from cpunet.networks.response_layer import (
     DriftClock,
     ElectronicsResponse,
-    fast_length,
+    padded_length,
 )
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ResponseConfig
@@ -101,7 +101,7 @@ def test_at_a_sharpness_of_one_samples_are_points():
 def test_a_step_is_that_of_the_exact_chain_averaged_over_the_period():
     chain = electronics((55.0, 35.0))
     samples = 600
-    padded = fast_length(4 * samples)
+    padded = padded_length(3 * samples)
     spectrum = layer((55.0, 35.0)).transfer(padded)
     got = scipy.fft.irfft(spectrum, padded)[:samples]
     within = (np.arange(64) + 0.5) / 64

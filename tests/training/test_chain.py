@@ -100,17 +100,6 @@ def test_files_are_translated_in_both_directions(
         assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
 
 
-def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
-    sim = sampled(charge(6, seed=5), FINE)
-    energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
-    path = tmp_path / "sim.lh5"
-    write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
-    told = translate(run.folder, path, tmp_path / "a.lh5").counts
-    assert told == Counts(6, 4, {"energy_unknown": 2})
-    told = translate(run.folder, path, tmp_path / "b.lh5", noise=False).counts
-    assert told == Counts(6, 6)
-
-
 @pytest.mark.thorough
 def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture

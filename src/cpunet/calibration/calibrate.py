@@ -20,6 +20,7 @@ from cpunet.calibration.calibrated_run import (
     Calibration,
     ExpectedErrors,
     Plan,
+    figures,
 )
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import (
@@ -229,7 +230,7 @@ def _calibrated(given: Given, _name: str, pair: Pair, out: Path | None) -> Calib
         }
         run.model_copy(update=facts).write(folder)
         (folder / CALIBRATION).write_text(result.model_dump_json(indent=1) + "\n")
-        for file, figure in result.figures.items():
+        for file, figure in figures(result).items():
             figure.savefig(folder / f"{file}.png", dpi=DPI)
     return Calibration.load(out)
 

@@ -30,11 +30,7 @@ if TYPE_CHECKING:
 CALIBRATION, SIM = "calibration.json", "sim.lh5"
 DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
 DPI = 110
-PLAN = FolderKind(
-    name="plan",
-    command="cpunet calibrate --plan",
-    own=r"plan\.json|plan\.png",
-)
+PLAN = FolderKind("plan", "cpunet calibrate --plan", r"plan\.(json|png)")
 _BY_LOAD: Any = {"default": None, "exclude": True, "repr": False}
 SHOWN = 0.25  # least component of a direction that is shown
 
@@ -178,31 +174,19 @@ class CalibratedPhysics(InfoPart):
         """Each value with its error, or why none is given."""
         pairs = {name for pair in self.together for name in pair.components}
         texts = {}
-        for name, parameter in self.parameters.items():
-            texts[name] = f"{parameter.value:.5g} ± {parameter.error:.2g}"
-            if parameter.doubt:
-                texts[name] = (
-                    f"unreliable value: {parameter.value:.5g} makes up for something else"
-                )
+        for name, of in self.parameters.items():
+            texts[name] = f"{of.value:.5g} ± {of.error:.2g}"
+            if of.doubt:
+                texts[name] = f"unreliable value: {of.value:.5g} makes up for something else"
             elif name in pairs:
                 texts[name] = "determined only together with another"
         return texts
 
-    @property
-    def figures(self) -> dict[str, Figure]:
-        """``pulls``, and ``directions`` if any parameter was free."""
-        drawn = {"pulls": pulls_figure(self)}
-        if self.directions:
-            drawn["directions"] = directions_figure(self.directions)
-        return drawn
-
     def __str__(self) -> str:
         lines = [
-            f"{titled(name)} {text} (simulated with {parameter.simulated:.5g}; "
-            f"± {parameter.error_all:.2g} if all physics were free)"
-            for (name, text), parameter in zip(
-                self.shown.items(), self.parameters.values(), strict=True
-            )
+            f"{titled(name)} {text} (simulated with {self.parameters[name].simulated:.5g}; "
+            f"± {self.parameters[name].error_all:.2g} if all physics were free)"
+            for name, text in self.shown.items()
         ] or ["no parameter of the physics is determined better than by its prior"]
         lines += [
             f"only together: {titled(pair.words, units=False)} = {pair.value:.2f} ± "
@@ -261,9 +245,7 @@ class Calibration(Run):
         """A row per free parameter: its value, error, simulated value, prior and others."""
         from pandas import DataFrame
 
-        rows = {
-            name: parameter.model_dump() for name, parameter in self.result.parameters.items()
-        }
+        rows = {name: of.model_dump() for name, of in self.result.parameters.items()}
         return DataFrame.from_dict(rows, orient="index")
 
     @property
@@ -284,7 +266,7 @@ class Calibration(Run):
     @property
     def figures(self) -> dict[str, Figure]:
         """``pulls``, and ``directions`` if any parameter was free."""
-        return self.result.figures
+        return figures(self.result)
 
     @property
     def _folder(self) -> Path:
@@ -361,25 +343,20 @@ class Plan(InfoPart):
             self.plot().savefig(aside / "plan.png", dpi=DPI)
 
     def __str__(self) -> str:
-        counts, tables = [f"N={n}" for n in self.directions], []
+        counts, lines = [f"N={n}" for n in self.directions], []
         for kind, title in (("alone", "error of each alone"), ("all_free", "with all free")):
-            rows = [
-                [
-                    titled(name),
-                    *(f"{e:.3g}" for e in (expected.prior, *getattr(expected, kind).values())),
-                ]
-                for name, expected in self.errors_by_name.items()
-            ]
-            tables.append(text_table([title, "prior", *counts], rows))
-        directions = [
-            f"{expected.error:8.3f}  {titled(expected.words, units=False)}"
-            for expected in self.directions[self._middle]
-        ]
-        about = (
+            rows = []
+            for name, of in self.errors_by_name.items():
+                errors = of.prior, *getattr(of, kind).values()
+                rows.append([titled(name), *(f"{error:.3g}" for error in errors)])
+            lines.append(text_table([title, "prior", *counts], rows))
+        lines.append(
             f"eigenvectors of the covariance with {self._middle} pulses of each side, error in "
             "units of the prior:"
         )
-        return "\n".join([*tables, about, *directions])
+        for of_axis in self.directions[self._middle]:
+            lines.append(f"{of_axis.error:8.3f}  {titled(of_axis.words, units=False)}")
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         return f"<Plan of {self.detector}: {', '.join(self.errors_by_name)}>"
@@ -391,6 +368,14 @@ class Plan(InfoPart):
 
 BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]
 LINEAR = 3.0  # pulls up to which the axis is linear
+
+
+def figures(result: CalibratedPhysics) -> dict[str, Figure]:
+    """``pulls``, and ``directions`` if any parameter was free."""
+    drawn = {"pulls": pulls_figure(result)}
+    if result.directions:
+        drawn["directions"] = directions_figure(result.directions)
+    return drawn
 
 
 @styled
@@ -425,15 +410,11 @@ def pulls_figure(result: CalibratedPhysics) -> Figure:
 def directions_figure(directions: Sequence[Direction]) -> Figure:
     """Eigenvectors of the covariance as a colour table, with the error of each."""
     names = list(directions[0].components)
-    matrix = np.array(
-        [[direction.components[name] for name in names] for direction in directions]
-    )
-    errors = np.array([direction.error for direction in directions])
+    matrix = np.array([[axis.components[name] for name in names] for axis in directions])
+    errors = np.array([axis.error for axis in directions])
     size = 0.34 * len(names)
     figure = Figure(figsize=(5.6 + size, 2.0 + size))
-    left, right = figure.subplots(
-        1, 2, sharey=True, gridspec_kw={"width_ratios": [len(names), 5]}
-    )
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=[len(names), 5])
     left.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
     titles = [titled(name, units=False) for name in names]
     left.set_xticks(range(len(names)), titles, rotation=60, ha="right", fontsize=8)

@@ -249,10 +249,8 @@ class JointProblem:
             assert difference.parts is not None
             slopes, values = difference.parts
             both = np.moveaxis(np.concatenate([slopes, values[..., np.newaxis]], axis=2), 1, 0)
-            solved = scipy.linalg.solve_triangular(
-                root, both.reshape(len(root), -1), lower=True
-            )
-            white.append(solved.reshape(both.shape))
+            flat = both.reshape(len(root), -1)
+            white.append(_white(root, flat).reshape(both.shape))
         parts = np.concatenate(white).swapaxes(0, 1)  # (parts, functions, parameters + 1)
         slopes, values = parts[..., :-1], parts[..., -1]
         rows = [slopes.mean(axis=0), np.diag(1 / parameters.widths)]
@@ -269,10 +267,7 @@ class JointProblem:
     def _stacked(self, vector: Values, differences: Sequence[Difference]) -> Values:
         parameters = self.parameters
         rows = [
-            *(
-                scipy.linalg.solve_triangular(root, difference.values, lower=True)
-                for root, difference in zip(self._roots, differences, strict=True)
-            ),
+            *(_white(of, d.values) for of, d in zip(self._roots, differences, strict=True)),
             (vector - parameters.centre) / parameters.widths,
             self.knowledge(parameters.coordinates),
         ]
@@ -284,10 +279,8 @@ class JointProblem:
     def _differences(self, *, slopes: bool = False) -> list[Difference]:
         """Differences of each band at the current parameters, with derivatives if asked."""
         parameters, at = self.parameters, self.parameters.coordinates
-        response = parameters.chain.response
         padded = self.functions[0].sides.padded
-        transfer = response.transfer(padded)
-        basis = parameters.basis(padded) if slopes else None
+        transfer = parameters.chain.response.transfer(padded)
         if not slopes:
             return [functions.difference(transfer) for functions in self.here()]
         most, steps = events(self.functions), STEP * parameters.reach
@@ -296,12 +289,11 @@ class JointProblem:
             (self.windows(at + step * np.eye(len(at))[i], most) - windows) / np.float32(step)
             for i, step in zip(parameters.free, steps, strict=True)
         ]
-        return [
-            functions.difference(
-                transfer, basis, [each[functions.sides.rows] for each in changes]
-            )
-            for functions in self.here()
-        ]
+        basis, differences = parameters.basis(padded), []
+        for functions in self.here():
+            own = [each[functions.sides.rows] for each in changes]
+            differences.append(functions.difference(transfer, basis, own))
+        return differences
 
     def here(self) -> list[SlicedJoint]:
         """Functions with the simulated pulses at the current coordinates."""
@@ -317,6 +309,11 @@ class JointProblem:
         length = self.recipe.preparation.length
         windows: FloatArray = cut(self.nearby.at(coordinates, most), self._first, length)
         return windows
+
+
+def _white(root: Values, values: Values) -> Values:
+    """Values without their correlations, given the root of the covariance."""
+    return np.asarray(scipy.linalg.solve_triangular(root, values, lower=True))
 
 
 def events(functions: Sequence[SlicedJoint]) -> int:

@@ -113,13 +113,6 @@ class Critic(nn.Module):
         return self.out(joined)[:, 0]  # type: ignore[no-any-return]
 
 
-def critic_of(config: schema.ConvolutionalConfig | schema.GruConfig, view: View) -> nn.Module:
-    """A new critic that reads views."""
-    if isinstance(config, schema.GruConfig):
-        return GruDiscriminator(config)
-    return Critic(config, view.n_edge, view.size)
-
-
 def window_weights(config: schema.LossConfig, length: int) -> Tensor:
     """Weight of each sample in the L1 losses: baseline, edge and tail count by their means."""
     begin, end = config.edges
@@ -171,7 +164,12 @@ class Game:
         )
         with torch.no_grad():
             self.views = {side: View(side, those, critic, own) for side, those in real.items()}
-        critics = {side: critic_of(critic, view) for side, view in self.views.items()}
+        critics = {
+            side: GruDiscriminator(critic)
+            if isinstance(critic, schema.GruConfig)
+            else Critic(critic, view.n_edge, view.size)
+            for side, view in self.views.items()
+        }
         self.critics = nn.ModuleDict(critics).to(device)
         self.generators = nn.ModuleDict({"ren": ren, "iren": iren}).to(device).train()
         self.average = copy.deepcopy(self.generators).requires_grad_(False)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -17,7 +18,6 @@ from cpunet.recipes.schema import ResponseConfig
 from cpunet.tables import counted, percent, with_std
 from cpunet.training.closed_forms import (
     Chain,
-    FloatArray,
     Numbers,
     chain_numbers,
     learned_chain,

@@ -23,7 +23,7 @@ from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -56,13 +56,6 @@ log = logging.getLogger(__name__)
 
 FORMAT = 3
 """Format of run folders; those of other versions cannot be loaded."""
-
-
-class Shaped(Protocol):
-    """Array of either library."""
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
 
 
 Record = dict[str, float | int | dict[str, float]]
@@ -213,11 +206,8 @@ class Run(InfoPart):
             If the weights are of another architecture, not finite, or all zero.
         """
         where, prefix = (self.folder or Path()) / WEIGHTS, f"{part}."
-        own = {
-            key.removeprefix(prefix): values
-            for key, values in self.weights.items()
-            if key.startswith(prefix)
-        }
+        weights = self.weights.items()
+        own = {key.removeprefix(prefix): of for key, of in weights if key.startswith(prefix)}
         if wrong := differing(own, arrays_of(network)):
             raise CpunetError(
                 f"{where}: weights of another network: {len(wrong)} tensors differ, first "
@@ -404,8 +394,8 @@ def arrays_of(part: Stored | nn.Module) -> dict[str, Array]:
     return {name: values.detach().cpu().numpy() for name, values in part.state_dict().items()}
 
 
-def differing(own: Mapping[str, Shaped], expected: Mapping[str, Shaped]) -> list[str]:
-    """Names of arrays that only a single side has, or in another shape."""
+def differing(own: Mapping[str, Any], expected: Mapping[str, Any]) -> list[str]:
+    """Names of arrays, of either library, that only a single side has, or in another shape."""
     shapes = [{name: value.shape for name, value in side.items()} for side in (own, expected)]
     return sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()})
 
