@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
-from cpunet.calibration.identifiability import Information
+from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.result import described
@@ -45,9 +45,10 @@ def calibrated(values=(), degenerate=False) -> CalibratedPhysics:
         before=9.0, after=2.0, moments=2, expected=2.0, spread=0.5, errors_scaled_by=1.0
     )
     facts = {"others": [], "pulls_before": [0.0], "pulls_after": [0.0]}
-    information = Information(NUISANCES, np.eye(5), np.ones(5), 100.0)
     facts |= {"rounds": 1, "settled": True}
-    return described(problem, covariance, chi, information, {}, **facts)
+    none = np.zeros((2, 5))
+    linear = Linear(np.eye(5), np.zeros(5), none, np.zeros(5), np.ones(5), 100.0)
+    return described(problem, covariance, chi, linear, **facts)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

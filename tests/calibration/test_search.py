@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration.identifiability import Selection
+from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.nuisances import (
     Freedom,
     Physics,
@@ -57,9 +57,12 @@ def test_a_parameter_that_explains_the_pulses_better_takes_the_place_of_another(
     search = Search.__new__(Search)
     search.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
     search._all = [0, 1, 2]
-    better = Selection(columns, np.array([0.0, 6.0, 0.0]), halves, at)
+    better, none = (
+        Linear(columns, np.array([0.0, size, 0.0]), halves, at, np.full(3, 1e6), 100.0)
+        for size in (6.0, 0.0)
+    )
     assert search._better(better, [0]) == [1]
-    assert search._better(Selection(columns, np.zeros(3), halves, at), [0]) is None
+    assert search._better(none, [0]) is None
 
 
 @pytest.mark.parametrize(

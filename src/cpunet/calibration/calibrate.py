@@ -167,18 +167,17 @@ def _planned(given: Given, _name: str, pair: Pair, out: Path | None) -> Plan:
         search.simulator.simulated = bar.update
         physics = search.simulator.physics
         bar.total = 2 + 2 * len(physics.nuisances)
-        information = search.plan()
-    by_pulses = {str(n): information.for_pulses(n / 2) for n in PLANNED}
-    errors = {}
+        linear = search.plan()
+    errors, names = {}, [nuisance.name for nuisance in physics.nuisances]
     for i, (centre, width) in enumerate(zip(*physics.priors(search.given), strict=True)):
         own = partial(physics.in_own_unit, i, float(centre))
         errors[physics.nuisances[i].name] = ExpectedErrors(
             simulated=physics.nominal(physics.nuisances[i]),
             prior=own(width)[1],
-            alone={n: own(of.errors([i])[0])[1] for n, of in by_pulses.items()},
-            all_free={n: own(of.errors()[i])[1] for n, of in by_pulses.items()},
+            alone={str(n): own(linear.errors([i], n / 2)[0])[1] for n in PLANNED},
+            all_free={str(n): own(linear.errors(pairs=n / 2)[i])[1] for n in PLANNED},
         )
-    directions = {n: of.directions() for n, of in by_pulses.items()}
+    directions = {str(n): linear.directions(names, n / 2) for n in PLANNED}
     name = physics.detector.name
     plan = Plan(detector=name, errors_by_name=errors, directions=directions)
     if out is not None:

@@ -13,7 +13,7 @@ from cpunet.calibration.calibrated_run import (
     FixedParameter,
     FreeParameter,
 )
-from cpunet.calibration.identifiability import Information, together
+from cpunet.calibration.identifiability import Linear, together
 from cpunet.calibration.joint_problem import JointParameters, JointProblem
 from cpunet.calibration.nuisances import Nuisance, Values
 
@@ -34,8 +34,7 @@ def described(
     problem: JointProblem,
     covariance: Values,
     chi: ChiSquare,
-    information: Information,
-    promised: Mapping[int, float],
+    linear: Linear,
     **facts: Any,
 ) -> CalibratedPhysics:
     """The calibrated physics in the units of their parameters.
@@ -48,10 +47,8 @@ def described(
         Covariance of its parameters, with errors of the functions larger by a scale.
     chi
         Chi-square of the functions, and this scale.
-    information
-        Information on all physics.
-    promised
-        Expected decrease of chi-square for each fixed parameter if it were free, by position.
+    linear
+        Dependence of the functions on all physics.
     facts
         Further fields of `CalibratedPhysics`.
     """
@@ -60,8 +57,8 @@ def described(
     centres, priors = physics.priors(parameters.given)
     errors = np.sqrt(covariance.diagonal()[n:])
     # sampling noise makes those with all free larger, too
-    errors_all = information.errors()
-    larger = errors / information.errors(parameters.free)
+    errors_all = linear.errors()
+    larger = errors / linear.errors(parameters.free)
     free, fixed = {}, {}
     for k, (i, error) in enumerate(zip(parameters.free, errors, strict=True)):
         name, x = nuisances[i].name, float(parameters.coordinates[i])
@@ -77,19 +74,23 @@ def described(
             prior_error=width,
             source="given" if name in parameters.given else nuisances[i].source,
         )
-    for i, fall in promised.items():
-        error = chi.errors_scaled_by * information.errors([*parameters.free, i])[-1]
-        value, own_error = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
-        fixed[nuisances[i].name] = FixedParameter(
-            value=value, chi_square_would_fall_by=fall, error_if_free=own_error
-        )
+    here, _ = linear.cost(parameters.free)
+    for i, nuisance in enumerate(nuisances):
+        if i not in parameters.free:
+            more = [*parameters.free, i]
+            error = chi.errors_scaled_by * linear.errors(more)[-1]
+            value, own_error = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+            fall = here - linear.cost(more)[0]
+            fixed[nuisance.name] = FixedParameter(
+                value=value, chi_square_would_fall_by=fall, error_if_free=own_error
+            )
     widths = parameters.widths[n:]
     off = (parameters.vector()[n:] - parameters.centre[n:]) / widths
     return CalibratedPhysics(
         parameters=free,
         fixed=fixed,
         together=together(names, covariance[n:, n:] / np.outer(widths, widths), off),
-        directions=information.directions(),
+        directions=linear.directions([nuisance.name for nuisance in nuisances]),
         chi_square=chi,
         covariance=covariance[n:, n:].tolist(),
         functions=list(problem.names),

@@ -11,12 +11,12 @@ import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
-from cpunet.calibration.identifiability import Information, Selection
+from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.joint_problem import JointParameters, JointProblem, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
@@ -50,14 +50,6 @@ SAME, MAX_OTHERS = 9.0, 2
 USUAL_ROUNDS = 4  # of most searches, for the remaining time
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
-
-
-class Examined(NamedTuple):
-    """Information on all parameters, linear fits, and fall of chi-square for each fixed one."""
-
-    information: Information
-    selection: Selection
-    promised: dict[int, float]
 
 
 @dataclass(eq=False)
@@ -101,12 +93,12 @@ class Search:
         with_decay(self._start, self.sets.tail_slope)
         self._modes = NONE
 
-    def plan(self) -> Information:
-        """Information of the pulses on all parameters that may become free, before a fit."""
+    def plan(self) -> Linear:
+        """What the pulses say of all parameters that may become free, before a fit."""
         few = first(self._functions)
         nearby = Nearby.about(self.simulator, np.zeros(self._n), [])
         nearby = nearby.again(self._all, events(few))
-        return self._looked(self._problem(self._chain(), nearby, self._all, few))[0]
+        return self._looked(self._problem(self._chain(), nearby, self._all, few))
 
     def run(self) -> tuple[JointProblem, CalibratedPhysics]:
         """Search until the physics no longer changes: the last comparison, and its result.
@@ -146,7 +138,7 @@ class Search:
             examined = self._examined(problem) if settled or number == ROUNDS else None
             better = None
             if examined is not None and more < MAX_MORE and not self.chosen:
-                better = self._better(examined.selection, free)
+                better = self._better(examined, free)
             if number == ROUNDS or (settled and better is None):
                 break
             if better is not None:
@@ -233,8 +225,7 @@ class Search:
         if self.chosen:
             return self._all
         problem = self._problem(response, nearby, self._first, first(self._functions))
-        information, selection = self._looked(problem)
-        return [self._first[i] for i in selection.begin(information)]
+        return [self._first[i] for i in self._looked(problem).begin()]
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
         """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
@@ -256,35 +247,30 @@ class Search:
         reach = farthest / FARTHEST
         return place.again(place.outdated(free, reach, len(place.base)))
 
-    def _better(self, selection: Selection, free: Sequence[int]) -> list[int] | None:
+    def _better(self, linear: Linear, free: Sequence[int]) -> list[int] | None:
         """Parameters that explain the pulses better if they are free, if any do significantly.
 
         These are the free with another that held-out pulses need most, or in exchange.
         """
-        here = selection.score(free)
+        here = linear.score(free)
         more = [sorted([*free, i]) for i in self._all if i not in free]
-        falls = [here - selection.score(other) for other in more]
+        falls = [here - linear.score(other) for other in more]
         if falls and max(falls) > NEEDED:
             return more[int(np.argmax(falls))]
-        others = [(selection.cost(other)[0], other) for other in selection.others(free)]
+        others = [(linear.cost(other)[0], other) for other in linear.others(free)]
         cost, other = min(others, default=(np.inf, []))
-        return other if cost < selection.cost(free)[0] - NEEDED else None
+        return other if cost < linear.cost(free)[0] - NEEDED else None
 
-    def _examined(self, problem: JointProblem) -> Examined:
+    def _examined(self, problem: JointProblem) -> Linear:
         """What some of the pulses say of all parameters, also of those that are fixed."""
         parameters = problem.parameters
         fixed = [i for i in self._all if i not in parameters.free]
         few = first(self._functions, LOOKED_AT_WITH)
         problem.nearby = problem.nearby.again(problem.nearby.outdated(fixed), events(few))
         chain, at = parameters.chain.response, parameters.coordinates
-        information, selection = self._looked(
-            self._problem(chain, problem.nearby, self._all, few, at=at)
-        )
-        here, _ = selection.cost(parameters.free)
-        promised = {i: here - selection.cost([*parameters.free, i])[0] for i in fixed}
-        return Examined(information, selection, promised)
+        return self._looked(self._problem(chain, problem.nearby, self._all, few, at=at))
 
-    def _looked(self, problem: JointProblem) -> tuple[Information, Selection]:
+    def _looked(self, problem: JointProblem) -> Linear:
         """What all pulses, and each half of them, tell of the free parameters."""
         parameters, vector = problem.parameters, problem.parameters.vector()
         residuals, jacobian, _ = problem.both(vector)
@@ -292,19 +278,20 @@ class Search:
         for k in range(2):
             half = [functions.some(slice(k, None, 2)) for functions in problem.functions]
             halves.append(replace(problem, functions=half).residuals(vector))
-        selection = Selection(
+        return Linear(
             jacobian,
             residuals,
             np.array(halves)[:, : problem.moments],
             parameters.coordinates[parameters.free],
+            parameters.widths,
+            sum(functions.pairs for functions in problem.functions),
         )
-        return Information.of(problem, jacobian), selection
 
     def _ended(
         self,
         problem: JointProblem,
         before: JointProblem,
-        examined: Examined,
+        linear: Linear,
         **facts: Any,
     ) -> tuple[JointProblem, CalibratedPhysics]:
         """The result, without the sampling noise of the simulated events."""
@@ -326,18 +313,17 @@ class Search:
             spread=spread,
             errors_scaled_by=scale,
         )
-        selection, free, lines = examined.selection, parameters.free, []
-        others = [] if self.chosen else [*selection.others(free)]
-        for other in sorted(others, key=lambda other: selection.cost(other)[0])[:MAX_OTHERS]:
-            cost, place = selection.cost(other)
-            if (rise := cost - selection.cost(free)[0]) < SAME:
+        free, lines = parameters.free, []
+        others = [] if self.chosen else [*linear.others(free)]
+        for other in sorted(others, key=lambda other: linear.cost(other)[0])[:MAX_OTHERS]:
+            cost, place = linear.cost(other)
+            if (rise := cost - linear.cost(free)[0]) < SAME:
                 values = physics.values(place).items()
                 sizes = [f"{n} {v:.4g}" for i, (n, v) in enumerate(values) if i in other]
                 lines.append(f"{', '.join(sizes)} (chi-square {rise:+.1f})")
         facts |= {"others": lines, "pulls_before": pulls_before.tolist()}
         facts["pulls_after"] = pulls_after.tolist()
-        of_all = examined.information, examined.promised
-        return problem, described(problem, covariance, chi, *of_all, **facts)
+        return problem, described(problem, covariance, chi, linear, **facts)
 
     def _tell(
         self, when: str, problem: JointProblem, chi_square: float, end: Parabola | None = None
