@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import scipy.fft
 
-from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
@@ -152,16 +151,6 @@ def test_a_drift_as_simulated_is_not_stretched(problem: Problem, near: Told) -> 
     response, fit, _ = problem.fit(0, "training.drift_terms=2")
     assert response.drift is None
     assert fit == near.fit
-
-
-@pytest.mark.slow
-def test_a_ringing_is_found_with_few_pulses() -> None:
-    ringing = {"frequency_MHz": 5.0, "fraction": 0.285, "damping_ns": 160.0}
-    rings = measured_with(Electronics.model_validate(CHAIN.model_dump() | {"ringing": ringing}))
-    few = Problem(rings.sim[:300], rings.data[:250], rings.noise)
-    response, fit, _ = few.fit(0, "training.start_factors=[1]")
-    assert response.config.deviations
-    assert fit.checks.good
 
 
 def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None:

@@ -250,7 +250,8 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
         from cpunet.training.network_runs import learned_residuals
 
         residuals, gains, of_networks = learned_residuals(job, recipe, chain, iren)
-        info, records = info.model_copy(update={"gains": info.gains | gains}), of_networks
+        info = info.model_copy(update={"gains": info.gains | gains})
+        records = of_networks or records
         for part, gain in gains.items():
             log.info(f"{part}: {gain}")
         parts |= residuals
