@@ -34,7 +34,7 @@ def calibrated(values=(), degenerate=False) -> CalibratedPhysics:
     problem = SimpleNamespace(
         parameters=parameters,
         nearby=SimpleNamespace(simulator=SimpleNamespace(physics=PHYSICS)),
-        names=("first", "second"),
+        names={"both": ["first", "second"]},
     )
     covariance = 1e-4 * np.eye(len(vector))
     if degenerate:

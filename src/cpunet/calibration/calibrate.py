@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -142,8 +142,15 @@ def calibrate(
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
     _ = settings.matching  # without a chain nothing is calibrated with a detector
-    given = settings, Freedom.of(free, prior), peak, events, require_seed(seed), force
-    act = partial(_planned if plan else _calibrated, given)
+    require_seed(seed)
+    freedom = Freedom.of(free, prior)
+    start: Start = partial(
+        _search, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed
+    )
+    act: Callable[[str, Pair, Path | None], Calibration | Plan]
+    act = partial(_planned, start, force)
+    if not plan:
+        act = partial(_calibrated, start, peak, seed, force)
     if sides[1].table != ALL:
         return act("", sides, target)
     if target is None or CHANNEL not in str(sides[0].path):
@@ -154,16 +161,16 @@ def calibrate(
     return each_channel(paired(*sides), target, act)
 
 
-Given = tuple[Recipe, Freedom, str, int, int, bool]
+Start = Callable[[Pair], tuple[Search, InputSet]]
 
 
 @one_thread_for_matrices()
-def _planned(given: Given, _name: str, pair: Pair, out: Path | None) -> Plan:
+def _planned(start: Start, force: bool, _name: str, pair: Pair, out: Path | None) -> Plan:
     """Forecast how well the pulses of a channel constrain the physics, before any fit."""
     if out is not None:
-        refuse_existing(out, *pair[0].files, *pair[1].files, force=given[-1])
+        refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
     with stage("Planning") as bar:
-        search, _ = _search(pair, *given[:-1])
+        search, _ = start(pair)
         search.simulator.simulated = bar.update
         physics = search.simulator.physics
         bar.total = 2 + 2 * len(physics.nuisances)
@@ -181,19 +188,20 @@ def _planned(given: Given, _name: str, pair: Pair, out: Path | None) -> Plan:
     name = physics.detector.name
     plan = Plan(detector=name, errors_by_name=errors, directions=directions)
     if out is not None:
-        plan.save(out, force=given[-1])
+        plan.save(out, force=force)
     return plan
 
 
 @one_thread_for_matrices()
-def _calibrated(given: Given, _name: str, pair: Pair, out: Path | None) -> Calibration:
+def _calibrated(
+    start: Start, peak: str, seed: int, force: bool, _name: str, pair: Pair, out: Path | None
+) -> Calibration:
     """Calibrate detector and readout of a channel together."""
     assert out is not None
-    _, _, peak, _, seed, force = given
     refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
     keep_freed_memory()
     clock, started = time.perf_counter(), datetime.now(UTC)
-    search, data = _search(pair, *given[:-1])
+    search, data = start(pair)
     with folder_written_aside(out, RUN, force=force) as folder:
         with stage("Calibrating", search.simulations) as bar:
             search.simulator.simulated = bar.update
@@ -235,7 +243,7 @@ def _calibrated(given: Given, _name: str, pair: Pair, out: Path | None) -> Calib
 
 
 def _search(
-    pair: Pair, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
+    pair: Pair, *, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
 ) -> tuple[Search, InputSet]:
     """Read and prepare both sides, of the simulated side some events: search, and the data."""
     selection = parse_selection(peak, recipe.peaks)

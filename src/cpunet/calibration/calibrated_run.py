@@ -138,8 +138,9 @@ class CalibratedPhysics(InfoPart):
         Of all that is compared.
     covariance
         Of the coordinates of the free parameters, in their order.
-    functions, pulls_before, pulls_after
-        Names of the functions, and their deviations in standard deviations.
+    functions, groups, pulls_before, pulls_after
+        Names of the functions, how many of them each group has, and their deviations in
+        standard deviations.
     rounds, settled
         Number of rounds, and whether the physics was unchanged in the last.
     notes
@@ -154,6 +155,7 @@ class CalibratedPhysics(InfoPart):
     chi_square: ChiSquare
     covariance: list[list[float]]
     functions: list[str]
+    groups: dict[str, int]
     pulls_before: list[float]
     pulls_after: list[float]
     rounds: int
@@ -381,11 +383,9 @@ def figures(result: CalibratedPhysics) -> dict[str, Figure]:
 @styled
 def pulls_figure(result: CalibratedPhysics) -> Figure:
     """Pulls of all functions before and after a calibration."""
-    groups = [_group(name) for name in result.functions]
-    names = list(dict.fromkeys(groups))
     figure = Figure(figsize=(9.5, 3.6))
     panel = figure.subplots()
-    x = np.arange(len(groups))
+    x = np.arange(len(result.functions))
     for pulls, colour, label in (
         (result.pulls_before, BEFORE, "as simulated, chain alone"),
         (result.pulls_after, AFTER, "calibrated"),
@@ -393,12 +393,12 @@ def pulls_figure(result: CalibratedPhysics) -> Figure:
         panel.plot(x, pulls, ".", ms=4, color=colour, label=label)
     panel.set_yscale("symlog", linthresh=LINEAR)
     panel.axhspan(-2, 2, color="0.9", zorder=0)
-    starts = [groups.index(name) for name in names]
-    for start in starts[1:]:
-        panel.axvline(start - 0.5, color="0.8", lw=0.8)
-    ends = [*starts[1:], len(groups)]
-    middles = [0.5 * (a + b - 1) for a, b in zip(starts, ends, strict=True)]
-    broken = [re.sub(r" (?=in slices)|(?<=current) ", "\n", name) for name in names]
+    sizes = np.array([*result.groups.values()])
+    ends = np.cumsum(sizes)
+    for end in ends[:-1]:
+        panel.axvline(end - 0.5, color="0.8", lw=0.8)
+    middles = ends - 0.5 * (sizes + 1)
+    broken = [re.sub(r" (?=in slices)|(?<=current) ", "\n", name) for name in result.groups]
     panel.set_xticks(middles, broken, fontsize=8)
     panel.grid(axis="x", visible=False)
     panel.set_ylabel("deviation [standard deviations]\n(symlog scale)")
@@ -427,15 +427,3 @@ def directions_figure(directions: Sequence[Direction]) -> Figure:
     right.axvline(1, color="0.5", lw=0.8)
     right.set_xlabel("error in units of the prior")
     return figure
-
-
-def _group(name: str) -> str:
-    """Group to which a function belongs."""
-    plain = name.split(": ")[-1]
-    if plain.startswith("component") and "amplitude" in plain:
-        return "components with current amplitude"
-    for group in ("samples", "drift time"):
-        if plain.startswith(group):
-            return group
-    kind = "current amplitude" if plain.startswith("current") else "components"
-    return f"{kind} in slices" if "slice" in plain else kind

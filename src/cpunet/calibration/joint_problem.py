@@ -178,9 +178,9 @@ class JointProblem:
         return sum(len(root) for root in self._roots)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the functions."""
-        return tuple(name for functions in self.functions for name in functions.names)
+    def names(self) -> dict[str, list[str]]:
+        """Names of the functions by group."""
+        return {of: own for functions in self.functions for of, own in functions.names.items()}
 
     @property
     def by_chance(self) -> tuple[float, float]:

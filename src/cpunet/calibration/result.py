@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ def described(
         Further fields of `CalibratedPhysics`.
     """
     parameters, physics = problem.parameters, problem.nearby.simulator.physics
-    n, nuisances, names = parameters.n_chain, physics.nuisances, parameters.names
+    n, nuisances = parameters.n_chain, physics.nuisances
     centres, priors = physics.priors(parameters.given)
     errors = np.sqrt(covariance.diagonal()[n:])
     # sampling noise makes those with all free larger, too
@@ -89,11 +90,12 @@ def described(
     return CalibratedPhysics(
         parameters=free,
         fixed=fixed,
-        together=together(names, covariance[n:, n:] / np.outer(widths, widths), off),
+        together=together(parameters.names, covariance[n:, n:] / np.outer(widths, widths), off),
         directions=linear.directions([nuisance.name for nuisance in nuisances]),
         chi_square=chi,
         covariance=covariance[n:, n:].tolist(),
-        functions=list(problem.names),
+        functions=[*chain.from_iterable(problem.names.values())],
+        groups={group: len(names) for group, names in problem.names.items()},
         notes=_notes(free, fixed, chi),
         **facts,
     )

@@ -197,10 +197,8 @@ class ElectronicsResponse(Stored):
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         self.config, self.dt_ns = config, np.array(float(dt_ns))
-        self.log_poles_ns, self.log_decay_us = (
-            np.log(config.poles_ns),
-            np.log([config.decay_us]),
-        )
+        self.log_poles_ns = np.log(config.poles_ns)
+        self.log_decay_us = np.log([config.decay_us])
         self.slow_ns = np.array(config.slow_ns, float)
         self.fast_decays_us = np.array(config.fast_decays_us, float)
         self.slow_weights = np.zeros(len(self.slow_ns))
@@ -267,10 +265,8 @@ class ElectronicsResponse(Stored):
         """
         dt_ns = float(self.dt_ns)
         frequency = np.fft.rfftfreq(padded)
-        image = np.arange(-IMAGES, IMAGES + 1)[:, np.newaxis]
-        everywhere = frequency + image.astype(
-            float
-        )  # (images, frequencies), in units of 1/period
+        image = np.arange(-IMAGES, IMAGES + 1.0)[:, np.newaxis]
+        everywhere = frequency + image  # (images, frequencies), in units of 1/period
         passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
         passed = passed * (1 + self.sharpness / 24 * (2 * math.pi * everywhere) ** 2)
         fast = (_spline(everywhere) * passed).sum(axis=0)

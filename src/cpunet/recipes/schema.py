@@ -233,9 +233,8 @@ class LossConfig(Timed):
     @property
     def edges(self) -> tuple[int, int]:
         """Samples at which the baseline and the rising edge end."""
-        return self.samples(self.baseline_ns), self.samples(
-            self.baseline_ns + self.rising_edge_ns
-        )
+        end_ns = self.baseline_ns + self.rising_edge_ns
+        return self.samples(self.baseline_ns), self.samples(end_ns)
 
 
 class TrainingConfig(Timed):

@@ -58,9 +58,7 @@ class Residual(nn.Module):
         height = pulses.detach().amax(dim=1, keepdim=True).clamp_min(0.1)
         x = pulses.gather(1, index.clamp(0, pulses.shape[1] - 1)) / height
         seen = torch.stack([2 * x[:, 1:] - 1, self.scale * x.diff(dim=1)], dim=1)
-        change: Tensor = (
-            pad(SIZE * self.unet(seen)[:, 0], (1, 0)) * height
-        )  # first 0, then held
+        change: Tensor = pad(SIZE * self.unet(seen)[:, 0], (1, 0)) * height  # begins with 0
         since = torch.arange(1, 1 + pulses.shape[1], device=at.device) - at
         return change.gather(1, since.clamp(0, n))
 
@@ -158,10 +156,8 @@ class Game:
         c, critic, device = settings.training, settings.discriminator, sides.data.pulses.device
         self.weights = window_weights(c.losses, sides.preparation.length).to(device)
         some = self.with_noise(sides.sim.draw(min(SOME, 4 * sides.sim.seen)))
-        real, own = (
-            {"data": sides.data.pulses[: sides.data.seen], "sim": some},
-            sides.preparation,
-        )
+        real, own = {"data": sides.data.pulses[: sides.data.seen]}, sides.preparation
+        real["sim"] = some
         with torch.no_grad():
             self.views = {side: View(side, those, critic, own) for side, those in real.items()}
         critics = {

@@ -358,11 +358,9 @@ def _left_out(inputs: InputSet, side: str) -> Iterator[Finding]:
     selected = len(inputs.prepared) + sum(counts.values())
     for label, n in counts.items():
         if n > LOST * selected or label == Rejection.COPIES.label:
-            text = (
-                f"{inputs.path.name}: {100 * n / selected:.0f} % of the {side} pulses left out"
-            )
+            part = f"{100 * n / selected:.0f} % of the {side} pulses left out ({label})"
             remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
-            yield Finding(Level.WARNING, f"{text} ({label})", remedy)
+            yield Finding(Level.WARNING, f"{inputs.path.name}: {part}", remedy)
 
 
 def _lines(inputs: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:

@@ -155,9 +155,8 @@ def noise_numbers(chain: Chain) -> Numbers:
         return {}
     frequency, density = chain.noise
     # frequency 0 is the baseline; the last represents half a step
-    numbers = {
-        "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
-    }
+    power = (density[1:-1].sum() + density[-1] / 2) * frequency[1]
+    numbers = {"noise_rms_kev": float(np.sqrt(power))}
     low, high = (part * frequency[-1] for part in _PLATEAU)
     plateau = np.median(density[(frequency >= low) & (frequency <= high)])
     smooth = uniform_filter1d(density, _SMOOTHED)
@@ -215,9 +214,8 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
 
 def true_chain_of(electronics: Electronics) -> Chain:
     """The closed form of a true chain."""
-    endless = electronics.model_copy(
-        update={"decays": (Decay(fraction=1, tau_us=_FOREVER_US),)}
-    )
+    forever = Decay(fraction=1, tau_us=_FOREVER_US)
+    endless = electronics.model_copy(update={"decays": (forever,)})
     name = f"true response ({electronics.name})"
     samples, dt_ns = record_samples(electronics.dt_ns), electronics.dt_ns
     power = noise_power(electronics.noise.spectrum, dt_ns, samples)
@@ -247,9 +245,8 @@ def true_parameters(electronics: Electronics) -> Numbers:
     numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
     # an overshoot is a slow part of negative sign
     parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
-    numbers |= slow_numbers(
-        [(part.tau_ns, sign * part.fraction) for part, sign in parts if part]
-    )
+    slow = [(part.tau_ns, sign * part.fraction) for part, sign in parts if part]
+    numbers |= slow_numbers(slow)
     if ring := electronics.ringing:
         numbers["ringing"] = ring.fraction
         numbers["ringing_mhz"] = ring.frequency_MHz

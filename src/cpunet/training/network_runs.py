@@ -53,9 +53,9 @@ def generators(recipe: Recipe, decay: float = 0.0) -> dict[str, Generator]:
     """New generators, with a learned linear part or none; `decay` is the data's per sample."""
     config, preparation = recipe.cyclegan.generator, recipe.preparation
     if config.linear == "none":
-        unets = (PositionalUNet(config, preparation.length) for _ in range(2))
         return {
-            part: Generator(unet) for part, unet in zip(("ren", "iren"), unets, strict=True)
+            part: Generator(PositionalUNet(config, preparation.length))
+            for part in ("ren", "iren")
         }
     response = LearnedResponse(preparation, decay)
     linear = {"ren": response, "iren": LearnedInverse(response)}

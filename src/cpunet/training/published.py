@@ -132,9 +132,8 @@ def _load_state(path: Path) -> State:
             f"{path}: no plain state dict of tensors, or damaged ({type(error).__name__}); "
             "nothing of it was executed"
         ) from error
-    if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
-    ):
+    pairs = state.items() if isinstance(state, dict) else [(None, state)]
+    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
         raise CpunetError(f"{path}: no state dict; give a file such as fep_REN.pt")
     return dict(state)
 
