@@ -111,12 +111,13 @@ class Search:
         nearby = Nearby.about(self.simulator, np.zeros(self._n), self._first)
         response = self._chain()
         before = self._problem(response, nearby, [], held=True)
-        self._tell("as simulated", before, before.compared()[0])
+        chi_square, _ = before.compared()
+        self._tell("as simulated", before, chi_square)
         free = self._first_free(response, nearby)
         problem, end = self._from_far(response, nearby, free)
         if end.chi_square > POOR * problem.moments:  # as if the readout rings
             self._tell("without deviations", problem, end.chi_square, end)
-            response = self._deviated(before, before.compared()[0]) or response
+            response = self._deviated(before, chi_square) or response
             free = self._first_free(response, nearby)
             problem, end = self._from_far(response, nearby, free)
         more, last = 0, np.zeros(self._n)
