@@ -111,24 +111,23 @@ def experiment(
             seed=100 * group + seed,
         )
         search, truth = _search(stand, before, drawn, seed, simulated)
-        calibrated = search.run()
-    at = calibrated.problem.parameters.coordinates
-    covariance = calibrated.covariance[-len(names) :, -len(names) :]
+        problem, result = search.run()
+    at, covariance = problem.parameters.coordinates, np.array(result.covariance)
     errors = np.sqrt(covariance.diagonal())
     return {
         "group": group,
         "seed": seed,
         "pulses": len(search.sets.sim),
-        "chi_square": calibrated.chi_square / calibrated.problem.moments,
-        "by_chance": calibrated.problem.by_chance[0] / calibrated.problem.moments,
-        "rounds": calibrated.rounds,
-        "settled": calibrated.settled,
+        "chi_square": result.chi_square.after / problem.moments,
+        "by_chance": problem.by_chance[0] / problem.moments,
+        "rounds": result.rounds,
+        "settled": result.settled,
         "seconds": time.perf_counter() - begun,
         "parameters": {
             n.name: {"found": float(x), "true": float(t), "error": float(e), "prior": float(w)}
             for n, x, t, e, w in zip(nuisances, at, truth, errors, widths, strict=True)
         },
-        "covariance": covariance.tolist(),
+        "covariance": result.covariance,
     }
 
 

@@ -35,7 +35,7 @@ def settings(**more: float) -> SimulationSettings:
 
 def told(undecayed: StepResponse, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A/E, and late charge in ns: area missing after 80 % of the charge at 10 us."""
-    step = undecayed.step(np.arange(LENGTH, dtype=float))
+    step = undecayed(np.arange(LENGTH, dtype=float))
     size = scipy.fft.next_fast_len(2 * LENGTH, real=True)
     impulse = scipy.fft.rfft(np.diff(step, prepend=0.0), size)
     signal = scipy.fft.irfft(scipy.fft.rfft(fine.astype(float), size) * impulse, size)

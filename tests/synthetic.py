@@ -227,6 +227,20 @@ def write_files(folder: Path, kev: npt.ArrayLike) -> Files:
     return Files(PulseFile(folder / "sim.lh5"), PulseFile(folder / "data.lh5"))
 
 
+def write_line(
+    path: Path, seed: int, pole: float | None, dt_ns: float = DT_NS, n: int = 240
+) -> PulseFile:
+    """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
+    rng = np.random.default_rng(seed)
+    pulses = phased_edges(n, rng, 450, 1100)
+    if pole is not None:
+        decayed = after_pole(pulses, pole, 90) * decay(450, 4000, 1100)
+        pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
+    kev = np.full(n, 2614.5)
+    write_pulses(path, Pulses.of(pulses, dt_ns=dt_ns, energy_kev=kev), table="geds/raw")
+    return PulseFile(path)
+
+
 def write_sides(folder: Path, sim_kev: Values, dead: int | None = None) -> None:
     """Files of both sides, all measured pulses of one energy; a simulated one may be empty."""
     rng, n = np.random.default_rng(1), len(sim_kev)

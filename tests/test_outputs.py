@@ -11,7 +11,6 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import (
     MARKER,
     FolderKind,
-    copy_own,
     folder_written_aside,
     mark,
     refuse_existing,
@@ -190,12 +189,10 @@ def test_a_linked_folder_is_replaced_in_its_place(tmp_path):
     assert tree(tmp_path / "disk") == {"run/run.json": "new"}
 
 
-def test_own_files_are_removed_and_copied_alone(tmp_path):
+def test_own_files_are_removed_alone(tmp_path):
     run = tmp_path / "run"
     make(run, run_json="a", log__b="b")
     (run / "mine").write_text("mine")
-    copy_own(run, tmp_path / "copy", RUN)
-    assert tree(tmp_path / "copy") == {"log/b": "b", "run.json": "a"}
     remove_own(run, RUN)
     assert tree(run) == {"mine": "mine"}
     (run / "mine").unlink()

@@ -121,14 +121,6 @@ def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:
     (folder / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def copy_own(folder: Path, to: Path, kind: FolderKind) -> None:
-    """Copy the files whose names match ``own`` of the kind from one folder to another."""
-    for name in _names(folder):
-        if re.fullmatch(kind.own, name):
-            (to / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(folder / name, to / name)
-
-
 def remove_own(folder: Path, kind: FolderKind) -> None:
     """Remove the program's files from a folder, and the folder if nothing else is in it."""
     own = re.compile(f"{kind.own}|{re.escape(MARKER)}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import numpy as np
 import pytest
 
@@ -20,27 +22,34 @@ def functions() -> SlicedJoint:
     return SlicedJoint(sides)
 
 
+def names_of(functions: SlicedJoint) -> list[str]:
+    return [*chain.from_iterable(functions.names.values())]
+
+
 def values_of(functions, words):
     """Values of the functions whose names begin so, for the measured pulses."""
-    chosen = [i for i, name in enumerate(functions.names) if name.startswith(words)]
+    chosen = [i for i, name in enumerate(names_of(functions)) if name.startswith(words)]
     assert chosen
     return functions.data[:, chosen]
 
 
 def test_each_function_has_a_name(functions):
-    plain = Joint(functions.sides)
-    assert functions.data.shape == (len(functions.sides.data), len(functions.names))
-    assert len(set(functions.names)) == len(functions.names)
+    plain, names = Joint(functions.sides), names_of(functions)
+    assert functions.data.shape == (len(functions.sides.data), len(names))
+    assert len(set(names)) == len(names)
     n = plain.data.shape[1]
     assert np.array_equal(functions.data[:, :n], plain.data)
-    assert len(functions.names) == n + DENSITY + (OTHERS + AMPLITUDES) * SLICES
+    assert len(names) == n + DENSITY + (OTHERS + AMPLITUDES) * SLICES
     of_band = SlicedJoint(functions.sides, band="FEP")
-    assert of_band.names[0] == f"FEP: {functions.names[0]}"
+    assert names_of(of_band)[0] == f"FEP: {names[0]}"
+    assert next(iter(of_band.names)) == "FEP: samples"
 
 
 def test_slices_multiply_components_and_amplitudes(functions):
     """All slices are numbers of the drift time times what is sliced."""
-    second, third = (functions.data[:, functions.names.index(f"component {c}")] for c in (2, 3))
+    second, third = (
+        functions.data[:, names_of(functions).index(f"component {c}")] for c in (2, 3)
+    )
     slices = [values_of(functions, f"component {c}, slice") for c in (2, 3)]
     np.testing.assert_allclose(
         slices[0] * third[:, None], slices[1] * second[:, None], atol=1e-9

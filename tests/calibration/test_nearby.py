@@ -58,19 +58,6 @@ def test_derivatives_follow_the_edge(simulator):
     assert followed < 0.5 * stale
 
 
-def test_at_its_centre_nothing_is_added(simulator):
-    centre = np.array([1.0, 0.0, 0.0])
-    nearby = Nearby.about(simulator, centre, [])
-    assert np.array_equal(nearby.at(centre), simulator.exact(centre))
-    assert np.array_equal(nearby.at(centre, 7), simulator.exact(centre)[:7])
-
-
-def test_self_repulsion_is_never_negative(simulator):
-    """Below 0 there is none; its slope is that upwards."""
-    nearby = Nearby.about(simulator, np.zeros(3), [2])
-    assert np.abs(nearby.slopes[2]).max() > 0
-
-
 def test_only_derivatives_from_afar_are_simulated_again():
     base, far, reach = np.zeros((4, 2)), np.array([2.0, 0.1, 0.0]), np.ones(3)
     near = np.array([1.5, 0.1, 0.0])
@@ -80,8 +67,8 @@ def test_only_derivatives_from_afar_are_simulated_again():
         2: Derivative(base[:3], far, np.zeros(3)),
     }
     nearby = Nearby(None, far, base, known)
-    assert nearby.outdated([0, 1, 2], reach) == [1, 2]  # the last of too few events
-    assert nearby.outdated([1], reach) == []  # what is not free does not count
+    assert nearby.outdated([0, 1, 2], reach, 4) == [1, 2]  # the last of too few events
+    assert nearby.outdated([1], reach, 4) == []  # what is not free does not count
     assert Nearby(None, far, base, {}).outdated([0], reach) == [0]
 
 

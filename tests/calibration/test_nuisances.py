@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -61,14 +59,6 @@ def test_a_given_prior_is_told_as_it_was_given(nuisance, factor, error):
     i = NUISANCES.index(nuisance)
     centres, widths = PHYSICS.priors({nuisance.name: (value, error)})
     assert PHYSICS.in_own_unit(i, centres[i], widths[i]) == pytest.approx((value, error))
-
-
-def test_priors_are_the_defaults_or_those_given():
-    some = replace(PHYSICS, nuisances=(named("temperature"), named("impurity_factor")))
-    assert some.priors({})[0].tolist() == [0, 0]
-    centres, widths = some.priors({"impurity_factor": (1.1, 0.011)})
-    assert centres == pytest.approx([0, np.log(1.1)])
-    assert widths == pytest.approx([3.0, 0.01])
 
 
 def test_what_is_not_known_or_possible_is_refused():

@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cpunet.calibration.identifiability import Information
+from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
+from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.joint_problem import JointParameters
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.result import Calibrated, described
+from cpunet.calibration.result import described
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
@@ -21,12 +22,10 @@ NUISANCES = tuple(named(name) for name in SHORT)
 PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
 
 
-def calibrated(values=(), given=None) -> Calibrated:
+def calibrated(values=(), degenerate=False) -> CalibratedPhysics:
     """A calibration that ended at these values, in their order; others are as simulated."""
     response = ElectronicsResponse(load_recipe("fast").matching[0], 16.0)
-    parameters = JointParameters(
-        response, PHYSICS, np.zeros(5), range(5), given or {}, response
-    )
+    parameters = JointParameters(response, PHYSICS, np.zeros(5), range(5), {}, response)
     vector = parameters.vector()
     for i, value in enumerate(values):
         nominal = PHYSICS.nominal(NUISANCES[i])
@@ -35,30 +34,27 @@ def calibrated(values=(), given=None) -> Calibrated:
     problem = SimpleNamespace(
         parameters=parameters,
         nearby=SimpleNamespace(simulator=SimpleNamespace(physics=PHYSICS)),
-        moments=2,
-        names=("first", "second"),
-        by_chance=(2.0, 0.5),
-        pulls=lambda: np.zeros(2),
-        residuals=lambda at: at - vector,
+        names={"both": ["first", "second"]},
     )
-    return Calibrated(
-        problem=problem,
-        covariance=1e-4 * np.eye(len(vector)),
-        chi_square_before=9.0,
-        pulls_before=np.zeros(2),
-        chi_square=2.0,
-        scale=1.0,
-        information=Information(NUISANCES, np.eye(5), np.ones(5), 100.0),
-        promised={},
-        rounds=1,
-        settled=True,
+    covariance = 1e-4 * np.eye(len(vector))
+    if degenerate:
+        n, widths = parameters.n_chain, parameters.widths[parameters.n_chain :][:2]
+        shares = np.array([[1, -0.99], [-0.99, 1]])
+        covariance[n : n + 2, n : n + 2] = 0.64 * shares * np.outer(widths, widths)
+    chi = ChiSquare(
+        before=9.0, after=2.0, moments=2, expected=2.0, spread=0.5, errors_scaled_by=1.0
     )
+    facts = {"others": [], "pulls_before": [0.0], "pulls_after": [0.0]}
+    facts |= {"rounds": 1, "settled": True}
+    none = np.zeros((2, 5))
+    linear = Linear(np.eye(5), np.zeros(5), none, np.zeros(5), np.ones(5), 100.0)
+    return described(problem, covariance, chi, linear, **facts)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_a_parameter_at_its_bound_is_told(factor):
     """Rounding in a coordinate does not hide it."""
-    told = described(calibrated((85.0, factor))).notes
+    told = calibrated((85.0, factor)).notes
     assert any(
         "the fit uses impurity_factor" in note and "at its bound" in note for note in told
     )
@@ -77,7 +73,7 @@ def test_a_parameter_at_its_bound_is_told(factor):
 )
 def test_what_cannot_be_is_no_finding(values, name, why):
     """In remarks, numbers, and the files that hold the physics."""
-    result = described(calibrated(values))
+    result = calibrated(values)
     doubts = {n: each.doubt for n, each in result.parameters.items() if each.doubt}
     assert [*doubts] == [name]
     assert why in doubts[name]
@@ -92,20 +88,8 @@ def test_what_cannot_be_is_no_finding(values, name, why):
     assert result.comment.count("\n") == 1
 
 
-def test_what_can_be_is_a_finding():
-    result = described(calibrated((93.9, 1.1, 0.4, 1.0, 0.11)))
-    assert not any(each.doubt for each in result.parameters.values())
-    assert not result.comment
-    assert not result.together
-
-
 def test_of_a_degenerate_pair_the_direction_is_told():
-    one = calibrated((93.0, 1.05))
-    n = one.problem.parameters.n_chain
-    (t, i), widths = (n, n + 1), one.problem.parameters.widths
-    for a, b, share in ((t, t, 1.0), (i, i, 1.0), (t, i, -0.99), (i, t, -0.99)):
-        one.covariance[a, b] = 0.64 * share * widths[a] * widths[b]
-    (pair,) = described(one).together
+    (pair,) = calibrated((93.0, 1.05), degenerate=True).together
     assert pair.components == pytest.approx(
         {"temperature_K": 0.5**0.5, "impurity_factor": 0.5**0.5}
     )

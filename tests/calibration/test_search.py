@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.calibration.identifiability import Selection
+from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.nuisances import (
     Freedom,
     Physics,
@@ -33,9 +33,6 @@ def test_a_search_that_goes_back_and_forth_ends_between(slope, begin):
         last = _relaxed((slope - 1) * where, last)
         where = where + last
     assert abs(where[0]) < 1e-9 * begin
-
-
-def test_a_search_that_goes_on_is_not_held():
     assert _relaxed(np.array([1.0, -2.0]), np.array([3.0, 0.0])).tolist() == [1.0, -2.0]
 
 
@@ -53,40 +50,19 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch):
     assert not len(known_depletion(physics, None)(np.zeros(2)))
 
 
-def test_only_physics_that_explain_the_pulses_as_well_are_fitted():
-    """Of three parameters the second acts as the first one, which has moved by ten errors."""
-    columns = np.array([[10.0, 9.9, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 3.0]])
-    selection = Selection(columns, np.zeros(3), np.zeros((2, 3)), np.array([1.0, 0, 0]))
-    fitted = []
-
-    def problem(response, nearby, free, weights=()):
-        fitted.append((free, nearby.centre))
-        parameters = SimpleNamespace(
-            chain=SimpleNamespace(response=response),
-            coordinates=nearby.centre,
-            free=free,
-            n_chain=0,
-        )
-        parameters.widths = np.full(len(free), np.inf)
-        end = SimpleNamespace(information=np.eye(len(free)))
-        return SimpleNamespace(
-            parameters=parameters, nearby=nearby, weights=weights, fitted=lambda: end
-        )
-
-    found = Search.__new__(Search)
-    found.chosen = False
-    found.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
-    found._moved = lambda nearby, move, *_: SimpleNamespace(centre=nearby.centre + move)
-    found._problem = problem
-    here = problem("chain", SimpleNamespace(centre=np.array([1.0, 0, 0])), [0])
-    (only,) = found._alternatives(here, selection)
-    assert only[0].parameters.free == [1]
-    # the first one is as simulated, the second one where a linear fit has it
-    expected = np.linalg.lstsq(columns[:, 1:2], np.array([10.0, 0, 0]))[0]
-    assert only[0].parameters.coordinates == pytest.approx([0, *expected, 0])
-    assert [free for free, _ in fitted[1:]] == [[1]]
-    found.chosen = True  # by the user
-    assert not found._alternatives(here, selection)
+def test_a_parameter_that_explains_the_pulses_better_takes_the_place_of_another():
+    """The first has moved by ten errors; the second acts as the pulses ask for."""
+    halves, at = np.zeros((2, 3)), np.array([1.0, 0, 0])
+    columns = np.array([[10.0, 9.9, 0.0], [6.0, 0.0, 1.0], [0.0, 0.0, 3.0]])
+    search = Search.__new__(Search)
+    search.simulator = SimpleNamespace(physics=SimpleNamespace(nuisances=range(3)))
+    search._all = [0, 1, 2]
+    better, none = (
+        Linear(columns, np.array([0.0, size, 0.0]), halves, at, np.full(3, 1e6), 100.0)
+        for size in (6.0, 0.0)
+    )
+    assert search._better(better, [0]) == [1]
+    assert search._better(none, [0]) is None
 
 
 @pytest.mark.parametrize(

@@ -38,15 +38,6 @@ def test_positional_map_against_the_formula(channels, samples, offset):
             assert float(values[0, channel, sample]) == pytest.approx(truth, abs=1e-6)
 
 
-def test_a_map_is_added_before_the_dropout():
-    network = PositionalUNet(narrow(dropout=0.5), 64).eval()
-    module = network.maps_down[0]
-    x = torch.randn(2, 4, 64)
-    assert torch.equal(module(x), x + module.values)
-    dropped = module.train()(torch.full((2, 4, 64), 5.0)) == 0
-    assert 0.3 < float(dropped.float().mean()) < 0.7
-
-
 def test_a_seeded_draw_comes_again():
     network = PositionalUNet(narrow(), 64).eval()
     pulses = torch.randn(2, 1, 64)

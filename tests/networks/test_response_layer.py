@@ -12,7 +12,7 @@ from cpunet.electronics.readout import linear_response
 from cpunet.networks.response_layer import (
     DriftClock,
     ElectronicsResponse,
-    fast_length,
+    padded_length,
 )
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ResponseConfig
@@ -101,7 +101,7 @@ def test_at_a_sharpness_of_one_samples_are_points():
 def test_a_step_is_that_of_the_exact_chain_averaged_over_the_period():
     chain = electronics((55.0, 35.0))
     samples = 600
-    padded = fast_length(4 * samples)
+    padded = padded_length(3 * samples)
     spectrum = layer((55.0, 35.0)).transfer(padded)
     got = scipy.fft.irfft(spectrum, padded)[:samples]
     within = (np.arange(64) + 0.5) / 64
@@ -114,17 +114,10 @@ def test_a_step_is_that_of_the_exact_chain_averaged_over_the_period():
     assert abs((got - wanted)[:40].sum()) < 40 * 2.5e-4
 
 
-def test_records_have_room_and_nothing_wraps_around():
-    pulses = windows(fine_pulses(20))
-    records = layer((40.0, 40.0))(pulses)
-    assert records.shape == (3, PADDING_BEFORE + SAMPLES + PADDING_AFTER)
-    assert records.dtype == np.float32
-    assert np.abs(records[:, :PADDING_BEFORE]).max() < 2e-5
-
-
 def test_pulses_of_any_height_and_time():
     response = layer((40.0, 40.0))
     pulses = windows(fine_pulses(20))
+    assert np.abs(response(pulses)[:, :PADDING_BEFORE]).max() < 2e-5  # nothing wraps around
     later = np.pad(pulses, ((0, 0), (7, 0)))[:, :SAMPLES]
     records, moved = response(pulses), response(3 * later)
     np.testing.assert_allclose(moved[:, 7:-7], 3 * records[:, :-14], atol=1e-5)
@@ -150,11 +143,6 @@ def pulses(
 ) -> npt.NDArray[np.float32]:
     before = 1e-3 * dt_ns * (END - np.arange(samples))
     return np.stack([rise(before, u) for u in long_us]).astype(np.float32)
-
-
-def test_nothing_changes_at_the_start():
-    given = pulses(0.3, 1.0, 2.0)
-    np.testing.assert_array_equal(clock(0, 0)(given, dt_ns=DT_NS), given)
 
 
 @pytest.mark.parametrize("stretch", [0.05, -0.05])
@@ -191,8 +179,3 @@ def test_a_template_may_keep_its_begin():
     long_us = 4e-3 * took
     expected = took * 1.1 / (1 - 0.05 * long_us)
     assert int((found >= 0.999).argmax()) - begin == pytest.approx(expected, abs=1.5)
-
-
-def test_pulses_without_charge_pass():
-    nothing = np.zeros((2, 800), np.float32)
-    np.testing.assert_array_equal(clock(0.1)(nothing, dt_ns=DT_NS), nothing)

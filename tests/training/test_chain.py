@@ -100,17 +100,6 @@ def test_files_are_translated_in_both_directions(
         assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
 
 
-def test_rows_without_energy_are_counted(run: Run, tmp_path: Path) -> None:
-    sim = sampled(charge(6, seed=5), FINE)
-    energies = np.array([KEV, np.nan, KEV, 0.0, KEV, KEV])
-    path = tmp_path / "sim.lh5"
-    write_pulses(path, Pulses.of(sim, dt_ns=DT_NS, energy_kev=energies))
-    told = translate(run.folder, path, tmp_path / "a.lh5").counts
-    assert told == Counts(6, 4, {"energy_unknown": 2})
-    told = translate(run.folder, path, tmp_path / "b.lh5", noise=False).counts
-    assert told == Counts(6, 6)
-
-
 @pytest.mark.thorough
 def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
@@ -135,28 +124,6 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     # without tails the noise is that of empty baselines
     prepared = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * prepared, rel=0.07)
-
-
-def test_data_without_tails_are_given_none(run: Run) -> None:
-    assert run.fit.tails.rate_khz == 0
-    assert dict(run.summary())["pile-up tails"] == "none significant"
-    tails = REN.load(run.folder).tails
-    assert tails is not None
-    assert tails.law.rate_khz == 0
-
-
-@pytest.mark.thorough
-def test_a_simulation_of_other_physics_is_told(
-    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    # edges of many widths, as no pole makes them of the right ones
-    other = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, slowest=12.0), FINE))
-    recipe = load_recipe("fast", [*ONE_START, *SHORT])
-    made = train(other, files.data, tmp_path / "run", recipe=recipe, device="cpu")
-    fit = made.fit.model_dump()
-    assert not made.fit.checks.good
-    (said,) = (note for note in caplog.messages if note.startswith("the fit is bad"))
-    assert fit["verdict"] in said
 
 
 @pytest.mark.thorough

@@ -117,7 +117,7 @@ def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
         true_chain_of(CHAIN),
     ):
         half_ns = reaches_ns(chain, 0.5)
-        steps.append(chain.whole.step(time_ns + half_ns) / chain.whole.step(3000.0))
+        steps.append(chain.step(time_ns + half_ns) / chain.step(3000.0))
     assert np.abs(steps[0] - steps[1]).max() < 0.002
     assert np.abs(steps[2] - steps[1]).max() > 0.008
 
@@ -180,7 +180,7 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
     step = np.float32(np.arange(1600) >= 400)[np.newaxis]
     record = own(step)[0][padding(DT_NS)[0] + 400 :]
     time_ns = (np.arange(1000) + 0.5) * DT_NS
-    closed = learned_chain(copy.deepcopy(own), "").whole.step(time_ns)
+    closed = learned_chain(copy.deepcopy(own), "").step(time_ns)
     np.testing.assert_allclose(record[30:1000], closed[30:], atol=3e-4)
     assert own.describe()["deviation"] == pytest.approx(0.014)
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training import network_runs
-from cpunet.training.network_runs import Scale
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.export import export_onnx
@@ -19,12 +15,10 @@ from cpunet.translation.translator import IREN, REN
 from cpunet.validation.run_figures import loss_curves
 from games import SMALL
 from synthetic import (
-    after_pole,
-    decay,
     load_recipe,
     phased_edges,
     require_drawn,
-    write_pulses,
+    write_line,
 )
 
 SHORT = (
@@ -41,22 +35,10 @@ GAME = (
 RECIPE = load_recipe("cpunet", [*SHORT, *GAME])
 
 
-def write(path: Path, seed: int, pole: float | None, n: int = 240) -> PulseFile:
-    """Pulses of 2614.5 keV; behind a pole (samples) and a decay, with noise, if measured."""
-    rng = np.random.default_rng(seed)
-    pulses = phased_edges(n, rng, 450, 1100)
-    if pole is not None:
-        decayed = after_pole(pulses, pole, 90) * decay(450, 4000, 1100)
-        pulses = np.round(1000 + 26000 * decayed + rng.normal(0, 20, decayed.shape))
-    kev = np.full(n, 2614.5)
-    write_pulses(path, Pulses.of(pulses, dt_ns=16.0, energy_kev=kev), table="geds/raw")
-    return PulseFile(path)
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> tuple[PulseFile, PulseFile]:
     folder = tmp_path_factory.mktemp("files")
-    return write(folder / "sim.lh5", 1, None), write(folder / "data.lh5", 2, 4.0)
+    return write_line(folder / "sim.lh5", 1, None), write_line(folder / "data.lh5", 2, 4.0)
 
 
 def test_with_few_pulses_it_is_the_readout_alone(files, tmp_path, caplog):
@@ -76,7 +58,7 @@ def kept(files, tmp_path_factory) -> Run:
     out = tmp_path_factory.mktemp("kept") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network_runs, "ENOUGH", 100)
-        patch.setattr(Scale, "of", lambda best, gain, error, text: Scale(0.5, f"used; {text}"))
+        patch.setattr(network_runs, "_scale", lambda *of: (0.5, f"used; {of[-1]}"))
         return train(*files, out, recipe=RECIPE, device="cpu")
 
 
@@ -125,7 +107,7 @@ def test_losses_and_accuracies_are_drawn(kept):
 
 @pytest.mark.parametrize(("gain", "scale"), [(-0.1, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.5)])
 def test_what_gains_by_two_standard_errors_is_used(gain, scale):
-    assert Scale.of(1, gain, 0.1, "AUC") == (
+    assert network_runs._scale(1, gain, 0.1, "AUC") == (
         scale,
         f"{'used, scaled by 0.5' if scale else 'left out'}; AUC",
     )

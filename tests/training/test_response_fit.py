@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import scipy.fft
 
-from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
@@ -35,7 +34,6 @@ from unpaired import (
     simulated,
 )
 
-STARTS = ["near", pytest.param("far", marks=pytest.mark.slow)]
 STEP = 0.02  # in widths of the priors
 FEW = ("generator.slow_ns=[400]", "generator.fast_decays_us=[]")
 RECIPE = load_recipe("fast", FEW)
@@ -68,12 +66,6 @@ def near(problem: Problem) -> Told:
     return problem.fit(0)
 
 
-@pytest.fixture(scope="module")
-def far(problem: Problem) -> Told:
-    """Other noise, and a start with three times the bandwidth that there is."""
-    return problem.fit(1, "generator.poles_ns=[20, 10]")
-
-
 def rise_ns(step: np.ndarray) -> float:
     """From 10 to 90 % of the highest, for a step sampled every ns."""
     step = step[: int(step.argmax())] / step.max()
@@ -87,23 +79,16 @@ def learned_rise_ns(response: ElectronicsResponse) -> float:
     return rise_ns(scipy.fft.irfft(fine.transfer(16_384), 16_384)[:4000])
 
 
-@pytest.mark.parametrize("which", STARTS)
-def test_the_chain_is_found(request, which: str) -> None:
-    found: Told = request.getfixturevalue(which)
+def test_the_chain_is_found_and_errors_cover_the_truth(near: Told) -> None:
+    response, numbers, errors = near.response, near.response.describe(), near.fit.errors
     true_rise = rise_ns(CHAIN.transfer.step(np.arange(4000.0)))
-    assert learned_rise_ns(found.response) == pytest.approx(true_rise, rel=0.02)
-    numbers = found.response.describe()
+    assert learned_rise_ns(response) == pytest.approx(true_rise, rel=0.02)
     assert numbers["decay_us"] == pytest.approx(80, rel=0.01)
-    assert numbers["slow_400_ns"] == pytest.approx(0.065, rel=0.05)
-    assert found.fit.chi_square < 1.6 * found.fit.moments
-
-
-@pytest.mark.parametrize("which", STARTS)
-def test_the_errors_cover_the_truth(request, which: str) -> None:
-    found: Told = request.getfixturevalue(which)
-    numbers, errors = found.response.describe(), found.fit.errors
+    of_edges = edge_errors(response)
+    assert np.median(of_edges) < 1e-3
+    assert np.quantile(of_edges, 0.95) < 5e-3
     # which of the two poles is the longer is a matter of the start
-    poles = np.sort(found.response.log_poles_ns)
+    poles = np.sort(response.log_poles_ns)
     pole_errors = sorted((errors["log_poles_ns.1"], errors["log_poles_ns.2"]), reverse=True)
     assert (np.abs(poles - np.log([35, 55])) < 4 * np.array(pole_errors)).all()
     assert abs(numbers["slow_400_ns"] - 0.065) < 4 * errors["slow_weights.1"]
@@ -112,12 +97,6 @@ def test_the_errors_cover_the_truth(request, which: str) -> None:
     # and they are no excuse: the set fixes each within a few percent
     assert max(pole_errors) < 0.1
     assert errors["slow_weights.1"] < 0.002
-
-
-def test_edges_are_those_of_the_true_chain(near: Told) -> None:
-    errors = edge_errors(near.response)
-    assert np.median(errors) < 1e-3
-    assert np.quantile(errors, 0.95) < 5e-3
 
 
 def test_what_a_fit_tells(near: Told) -> None:
@@ -132,16 +111,6 @@ def test_what_a_fit_tells(near: Told) -> None:
     pulls = np.abs(list(near.fit.pulls.values()))
     assert np.sqrt((pulls**2).mean()) < 1.6
     assert pulls.max() < 5
-
-
-@pytest.mark.thorough
-def test_the_same_seed_gives_the_same_fit(problem: Problem) -> None:
-    short = ("training.steps=1", "training.search_pulses=250", "training.start_factors=[1]")
-    few = Problem(problem.sim[:250], problem.data[:250], problem.noise)
-    first, again, other = (few.fit(seed, *short) for seed in (5, 5, 6))
-    assert first[0].describe() == again[0].describe()
-    assert first[1] == again[1]
-    assert first[0].describe() != other[0].describe()
 
 
 DRIFT = ("training.drift_terms=2", "training.start_factors=[1]")

@@ -13,7 +13,7 @@ from torch import nn
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.training.run import FORMAT, WEIGHTS, Run, append_losses, read_losses, used_run
+from cpunet.training.run import FORMAT, WEIGHTS, Run, used_run
 from games import untrained
 from synthetic import one_line, write_run
 
@@ -113,12 +113,12 @@ def test_weights_that_are_no_numbers(run, recipe, change, message):
 
 def test_a_damaged_log(run):
     (run / "losses.jsonl").write_text('{"iteration": 0')
-    one_line(lambda: read_losses(run), "losses.jsonl: damaged")
+    one_line(lambda: Run.load(run).records, "losses.jsonl: damaged")
 
 
 def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_factory):
-    (record,) = records = [{"iteration": 1, "rate": 0.1, "losses": {"cycle": 2.0, "gan": 1.0}}]
-    append_losses(run, records)
+    record = {"iteration": 1, "rate": 0.1, "losses": {"cycle": 2.0, "gan": 1.0}}
+    (run / "losses.jsonl").write_text(json.dumps(record) + "\n")
     known, copy = Run.load(run), tmp_path_factory.mktemp("saved") / "copy"
     assert known.losses.to_dict("records") == [
         {"iteration": 1, "rate": 0.1, **record["losses"]}

@@ -5,11 +5,9 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from cpunet.calibration.calibrated_run import (
     Calibration,
     ExpectedErrors,
     Plan,
+    figures,
 )
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import (
@@ -32,11 +31,9 @@ from cpunet.calibration.nuisances import (
     require_depletion,
     titled,
 )
-from cpunet.calibration.result import described
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import drawn_like, noise_of, tails_of
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
@@ -52,14 +49,12 @@ from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed, yaml_text
-from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_sources import HitFile
-from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import StoredSimulation, simulate
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.job import TrainingJob, train_chain
 from cpunet.training.pulse_sets import MIN_PULSES, PulseSets
-from cpunet.training.run import RUN, Run
+from cpunet.training.run import RUN
 
 log = logging.getLogger(__name__)
 
@@ -147,9 +142,15 @@ def calibrate(
         refuse_inputs(target, recipe)
     settings = load_recipe(recipe)
     _ = settings.matching  # without a chain nothing is calibrated with a detector
-    freedom, act = Freedom.of(free, prior), _planned if plan else _calibrated
-    given = settings, freedom, peak, events, require_seed(seed), force
-    act = partial(act, given)
+    require_seed(seed)
+    freedom = Freedom.of(free, prior)
+    start: Start = partial(
+        _search, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed
+    )
+    act: Callable[[str, Pair, Path | None], Calibration | Plan]
+    act = partial(_planned, start, force)
+    if not plan:
+        act = partial(_calibrated, start, peak, seed, force)
     if sides[1].table != ALL:
         return act("", sides, target)
     if target is None or CHANNEL not in str(sides[0].path):
@@ -160,71 +161,74 @@ def calibrate(
     return each_channel(paired(*sides), target, act)
 
 
-Given = tuple[Recipe, Freedom, str, int, int, bool]
+Start = Callable[[Pair], tuple[Search, InputSet]]
 
 
 @one_thread_for_matrices()
-def _planned(given: Given, _name: str, pair: Pair, out: Path | None) -> Plan:
+def _planned(start: Start, force: bool, _name: str, pair: Pair, out: Path | None) -> Plan:
     """Forecast how well the pulses of a channel constrain the physics, before any fit."""
     if out is not None:
-        refuse_existing(out, *pair[0].files, *pair[1].files, force=given[-1])
+        refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
     with stage("Planning") as bar:
-        sides = _Sides.read(pair, *given[:-1])
-        search = sides.search(bar.update)
+        search, _ = start(pair)
+        search.simulator.simulated = bar.update
         physics = search.simulator.physics
         bar.total = 2 + 2 * len(physics.nuisances)
-        information = search.plan()
-    by_pulses = {str(n): information.for_pulses(n / 2) for n in PLANNED}
-    errors = {}
+        linear = search.plan()
+    errors, names = {}, [nuisance.name for nuisance in physics.nuisances]
     for i, (centre, width) in enumerate(zip(*physics.priors(search.given), strict=True)):
         own = partial(physics.in_own_unit, i, float(centre))
         errors[physics.nuisances[i].name] = ExpectedErrors(
             simulated=physics.nominal(physics.nuisances[i]),
             prior=own(width)[1],
-            alone={
-                n: own(information_of.errors([i])[0])[1]
-                for n, information_of in by_pulses.items()
-            },
-            all_free={
-                n: own(information_of.errors()[i])[1] for n, information_of in by_pulses.items()
-            },
+            alone={str(n): own(linear.errors([i], n / 2)[0])[1] for n in PLANNED},
+            all_free={str(n): own(linear.errors(pairs=n / 2)[i])[1] for n in PLANNED},
         )
-    directions = {n: information_of.directions() for n, information_of in by_pulses.items()}
-    name = sides.stored.detector.name
+    directions = {str(n): linear.directions(names, n / 2) for n in PLANNED}
+    name = physics.detector.name
     plan = Plan(detector=name, errors_by_name=errors, directions=directions)
     if out is not None:
-        plan.save(out, force=given[-1])
+        plan.save(out, force=force)
     return plan
 
 
 @one_thread_for_matrices()
-def _calibrated(given: Given, _name: str, pair: Pair, out: Path | None) -> Calibration:
+def _calibrated(
+    start: Start, peak: str, seed: int, force: bool, _name: str, pair: Pair, out: Path | None
+) -> Calibration:
     """Calibrate detector and readout of a channel together."""
     assert out is not None
-    refuse_existing(out, *pair[0].files, *pair[1].files, force=given[-1])
+    refuse_existing(out, *pair[0].files, *pair[1].files, force=force)
     keep_freed_memory()
     clock, started = time.perf_counter(), datetime.now(UTC)
-    sides = _Sides.read(pair, *given[:-1])
-    with folder_written_aside(out, RUN, force=given[-1]) as folder:
-        with stage("Calibrating") as bar:
-            search = sides.search(bar.update)
-            bar.total = search.simulations
-            calibrated = search.run()
-        if (per := calibrated.chi_square / calibrated.problem.moments) > HOPELESS:
+    search, data = start(pair)
+    with folder_written_aside(out, RUN, force=force) as folder:
+        with stage("Calibrating", search.simulations) as bar:
+            search.simulator.simulated = bar.update
+            problem, result = search.run()
+        physics, parameters = search.simulator.physics, problem.parameters
+        if (per := result.chi_square.after / problem.moments) > HOPELESS:
             raise CpunetError(
-                f"{sides.data.path}: no physics near those of {sides.stored.detector.name} "
+                f"{data.path}: no physics near those of {physics.detector.name} "
                 f"make the simulation look like it (chi-square {per:.0f} per function); is it "
                 "of another detector, or of other energies (`peak`)?"
             )
-        result = described(calibrated)
         for note in result.notes:
             log.info(titled(note))
-        detector, settings = calibrated.physics.at(calibrated.problem.parameters.coordinates)
+        detector, settings = physics.at(parameters.coordinates)
         for file, config in ((DETECTOR, detector), (SETTINGS, settings)):
             text = yaml_text(config.model_dump(mode="json"))
             (folder / file).write_text(result.comment + text, encoding="utf-8")
-        sides.simulate(folder / SIM, detector, settings)
-        run = sides.trained(folder, with_settings(calibrated.response, deviations=False))
+        # all events of the file
+        hits, values = HitFile(pair[0].path, placed=True), dict(settings)
+        simulate(folder / SIM, detector=detector, hits=hits, settings=values, seed=seed)
+        recipe, selection = search.recipe, parse_selection(peak, search.recipe.peaks)
+        sim = load_pulses(PulseFile(folder / SIM), "simulated", recipe, selection)
+        # not stretched: what is off in the drift is for the physics to explain
+        training = recipe.training.model_copy(update={"drift_terms": 0})
+        recipe = recipe.model_copy(update={"training": training})
+        job = TrainingJob(recipe, peak, seed, "cpu", sim, data)
+        run = train_chain(job, with_settings(parameters.chain.response, deviations=False))
         facts = {
             "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
             "started": started.isoformat(timespec="seconds"),
@@ -233,85 +237,46 @@ def _calibrated(given: Given, _name: str, pair: Pair, out: Path | None) -> Calib
         }
         run.model_copy(update=facts).write(folder)
         (folder / CALIBRATION).write_text(result.model_dump_json(indent=1) + "\n")
-        for file, figure in result.figures.items():
+        for file, figure in figures(result).items():
             figure.savefig(folder / f"{file}.png", dpi=DPI)
     return Calibration.load(out)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    """Pulses of both sides, see `calibrate`.
-
-    `stored` is the physics of the simulated side, with the hits of each event of its file.
-    """
-
-    sim: InputSet
-    data: InputSet
-    stored: StoredSimulation
-    recipe: Recipe
-    freedom: Freedom
-    peak: str
-    seed: int
-
-    @classmethod
-    def read(
-        cls, pair: Pair, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
-    ) -> Self:
-        """Read and prepare both sides; of the simulated side some `events`."""
-        selection = parse_selection(peak, recipe.peaks)
-        data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
-        recipe = data.recipe
-        stored = StoredSimulation.read(pair[0].path)
-        sim = load_pulses(pair[0], "simulated", recipe, selection)
-        require_same_sampling(sim, data)
-        for note in require_both_sides(sim, data, selection):
-            log.warning(note)
-        fewest = min(len(sim.prepared), len(data.prepared))
-        if fewest < MIN_PULSES:
-            raise CpunetError(
-                f"{fewest} pulses of {peak} on a side determine neither the physics nor the "
-                f"readout, which takes {MIN_PULSES}",
-                "give more files, or more energies as `peak`",
-            )
-        # in random order, so that any first part is a representative sample
-        rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
-        some = replace(sim, prepared=sim.prepared[rows])
-        return cls(some, data, stored, recipe.at(data.dt_ns), freedom, peak, seed)
-
-    def search(self, simulated: Callable[[], None]) -> Search:
-        """The search, ready to start; it calls `simulated` after each simulation."""
-        given = self.freedom.priors
-        tails, _ = tails_of(self.data)
-        drawn = None
-        if tails is not None and tails.law is not None:
-            drawn = drawn_like(tails, self.data, self.recipe.preparation)
-        noise = noise_of(self.data, tails)
-        physics = Physics(self.stored.detector, self.stored.settings, self.freedom.looked_at)
-        require_depletion(physics, given)
-        pulses, measured = self.sim.prepared.pulses, self.data.prepared.pulses
-        hits = self.stored.hits[self.sim.prepared.index]
-        rng = np.random.default_rng(self.seed)
-        return Search(
-            simulator=Simulator(hits, physics, simulated),
-            sets=PulseSets(pulses, measured, noise, self.recipe, rng, drawn),
-            recipe=self.recipe,
-            given={k: v for k, v in given.items() if k != DEPLETION},
-            knowledge=known_depletion(physics, given.get(DEPLETION)),
-            chosen=self.freedom.chosen,
+def _search(
+    pair: Pair, *, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
+) -> tuple[Search, InputSet]:
+    """Read and prepare both sides, of the simulated side some events: search, and the data."""
+    selection = parse_selection(peak, recipe.peaks)
+    data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
+    stored = StoredSimulation.read(pair[0].path)
+    sim = load_pulses(pair[0], "simulated", data.recipe, selection)
+    require_same_sampling(sim, data)
+    for note in require_both_sides(sim, data, selection):
+        log.warning(note)
+    fewest = min(len(sim.prepared), len(data.prepared))
+    if fewest < MIN_PULSES:
+        raise CpunetError(
+            f"{fewest} pulses of {peak} on a side determine neither the physics nor the "
+            f"readout, which takes {MIN_PULSES}",
+            "give more files, or more energies as `peak`",
         )
-
-    def simulate(self, out: Path, detector: Detector, settings: SimulationSettings) -> None:
-        """Simulate all events of the file again."""
-        hits = HitFile(self.sim.path, placed=True)
-        how: Any = {"hits": hits, "settings": dict(settings), "seed": self.seed}
-        simulate(out, detector=detector, **how)
-
-    def trained(self, folder: Path, start: ElectronicsResponse) -> Run:
-        """The readout fitted to all events of the folder, starting from a chain."""
-        selection = parse_selection(self.peak, self.recipe.peaks)
-        again = load_pulses(PulseFile(folder / SIM), "simulated", self.recipe, selection)
-        # not stretched: what is off in the drift is for the physics to explain
-        training = self.recipe.training.model_copy(update={"drift_terms": 0})
-        recipe = self.recipe.model_copy(update={"training": training})
-        job = TrainingJob(recipe, self.peak, self.seed, "cpu", again, self.data, folder)
-        return train_chain(job, start)
+    recipe = data.recipe.at(data.dt_ns)
+    physics = Physics(stored.detector, stored.settings, freedom.looked_at)
+    require_depletion(physics, freedom.priors)
+    tails, _ = tails_of(data)
+    drawn = None
+    if tails is not None and tails.law is not None:
+        drawn = drawn_like(tails, data, recipe.preparation)
+    noise = noise_of(data, tails)
+    # in random order, so that any first part is a representative sample
+    rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
+    some, rng = sim.prepared[rows], np.random.default_rng(seed)
+    search = Search(
+        simulator=Simulator(stored.hits[some.index], physics),
+        sets=PulseSets(some.pulses, data.prepared.pulses, noise, recipe, rng, drawn),
+        recipe=recipe,
+        given={k: v for k, v in freedom.priors.items() if k != DEPLETION},
+        knowledge=known_depletion(physics, freedom.priors.get(DEPLETION)),
+        chosen=freedom.chosen,
+    )
+    return search, data

@@ -30,11 +30,7 @@ if TYPE_CHECKING:
 CALIBRATION, SIM = "calibration.json", "sim.lh5"
 DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
 DPI = 110
-PLAN = FolderKind(
-    name="plan",
-    command="cpunet calibrate --plan",
-    own=r"plan\.json|plan\.png",
-)
+PLAN = FolderKind("plan", "cpunet calibrate --plan", r"plan\.(json|png)")
 _BY_LOAD: Any = {"default": None, "exclude": True, "repr": False}
 SHOWN = 0.25  # least component of a direction that is shown
 
@@ -142,8 +138,9 @@ class CalibratedPhysics(InfoPart):
         Of all that is compared.
     covariance
         Of the coordinates of the free parameters, in their order.
-    functions, pulls_before, pulls_after
-        Names of the functions, and their deviations in standard deviations.
+    functions, groups, pulls_before, pulls_after
+        Names of the functions, how many of them each group has, and their deviations in
+        standard deviations.
     rounds, settled
         Number of rounds, and whether the physics was unchanged in the last.
     notes
@@ -158,6 +155,7 @@ class CalibratedPhysics(InfoPart):
     chi_square: ChiSquare
     covariance: list[list[float]]
     functions: list[str]
+    groups: dict[str, int]
     pulls_before: list[float]
     pulls_after: list[float]
     rounds: int
@@ -178,31 +176,19 @@ class CalibratedPhysics(InfoPart):
         """Each value with its error, or why none is given."""
         pairs = {name for pair in self.together for name in pair.components}
         texts = {}
-        for name, parameter in self.parameters.items():
-            texts[name] = f"{parameter.value:.5g} ± {parameter.error:.2g}"
-            if parameter.doubt:
-                texts[name] = (
-                    f"unreliable value: {parameter.value:.5g} makes up for something else"
-                )
+        for name, of in self.parameters.items():
+            texts[name] = f"{of.value:.5g} ± {of.error:.2g}"
+            if of.doubt:
+                texts[name] = f"unreliable value: {of.value:.5g} makes up for something else"
             elif name in pairs:
                 texts[name] = "determined only together with another"
         return texts
 
-    @property
-    def figures(self) -> dict[str, Figure]:
-        """``pulls``, and ``directions`` if any parameter was free."""
-        drawn = {"pulls": pulls_figure(self)}
-        if self.directions:
-            drawn["directions"] = directions_figure(self.directions)
-        return drawn
-
     def __str__(self) -> str:
         lines = [
-            f"{titled(name)} {text} (simulated with {parameter.simulated:.5g}; "
-            f"± {parameter.error_all:.2g} if all physics were free)"
-            for (name, text), parameter in zip(
-                self.shown.items(), self.parameters.values(), strict=True
-            )
+            f"{titled(name)} {text} (simulated with {self.parameters[name].simulated:.5g}; "
+            f"± {self.parameters[name].error_all:.2g} if all physics were free)"
+            for name, text in self.shown.items()
         ] or ["no parameter of the physics is determined better than by its prior"]
         lines += [
             f"only together: {titled(pair.words, units=False)} = {pair.value:.2f} ± "
@@ -261,9 +247,7 @@ class Calibration(Run):
         """A row per free parameter: its value, error, simulated value, prior and others."""
         from pandas import DataFrame
 
-        rows = {
-            name: parameter.model_dump() for name, parameter in self.result.parameters.items()
-        }
+        rows = {name: of.model_dump() for name, of in self.result.parameters.items()}
         return DataFrame.from_dict(rows, orient="index")
 
     @property
@@ -284,7 +268,7 @@ class Calibration(Run):
     @property
     def figures(self) -> dict[str, Figure]:
         """``pulls``, and ``directions`` if any parameter was free."""
-        return self.result.figures
+        return figures(self.result)
 
     @property
     def _folder(self) -> Path:
@@ -361,25 +345,20 @@ class Plan(InfoPart):
             self.plot().savefig(aside / "plan.png", dpi=DPI)
 
     def __str__(self) -> str:
-        counts, tables = [f"N={n}" for n in self.directions], []
+        counts, lines = [f"N={n}" for n in self.directions], []
         for kind, title in (("alone", "error of each alone"), ("all_free", "with all free")):
-            rows = [
-                [
-                    titled(name),
-                    *(f"{e:.3g}" for e in (expected.prior, *getattr(expected, kind).values())),
-                ]
-                for name, expected in self.errors_by_name.items()
-            ]
-            tables.append(text_table([title, "prior", *counts], rows))
-        directions = [
-            f"{expected.error:8.3f}  {titled(expected.words, units=False)}"
-            for expected in self.directions[self._middle]
-        ]
-        about = (
+            rows = []
+            for name, of in self.errors_by_name.items():
+                errors = of.prior, *getattr(of, kind).values()
+                rows.append([titled(name), *(f"{error:.3g}" for error in errors)])
+            lines.append(text_table([title, "prior", *counts], rows))
+        lines.append(
             f"eigenvectors of the covariance with {self._middle} pulses of each side, error in "
             "units of the prior:"
         )
-        return "\n".join([*tables, about, *directions])
+        for of_axis in self.directions[self._middle]:
+            lines.append(f"{of_axis.error:8.3f}  {titled(of_axis.words, units=False)}")
+        return "\n".join(lines)
 
     def __repr__(self) -> str:
         return f"<Plan of {self.detector}: {', '.join(self.errors_by_name)}>"
@@ -393,14 +372,20 @@ BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]
 LINEAR = 3.0  # pulls up to which the axis is linear
 
 
+def figures(result: CalibratedPhysics) -> dict[str, Figure]:
+    """``pulls``, and ``directions`` if any parameter was free."""
+    drawn = {"pulls": pulls_figure(result)}
+    if result.directions:
+        drawn["directions"] = directions_figure(result.directions)
+    return drawn
+
+
 @styled
 def pulls_figure(result: CalibratedPhysics) -> Figure:
     """Pulls of all functions before and after a calibration."""
-    groups = [_group(name) for name in result.functions]
-    names = list(dict.fromkeys(groups))
     figure = Figure(figsize=(9.5, 3.6))
     panel = figure.subplots()
-    x = np.arange(len(groups))
+    x = np.arange(len(result.functions))
     for pulls, colour, label in (
         (result.pulls_before, BEFORE, "as simulated, chain alone"),
         (result.pulls_after, AFTER, "calibrated"),
@@ -408,12 +393,12 @@ def pulls_figure(result: CalibratedPhysics) -> Figure:
         panel.plot(x, pulls, ".", ms=4, color=colour, label=label)
     panel.set_yscale("symlog", linthresh=LINEAR)
     panel.axhspan(-2, 2, color="0.9", zorder=0)
-    starts = [groups.index(name) for name in names]
-    for start in starts[1:]:
-        panel.axvline(start - 0.5, color="0.8", lw=0.8)
-    ends = [*starts[1:], len(groups)]
-    middles = [0.5 * (a + b - 1) for a, b in zip(starts, ends, strict=True)]
-    broken = [re.sub(r" (?=in slices)|(?<=current) ", "\n", name) for name in names]
+    sizes = np.array([*result.groups.values()])
+    ends = np.cumsum(sizes)
+    for end in ends[:-1]:
+        panel.axvline(end - 0.5, color="0.8", lw=0.8)
+    middles = ends - 0.5 * (sizes + 1)
+    broken = [re.sub(r" (?=in slices)|(?<=current) ", "\n", name) for name in result.groups]
     panel.set_xticks(middles, broken, fontsize=8)
     panel.grid(axis="x", visible=False)
     panel.set_ylabel("deviation [standard deviations]\n(symlog scale)")
@@ -425,15 +410,11 @@ def pulls_figure(result: CalibratedPhysics) -> Figure:
 def directions_figure(directions: Sequence[Direction]) -> Figure:
     """Eigenvectors of the covariance as a colour table, with the error of each."""
     names = list(directions[0].components)
-    matrix = np.array(
-        [[direction.components[name] for name in names] for direction in directions]
-    )
-    errors = np.array([direction.error for direction in directions])
+    matrix = np.array([[axis.components[name] for name in names] for axis in directions])
+    errors = np.array([axis.error for axis in directions])
     size = 0.34 * len(names)
     figure = Figure(figsize=(5.6 + size, 2.0 + size))
-    left, right = figure.subplots(
-        1, 2, sharey=True, gridspec_kw={"width_ratios": [len(names), 5]}
-    )
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=[len(names), 5])
     left.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
     titles = [titled(name, units=False) for name in names]
     left.set_xticks(range(len(names)), titles, rotation=60, ha="right", fontsize=8)
@@ -446,15 +427,3 @@ def directions_figure(directions: Sequence[Direction]) -> Figure:
     right.axvline(1, color="0.5", lw=0.8)
     right.set_xlabel("error in units of the prior")
     return figure
-
-
-def _group(name: str) -> str:
-    """Group to which a function belongs."""
-    plain = name.split(": ")[-1]
-    if plain.startswith("component") and "amplitude" in plain:
-        return "components with current amplitude"
-    for group in ("samples", "drift time"):
-        if plain.startswith(group):
-            return group
-    kind = "current amplitude" if plain.startswith("current") else "components"
-    return f"{kind} in slices" if "slice" in plain else kind

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
 from cpunet.calibration.nearby import FloatArray, Nearby, cut
@@ -155,21 +154,23 @@ class JointProblem:
     _roots: list[Values] = field(init=False)
 
     def __post_init__(self) -> None:
-        preparation = self.recipe.preparation
-        self._first = _starts(self.nearby, self.recipe)
-        self._length = preparation.samples_before + preparation.samples_after
+        base, preparation = self.nearby.base, self.recipe.preparation
+        pulses = Pulses.of(base, dt_ns=self.nearby.simulator.physics.settings.dt_ns)
+        prepared = prepare(pulses, preparation, "simulated")
+        if len(prepared) < len(base):
+            counts = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
+            raise CpunetError(
+                f"with these physics {len(base) - len(prepared)} of {len(base)} events "
+                f"give no pulse ({counts}); narrow the `prior` of what is free"
+            )
+        self._first = prepared.align_sample - preparation.samples_before
         if not self.weights:
-            own = [self._data_alone, self._both_sides][not self.held]
-            self.weights = own()
-        self._roots = [
-            np.asarray(np.linalg.cholesky(covariance)) for covariance in self.weights
-        ]
-
-    def _data_alone(self) -> list[Values]:
-        return [functions.covariance(np.cov(functions.data.T)) for functions in self.functions]
-
-    def _both_sides(self) -> list[Values]:
-        return [difference.covariance for difference in self._differences()]
+            self.weights = (
+                [functions.covariance(np.cov(functions.data.T)) for functions in self.functions]
+                if self.held
+                else [difference.covariance for difference in self._differences()]
+            )
+        self._roots = [np.asarray(np.linalg.cholesky(of)) for of in self.weights]
 
     @property
     def moments(self) -> int:
@@ -177,9 +178,9 @@ class JointProblem:
         return sum(len(root) for root in self._roots)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the functions."""
-        return tuple(name for functions in self.functions for name in functions.names)
+    def names(self) -> dict[str, list[str]]:
+        """Names of the functions by group."""
+        return {of: own for functions in self.functions for of, own in functions.names.items()}
 
     @property
     def by_chance(self) -> tuple[float, float]:
@@ -191,20 +192,26 @@ class JointProblem:
         :math:`q = (1 - \rho / \lambda) / (1 - \rho)` instead of 1, so the mean is
         :math:`\sum q` and the variance :math:`2 \sum q^2`.
         """
-        counted = np.concatenate([_counted(weights) for weights in self.weights])
-        return float(counted.sum()), float(np.sqrt(2 * counted @ counted))
+        counted = []
+        for weights in self.weights:
+            sigma = np.sqrt(weights.diagonal())
+            sizes = np.linalg.eigvalsh(weights / np.outer(sigma, sigma))
+            counted.append(np.maximum(1 - SHRUNK / sizes, 0) / (1 - SHRUNK))
+        each = np.concatenate(counted)
+        return float(each.sum()), float(np.sqrt(2 * each @ each))
 
-    def pulls(self) -> Values:
-        """Deviations of the functions in standard deviations; they are correlated."""
-        return np.concatenate([
+    def compared(self) -> tuple[float, Values]:
+        r"""Chi-square :math:`\mathbf{d}^T C^{-1} \mathbf{d}` without priors, and pulls.
+
+        Pulls are deviations of the functions in standard deviations; they are correlated.
+        """
+        differences = self._differences()
+        deviations = self._stacked(self.parameters.vector(), differences)[: self.moments]
+        pulls = [
             difference.values / np.sqrt(weights.diagonal())
-            for difference, weights in zip(self._differences(), self.weights, strict=True)
-        ])  # fmt: skip
-
-    def chi_square(self) -> float:
-        r""":math:`\mathbf{d}^T C^{-1} \mathbf{d}` of the functions alone, without priors."""
-        deviations = self.residuals(self.parameters.vector())[: self.moments]
-        return float(deviations @ deviations)
+            for difference, weights in zip(differences, self.weights, strict=True)
+        ]
+        return float(deviations @ deviations), np.concatenate(pulls)
 
     def fitted(self, count: Callable[[float], None] = lambda _: None) -> Parabola:
         """Set the parameters to the minimum."""
@@ -222,10 +229,6 @@ class JointProblem:
             float(residuals @ residuals),
             jacobian.T @ residuals,
         )
-
-    def of_parts(self, parts: Sequence[SlicedJoint]) -> JointProblem:
-        """The same comparison, weights included, of parts of the pulses."""
-        return replace(self, functions=parts)
 
     def residuals(self, vector: Values) -> Values:
         """Uncorrelated deviations of the functions, priors and further knowledge."""
@@ -246,10 +249,8 @@ class JointProblem:
             assert difference.parts is not None
             slopes, values = difference.parts
             both = np.moveaxis(np.concatenate([slopes, values[..., np.newaxis]], axis=2), 1, 0)
-            solved = scipy.linalg.solve_triangular(
-                root, both.reshape(len(root), -1), lower=True
-            )
-            white.append(solved.reshape(both.shape))
+            flat = both.reshape(len(root), -1)
+            white.append(_white(root, flat).reshape(both.shape))
         parts = np.concatenate(white).swapaxes(0, 1)  # (parts, functions, parameters + 1)
         slopes, values = parts[..., :-1], parts[..., -1]
         rows = [slopes.mean(axis=0), np.diag(1 / parameters.widths)]
@@ -266,10 +267,7 @@ class JointProblem:
     def _stacked(self, vector: Values, differences: Sequence[Difference]) -> Values:
         parameters = self.parameters
         rows = [
-            *(
-                scipy.linalg.solve_triangular(root, difference.values, lower=True)
-                for root, difference in zip(self._roots, differences, strict=True)
-            ),
+            *(_white(of, d.values) for of, d in zip(self._roots, differences, strict=True)),
             (vector - parameters.centre) / parameters.widths,
             self.knowledge(parameters.coordinates),
         ]
@@ -281,10 +279,8 @@ class JointProblem:
     def _differences(self, *, slopes: bool = False) -> list[Difference]:
         """Differences of each band at the current parameters, with derivatives if asked."""
         parameters, at = self.parameters, self.parameters.coordinates
-        response = parameters.chain.response
         padded = self.functions[0].sides.padded
-        transfer = response.transfer(padded)
-        basis = parameters.basis(padded) if slopes else None
+        transfer = parameters.chain.response.transfer(padded)
         if not slopes:
             return [functions.difference(transfer) for functions in self.here()]
         most, steps = events(self.functions), STEP * parameters.reach
@@ -293,17 +289,15 @@ class JointProblem:
             (self.windows(at + step * np.eye(len(at))[i], most) - windows) / np.float32(step)
             for i, step in zip(parameters.free, steps, strict=True)
         ]
-        return [
-            functions.difference(
-                transfer, basis, [each[functions.sides.rows] for each in changes]
-            )
-            for functions in self.here()
-        ]
+        basis, differences = parameters.basis(padded), []
+        for functions in self.here():
+            own = [each[functions.sides.rows] for each in changes]
+            differences.append(functions.difference(transfer, basis, own))
+        return differences
 
-    def here(self, coordinates: Values | None = None) -> list[SlicedJoint]:
-        """Functions with the simulated pulses at some coordinates."""
-        at = self.parameters.coordinates if coordinates is None else coordinates
-        windows = self.windows(at, events(self.functions))
+    def here(self) -> list[SlicedJoint]:
+        """Functions with the simulated pulses at the current coordinates."""
+        windows = self.windows(self.parameters.coordinates, events(self.functions))
         return [functions.taking(windows[functions.sides.rows]) for functions in self.functions]
 
     def windows(self, coordinates: Values, most: int | None = None) -> FloatArray:
@@ -312,29 +306,14 @@ class JointProblem:
         Their windows are those of the centre.  Noise begins with a window: if windows followed
         the pulses, by whole samples, every step would give some pulses other noise.
         """
-        windows: FloatArray = cut(self.nearby.at(coordinates, most), self._first, self._length)
+        length = self.recipe.preparation.length
+        windows: FloatArray = cut(self.nearby.at(coordinates, most), self._first, length)
         return windows
 
 
-def _starts(nearby: Nearby, recipe: Recipe) -> npt.NDArray[np.int64]:
-    """Sample of each pulse at the centre with which its window begins."""
-    base, preparation = nearby.base, recipe.preparation
-    pulses = Pulses.of(base, dt_ns=nearby.simulator.physics.settings.dt_ns)
-    prepared = prepare(pulses, preparation, "simulated")
-    if len(prepared) < len(base):
-        counts = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
-        raise CpunetError(
-            f"with these physics {len(base) - len(prepared)} of {len(base)} events "
-            f"give no pulse ({counts}); narrow the `prior` of what is free"
-        )
-    return prepared.align_sample - preparation.samples_before
-
-
-def _counted(weights: Values) -> Values:
-    """What each direction contributes to chi-square, see `JointProblem.by_chance`."""
-    sigma = np.sqrt(weights.diagonal())
-    sizes = np.linalg.eigvalsh(weights / np.outer(sigma, sigma))
-    return np.maximum(1 - SHRUNK / sizes, 0) / (1 - SHRUNK)
+def _white(root: Values, values: Values) -> Values:
+    """Values without their correlations, given the root of the covariance."""
+    return np.asarray(scipy.linalg.solve_triangular(root, values, lower=True))
 
 
 def events(functions: Sequence[SlicedJoint]) -> int:

@@ -95,14 +95,16 @@ class Simulator:
         Merged hits of the events, in an order in which any first part is representative.
     physics
         Detector and parameters that the coordinates refer to.
-    simulated
+
+    Attributes
+    ----------
+    simulated : callable
         Called after each simulation.
     """
 
-    def __init__(
-        self, hits: Hits, physics: Physics, simulated: Callable[[], None] = lambda: None
-    ) -> None:
-        self.physics, self._simulated = physics, simulated
+    def __init__(self, hits: Hits, physics: Physics) -> None:
+        self.physics = physics
+        self.simulated: Callable[[], None] = lambda: None
         self._same = SameHits(hits)
         steps = physics.settings.dt_ns / physics.settings.step_ns
         self._finer = next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
@@ -111,7 +113,7 @@ class Simulator:
         """Pulses as `cpunet simulate` produces them, shape (events, samples)."""
         detector, settings = self.physics.at(coordinates)
         events = self._same.simulate(detector, settings)
-        self._simulated()
+        self.simulated()
         return events.waveforms
 
     def quick(self, coordinates: Values, most: int | None = None) -> FloatArray:
@@ -119,14 +121,13 @@ class Simulator:
         detector, settings = self.physics.at(coordinates)
         fine = settings.model_copy(update={"dt_ns": settings.dt_ns / self._finer})
         events = self._same.simulate(detector, fine, quick=True, most=most)
-        self._simulated()
+        self.simulated()
         return events.waveforms
 
     def coarse(self, pulses: FloatArray) -> FloatArray:
         """Average fine samples over the sampling period."""
-        samples = pulses.shape[1] // self._finer
-        whole = pulses[:, : samples * self._finer]
-        blocks = whole.reshape(len(pulses), samples, self._finer)
+        whole = pulses[:, : pulses.shape[1] // self._finer * self._finer]
+        blocks = whole.reshape(len(pulses), -1, self._finer)
         return np.asarray(blocks.mean(axis=2, dtype=np.float32))
 
 
@@ -147,11 +148,6 @@ class Derivative:
     pulses: FloatArray
     point: Values
     half: Values
-
-    def moved(self, half: Values) -> FloatArray:
-        """Derivatives of pulses with other half maxima: each is moved with its edge."""
-        moved: FloatArray = move(self.pulses, self.half - half[: len(self.pulses)])
-        return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,13 +181,31 @@ class Nearby:
         return replace(self, centre=centre, base=self.simulator.exact(centre))
 
     def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
-        """The same point, with some derivatives simulated anew for the first `most` events."""
-        half = self.half[:most]
-        new = {
-            i: Derivative(pulses, self.centre, half)
-            for i, pulses in _slopes(self.simulator, self.centre, of, most).items()
-        }
-        return replace(self, derivatives={**self.derivatives, **new})
+        """The same point, with some derivatives simulated anew for the first `most` events.
+
+        Each is the difference of the aligned shapes of two simulations.
+        """
+        if not of:
+            return self
+        simulator, centre, derivatives = self.simulator, self.centre, {**self.derivatives}
+        physics, here = simulator.physics, simulator.quick(centre, most)
+        half = half_maxima(here, np.zeros(len(here)))
+        for i in of:
+            nuisance = physics.nuisances[i]
+            low, high = nuisance.bounds(physics.nominal(nuisance))
+            ends = [centre[i] - nuisance.step, centre[i] + nuisance.step]
+            if ends[0] < low:  # not possible below: upwards only
+                ends = [low, max(low, centre[i]) + 2 * nuisance.step]
+            ends[1] = min(ends[1], high)
+            shapes = []
+            for end in ends:
+                moved = centre.copy()
+                moved[i] = end
+                pulses = simulator.quick(moved, most)
+                shapes.append(simulator.coarse(move(pulses, half_maxima(pulses, half) - half)))
+            slope = (shapes[1] - shapes[0]) / np.float32(ends[1] - ends[0])
+            derivatives[i] = Derivative(slope, centre, self.half[:most])
+        return replace(self, derivatives=derivatives)
 
     @cached_property
     def half(self) -> Values:
@@ -201,11 +215,19 @@ class Nearby:
 
     @cached_property
     def slopes(self) -> Mapping[int, FloatArray]:
-        """Derivatives of these pulses by the position of the coordinate."""
-        return {i: derivative.moved(self.half) for i, derivative in self.derivatives.items()}
+        """Derivatives of these pulses by the position of the coordinate.
 
-    def outdated(self, of: Sequence[int], reach: Values) -> list[int]:
-        """Coordinates without derivatives for all events from within reach of the centre.
+        Each is moved with the edge of its pulse.
+        """
+        return {
+            i: move(of.pulses, of.half - self.half[: len(of.pulses)])
+            for i, of in self.derivatives.items()
+        }
+
+    def outdated(
+        self, of: Sequence[int], reach: Values | float = np.inf, least: int = 0
+    ) -> list[int]:
+        """Coordinates without derivatives from within reach, of at least so many events.
 
         Only distances along the coordinates `of` count. Derivatives are out of reach, too, if
         the edges of the pulses have moved.
@@ -213,21 +235,13 @@ class Nearby:
 
         def is_known(i: int) -> bool:
             derivative = self.derivatives.get(i)
-            if derivative is None or len(derivative.pulses) < len(self.base):
+            if derivative is None or len(derivative.pulses) < least:
                 return False
             near = np.abs(self.centre - derivative.point) <= reach
-            return bool(near[list(of)].all()) and self._still(derivative)
+            moved = self.half[: len(derivative.half)] - derivative.half
+            return bool(near[list(of)].all() and moved @ moved <= MOVED**2 * len(moved))
 
         return [i for i in of if not is_known(i)]
-
-    def unknown(self, of: Sequence[int]) -> list[int]:
-        """Coordinates without derivatives for any events here."""
-        derivatives = self.derivatives
-        return [i for i in of if i not in derivatives or not self._still(derivatives[i])]
-
-    def _still(self, derivative: Derivative) -> bool:
-        moved = self.half[: len(derivative.half)] - derivative.half
-        return bool((moved @ moved) <= MOVED**2 * len(moved))
 
     def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Pulses of the first `most` events at some coordinates, shape (events, samples)."""
@@ -236,30 +250,3 @@ class Nearby:
             if change and i in self.slopes:
                 pulses = pulses + np.float32(change) * self.slopes[i][:most]
         return pulses
-
-
-def _slopes(
-    simulator: Simulator, centre: Values, wanted: Sequence[int], most: int | None
-) -> dict[int, FloatArray]:
-    """Derivatives of the aligned shapes in each coordinate, from two simulations each."""
-    if not wanted:
-        return {}
-    physics = simulator.physics
-    here = simulator.quick(centre, most)
-    half = half_maxima(here, np.zeros(len(here)))
-    slopes = {}
-    for i in wanted:
-        nuisance = physics.nuisances[i]
-        low, high = nuisance.bounds(physics.nominal(nuisance))
-        ends = [centre[i] - nuisance.step, centre[i] + nuisance.step]
-        if ends[0] < low:  # not possible below: upwards only
-            ends = [low, max(low, centre[i]) + 2 * nuisance.step]
-        ends[1] = min(ends[1], high)
-        shapes = []
-        for end in ends:
-            moved = centre.copy()
-            moved[i] = end
-            pulses = simulator.quick(moved, most)
-            shapes.append(simulator.coarse(move(pulses, half_maxima(pulses, half) - half)))
-        slopes[i] = (shapes[1] - shapes[0]) / np.float32(ends[1] - ends[0])
-    return slopes

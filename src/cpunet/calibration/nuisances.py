@@ -52,7 +52,7 @@ class Nuisance:
         Whether it is considered before the others.
     possible
         Range of values that can be true, if narrower than what is allowed.
-    field
+    own_field
         Field of `Detector` or `SimulationSettings`, if not the name.
     """
 
@@ -68,10 +68,12 @@ class Nuisance:
     source: str
     first: bool = False
     possible: tuple[float, float] = (-math.inf, math.inf)
-    field: str = ""
+    own_field: str = ""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "field", self.field or self.name)
+    @property
+    def field(self) -> str:
+        """Field of `Detector` or `SimulationSettings`."""
+        return self.own_field or self.name
 
     def value(self, nominal: float, coordinate: float) -> float:
         """Value of the parameter at a coordinate, within the allowed range.
@@ -123,7 +125,7 @@ NUISANCES = (
     Nuisance(
         "impurity_factor", "impurity", "factor", "(factor)", 0.1, 0.01, 0.03, 1e-3, 1e3,
         "what a depletion voltage tells of it (Hall probes: 30 %)",
-        first=True, field="impurity_scale",
+        first=True, own_field="impurity_scale",
     ),
     Nuisance(
         "self_repulsion", "self_repulsion", "added", "(factor)", 1.0, 0.3, 0.9, 0, 10,
@@ -171,7 +173,7 @@ NUISANCES = (
     ),
     Nuisance(
         "li_thickness_mm", "li_thickness", "added", "[mm]", 0.2, 0.1, 0.3, 0.01, 5,
-        "what a full-charge collection depth is measured to", field="li_thickness",
+        "what a full-charge collection depth is measured to", own_field="li_thickness",
     ),
 )  # fmt: skip
 _NAMES = re.compile(rf"\b({'|'.join(n.name for n in NUISANCES)})\b")
@@ -305,7 +307,6 @@ class Physics:
 
 
 DEPLETION = "depletion_voltage"
-_PRIOR = re.compile(r"\s*([\w.]+)\s*=\s*([-+.\deE]+?)\s*(?:±|\+-|\+/-)\s*([.\deE+-]+)\s*")
 # Steps of impurity factor and tilt (1e10/cm4) for the derivatives of the depletion voltage.
 _FACTOR, _TILT = 0.1, 0.01
 
@@ -347,11 +348,25 @@ class Freedom:
         >>> Freedom.of(prior=["temperature=90±0.5"]).priors
         {'temperature_K': (90.0, 0.5)}
         """
-        chosen = _parameters(free)
+        texts = [free] if isinstance(free, str) else free
+        parts = [part for text in texts for part in text.split(",") if part.strip()]
+        chosen = tuple(dict.fromkeys(map(named, parts)))
         # another lithium layer requires new field solutions: only on request
         looked_at = chosen or tuple(n for n in NUISANCES if n.name != "li_thickness_mm")
         given = prior.items() if isinstance(prior, Mapping) else map(_split, prior)
-        priors = dict(_prior(name, *of_name) for name, of_name in given)
+        priors = {}
+        for name, pair in given:
+            value, error = map(float, pair)
+            text = f"`prior` {name}={value:g}"
+            if not (error > 0 and np.isfinite([value, error]).all()):
+                raise CpunetError(f"{text}±{error:g}: expected a value, and an error above 0")
+            nuisance = None if name == DEPLETION else named(name)
+            if nuisance and not nuisance.lowest <= value <= nuisance.highest:
+                limits = f"{nuisance.lowest:g} to {nuisance.highest:g}"
+                raise CpunetError(
+                    f"{text}: {nuisance.name} can be {limits}", "give a value between"
+                )
+            priors[nuisance.name if nuisance else DEPLETION] = value, error
         without_use = priors.keys() - {DEPLETION, *(n.name for n in looked_at)}
         if without_use:
             raise CpunetError(
@@ -421,35 +436,10 @@ def known_depletion(
     return deviation
 
 
-def _parameters(names: str | Sequence[str]) -> tuple[Nuisance, ...]:
-    texts = [names] if isinstance(names, str) else names
-    parts = [part for text in texts for part in text.split(",") if part.strip()]
-    return tuple(dict.fromkeys(named(name) for name in parts))
-
-
 def _split(text: str) -> tuple[str, tuple[float, float]]:
-    match = _PRIOR.fullmatch(text)
     try:
-        if match is not None:
-            return match[1], (float(match[2]), float(match[3]))
+        name, value, error = re.split("=|±|\\+/?-", text)
+        return name.strip(), (float(value), float(error))
     except ValueError:
-        pass
-    raise CpunetError(f"`prior` {text}: expected NAME=VALUE±ERROR, as temperature=90±0.5")
-
-
-def _prior(name: str, value: float, error: float) -> tuple[str, tuple[float, float]]:
-    value, error = float(value), float(error)
-    if not (error > 0 and np.isfinite([value, error]).all()):
-        raise CpunetError(
-            f"`prior` {name}={value:g}±{error:g}: expected a value, and an error above 0"
-        )
-    if name == DEPLETION:
-        return DEPLETION, (value, error)
-    nuisance = named(name)
-    if not nuisance.lowest <= value <= nuisance.highest:
-        raise CpunetError(
-            f"`prior` {name}={value:g}: {nuisance.name} can be {nuisance.lowest:g} to "
-            f"{nuisance.highest:g}",
-            "give a value between",
-        )
-    return nuisance.name, (value, error)
+        remedy = "expected NAME=VALUE±ERROR, as temperature=90±0.5"
+        raise CpunetError(f"`prior` {text}: {remedy}") from None

@@ -11,14 +11,16 @@ import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from cpunet.calibration.identifiability import Information, Selection
+from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
+from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.joint_problem import JointParameters, JointProblem, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
-from cpunet.calibration.result import BEYOND_CHANCE, Calibrated
+from cpunet.calibration.result import BEYOND_CHANCE, described
 from cpunet.calibration.sampling import of_events
 from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.errors import CpunetError
@@ -39,11 +41,12 @@ SETTLED = 0.4
 # of times the move is halved if pulses cannot be simulated after it.
 FARTHEST, HALVINGS = 1.5, 4
 # Decrease of chi-square of held-out pulses (five standard deviations) for which a fixed
-# parameter is freed, and maximum number of such parameters.
+# parameter is freed, and of all pulses, for which another takes the place of a free one; and
+# maximum number of such changes.
 NEEDED, MAX_MORE = 25.0, 3
-# Other sets of parameters are fitted if chi-square would rise by less than this in a linear
-# forecast, and are alternatives if it does so by less than the second; most, and their rounds.
-LIKELY, SAME, MAX_OTHERS, OTHER_ROUNDS = 16.0, 9.0, 2, 2
+# Other sets of parameters explain the pulses about as well if chi-square rises by less than
+# this in a linear fit; so many are named.
+SAME, MAX_OTHERS = 9.0, 2
 USUAL_ROUNDS = 4  # of most searches, for the remaining time
 # Number of events used to examine fixed parameters.
 LOOKED_AT_WITH = 1024
@@ -90,15 +93,15 @@ class Search:
         with_decay(self._start, self.sets.tail_slope)
         self._modes = NONE
 
-    def plan(self) -> Information:
-        """Information of the pulses on all parameters that may become free, before a fit."""
+    def plan(self) -> Linear:
+        """What the pulses say of all parameters that may become free, before a fit."""
         few = first(self._functions)
         nearby = Nearby.about(self.simulator, np.zeros(self._n), [])
         nearby = nearby.again(self._all, events(few))
-        return self._looked(self._problem(self._chain(), nearby, self._all, few))[0]
+        return self._looked(self._problem(self._chain(), nearby, self._all, few))
 
-    def run(self) -> Calibrated:
-        """Search until the physics no longer changes.
+    def run(self) -> tuple[JointProblem, CalibratedPhysics]:
+        """Search until the physics no longer changes: the last comparison, and its result.
 
         Raises
         ------
@@ -108,12 +111,13 @@ class Search:
         nearby = Nearby.about(self.simulator, np.zeros(self._n), self._first)
         response = self._chain()
         before = self._problem(response, nearby, [], held=True)
-        self._tell("as simulated", before)
+        chi_square, _ = before.compared()
+        self._tell("as simulated", before, chi_square)
         free = self._first_free(response, nearby)
         problem, end = self._from_far(response, nearby, free)
-        if problem.chi_square() > POOR * problem.moments:  # as if the readout rings
-            self._tell("without deviations", problem, end)
-            response = self._deviated(before) or response
+        if end.chi_square > POOR * problem.moments:  # as if the readout rings
+            self._tell("without deviations", problem, end.chi_square, end)
+            response = self._deviated(before, chi_square) or response
             free = self._first_free(response, nearby)
             problem, end = self._from_far(response, nearby, free)
         more, last = 0, np.zeros(self._n)
@@ -121,21 +125,31 @@ class Search:
             if number > 1:
                 problem = self._problem(response, nearby, free)
                 end = problem.fitted()
-            self._tell(f"round {number}", problem, end)
+            self._tell(f"round {number}", problem, end.chi_square, end)
             response = problem.parameters.chain.response
-            moved = problem.parameters.coordinates - nearby.centre
-            settled = number > 1 and _settled(problem, end, moved)
+            moves = problem.parameters.coordinates - nearby.centre
+            settled = (
+                number > 1
+                and bool((np.abs(moves[free]) < SETTLED * _errors(problem, end)).all())
+                and not np.delete(nearby.centre, free).any()
+            )
             if settled and not response.config.deviations:
-                other = self._deviated(problem)
+                other = self._deviated(problem, end.chi_square)
                 response, settled = other or response, settled and other is None
-            added = self._needed(problem) if settled and more < MAX_MORE else None
-            if number == ROUNDS or (settled and added is None):
+            examined = self._examined(problem) if settled or number == ROUNDS else None
+            better = None
+            if examined is not None and more < MAX_MORE and not self.chosen:
+                better = self._better(examined, free)
+            if number == ROUNDS or (settled and better is None):
                 break
-            if added is not None:
-                free, more = sorted([*free, added]), more + 1
-            last = _relaxed(moved, last)
+            if better is not None:
+                free, more = better, more + 1
+            # all that is not free is as simulated
+            aim = np.where(np.isin(self._all, free), problem.parameters.coordinates, 0.0)
+            last = _relaxed(aim - nearby.centre, last)
             nearby = self._moved(nearby, last, free)
-        return self._ended(problem, end, before, number, settled=settled)
+        assert examined is not None
+        return self._ended(problem, before, examined, rounds=number, settled=settled)
 
     def _from_far(
         self, response: ElectronicsResponse, nearby: Nearby, free: Sequence[int]
@@ -153,10 +167,9 @@ class Search:
     def simulations(self) -> int:
         """Number of simulations of a usual search, for the remaining time.
 
-        Derivatives take two each: of the first parameters, of all, and for other physics.
+        Derivatives take two each: of the first parameters, and of all.
         """
-        others = 0 if self.chosen else MAX_OTHERS * (1 + 2 * len(self._first))
-        return USUAL_ROUNDS + 3 + 2 * (len(self._first) + self._n) + others
+        return USUAL_ROUNDS + 3 + 2 * (len(self._first) + self._n)
 
     @property
     def _n(self) -> int:
@@ -191,14 +204,14 @@ class Search:
         sets = parameters, functions or self._functions, nearby
         return JointProblem(*sets, self.recipe, self.knowledge, held, weights)
 
-    def _deviated(self, problem: JointProblem) -> ElectronicsResponse | None:
+    def _deviated(self, problem: JointProblem, chi_square: float) -> ElectronicsResponse | None:
         """The chain with deviations of its step response, if these physics leave too much.
 
         Physics would absorb a part of it: an early decay between the fixed ones looks like more
         self-repulsion, and so does a ringing.
         """
         mean, spread = problem.by_chance
-        if problem.chi_square() < mean + BEYOND_CHANCE * spread:
+        if chi_square < mean + BEYOND_CHANCE * spread:
             return None
         chain = with_settings(problem.parameters.chain.response, deviations=False)
         sides = [functions.sides for functions in problem.here()]
@@ -213,16 +226,10 @@ class Search:
         if self.chosen:
             return self._all
         problem = self._problem(response, nearby, self._first, first(self._functions))
-        information, selection = self._looked(problem)
-        return [self._first[i] for i in selection.begin(information)]
+        return [self._first[i] for i in self._looked(problem).begin()]
 
-    def _moved(
-        self, nearby: Nearby, moved: Values, free: Sequence[int], reaches: float = 1.0
-    ) -> Nearby:
-        """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach.
-
-        Derivatives are simulated again beyond so many reaches.
-        """
+    def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
+        """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
         nuisances = self.simulator.physics.nuisances
         farthest = FARTHEST * np.array([nuisance.reach for nuisance in nuisances])
         move = np.clip(moved, -farthest, farthest)
@@ -238,130 +245,92 @@ class Search:
                 f"detector {self.simulator.physics.detector.name}: the data ask for physics "
                 "that cannot be simulated; narrow a `prior`, or leave a parameter out of `free`"
             )
-        outdated = place.outdated(free, reaches * farthest / FARTHEST)
-        return place.again(outdated) if outdated else place
+        reach = farthest / FARTHEST
+        return place.again(place.outdated(free, reach, len(place.base)))
 
-    def _needed(self, problem: JointProblem) -> int | None:
-        """Fixed parameter that held-out pulses need most, if significant."""
-        if self.chosen:
-            return None
-        selection, free = self._examined(problem)[2], problem.parameters.free
-        falls = {
-            i: selection.score(free) - selection.score([*free, i])
-            for i in self._all
-            if i not in free
-        }
-        best = max(falls, key=lambda i: falls[i], default=None)
-        return best if best is not None and falls[best] > NEEDED else None
+    def _better(self, linear: Linear, free: Sequence[int]) -> list[int] | None:
+        """Parameters that explain the pulses better if they are free, if any do significantly.
 
-    def _examined(
-        self, problem: JointProblem
-    ) -> tuple[dict[int, float], Information, Selection]:
-        """Expected decreases of chi-square for fixed parameters, and about all of them."""
+        These are the free with another that held-out pulses need most, or in exchange.
+        """
+        here = linear.score(free)
+        more = [sorted([*free, i]) for i in self._all if i not in free]
+        falls = [here - linear.score(other) for other in more]
+        if falls and max(falls) > NEEDED:
+            return more[int(np.argmax(falls))]
+        others = [(linear.cost(other)[0], other) for other in linear.others(free)]
+        cost, other = min(others, default=(np.inf, []))
+        return other if cost < linear.cost(free)[0] - NEEDED else None
+
+    def _examined(self, problem: JointProblem) -> Linear:
+        """What some of the pulses say of all parameters, also of those that are fixed."""
         parameters = problem.parameters
         fixed = [i for i in self._all if i not in parameters.free]
-        missing = problem.nearby.unknown(fixed)
         few = first(self._functions, LOOKED_AT_WITH)
-        if missing:
-            problem.nearby = problem.nearby.again(missing, events(few))
+        problem.nearby = problem.nearby.again(problem.nearby.outdated(fixed), events(few))
         chain, at = parameters.chain.response, parameters.coordinates
-        whole = self._problem(chain, problem.nearby, self._all, few, at=at)
-        information, selection = self._looked(whole)
-        here, _ = selection.cost(parameters.free)
-        falls = {i: here - selection.cost([*parameters.free, i])[0] for i in fixed}
-        return falls, information, selection
+        return self._looked(self._problem(chain, problem.nearby, self._all, few, at=at))
 
-    def _looked(self, problem: JointProblem) -> tuple[Information, Selection]:
+    def _looked(self, problem: JointProblem) -> Linear:
         """What all pulses, and each half of them, tell of the free parameters."""
         parameters, vector = problem.parameters, problem.parameters.vector()
         residuals, jacobian, _ = problem.both(vector)
         halves = []
         for k in range(2):
             half = [functions.some(slice(k, None, 2)) for functions in problem.functions]
-            halves.append(problem.of_parts(half).residuals(vector))
-        selection = Selection(
+            halves.append(replace(problem, functions=half).residuals(vector))
+        return Linear(
             jacobian,
             residuals,
             np.array(halves)[:, : problem.moments],
             parameters.coordinates[parameters.free],
+            parameters.widths,
+            sum(functions.pairs for functions in problem.functions),
         )
-        return Information.of(problem, jacobian), selection
-
-    def _alternatives(
-        self, problem: JointProblem, selection: Selection
-    ) -> list[tuple[JointProblem, Parabola]]:
-        """Fits of other sets of parameters that may explain the pulses as well."""
-        if self.chosen:
-            return []
-        free = problem.parameters.free
-        here, _ = selection.cost(free)
-        forecast = [(*selection.cost(other), other) for other in selection.others(free)]
-        forecast.sort(key=lambda forecasts: forecasts[0])
-        fits = []
-        for cost, place, other in forecast[:MAX_OTHERS]:
-            if cost - here > LIKELY:
-                break
-            is_free = np.isin(np.arange(self._n), other)
-            fit, nearby = problem, problem.nearby
-            try:
-                for _ in range(OTHER_ROUNDS):
-                    move = np.where(is_free, place, 0) - nearby.centre
-                    nearby = self._moved(nearby, move, other, np.inf)
-                    chain = fit.parameters.chain.response
-                    fit = self._problem(chain, nearby, other, weights=problem.weights)
-                    minimum = fit.fitted()
-                    place = fit.parameters.coordinates
-                    if _settled(fit, minimum, place - nearby.centre):
-                        break
-            except CpunetError:  # these physics cannot be simulated
-                continue
-            if not place[~is_free].any():  # all that is not free is as simulated
-                fits.append((fit, minimum))
-        return fits
 
     def _ended(
         self,
         problem: JointProblem,
-        end: Parabola,
         before: JointProblem,
-        rounds: int,
-        *,
-        settled: bool,
-    ) -> Calibrated:
-        promised, information, selection = self._examined(problem)
-        fits = [(problem, end), *self._alternatives(problem, selection)]
-        best = min(fits, key=lambda fit: fit[1].cost)
-        if best[1].cost < end.cost - NEEDED:
-            problem, end = best
-            promised, information, _ = self._examined(problem)
-        before = replace(before, weights=problem.weights)
+        linear: Linear,
+        **facts: Any,
+    ) -> tuple[JointProblem, CalibratedPhysics]:
+        """The result, without the sampling noise of the simulated events."""
         mean, spread = problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
-        scale = float(np.sqrt(max(1.0, problem.chi_square() / (mean + 2 * spread))))
+        scale = float(np.sqrt(max(1.0, problem.compared()[0] / (mean + 2 * spread))))
         move, covariance = of_events(problem, scale)
-        parameters = problem.parameters
+        parameters, physics = problem.parameters, self.simulator.physics
         moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
         parameters.set(moved)
-        rises = [(fit, minimum.cost - end.cost) for fit, minimum in fits]
-        rises.sort(key=lambda fit: fit[1])
-        return Calibrated(
-            problem=problem,
-            covariance=covariance,
-            chi_square_before=before.chi_square(),
-            pulls_before=before.pulls(),
-            chi_square=problem.chi_square(),
-            scale=scale,
-            information=information,
-            promised=promised,
-            rounds=rounds,
-            settled=settled,
-            alternatives=[fit for fit in rises if fit[0] is not problem and fit[1] < SAME],
+        (chi_before, pulls_before), (chi_after, pulls_after) = (
+            each.compared() for each in (replace(before, weights=problem.weights), problem)
         )
+        chi = ChiSquare(
+            before=chi_before,
+            after=chi_after,
+            moments=problem.moments,
+            expected=mean,
+            spread=spread,
+            errors_scaled_by=scale,
+        )
+        free, lines = parameters.free, []
+        others = [] if self.chosen else [*linear.others(free)]
+        for other in sorted(others, key=lambda other: linear.cost(other)[0])[:MAX_OTHERS]:
+            cost, place = linear.cost(other)
+            if (rise := cost - linear.cost(free)[0]) < SAME:
+                values = physics.values(place).items()
+                sizes = [f"{n} {v:.4g}" for i, (n, v) in enumerate(values) if i in other]
+                lines.append(f"{', '.join(sizes)} (chi-square {rise:+.1f})")
+        facts |= {"others": lines, "pulls_before": pulls_before.tolist()}
+        facts["pulls_after"] = pulls_after.tolist()
+        return problem, described(problem, covariance, chi, linear, **facts)
 
-    def _tell(self, when: str, problem: JointProblem, end: Parabola | None = None) -> None:
+    def _tell(
+        self, when: str, problem: JointProblem, chi_square: float, end: Parabola | None = None
+    ) -> None:
         parameters, physics = problem.parameters, self.simulator.physics
-        per = problem.chi_square() / problem.moments
-        words = [f"{when}: chi-square {per:.2f} per function"]
+        words = [f"{when}: chi-square {chi_square / problem.moments:.2f} per function"]
         errors = np.empty(0) if end is None else _errors(problem, end)
         for i, error in zip(parameters.free, errors, strict=True):
             value, own = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
@@ -385,9 +354,3 @@ def _relaxed(moved: Values, last: Values) -> Values:
     share = np.ones(len(moved))
     share[back] = 1 / (1 + np.abs(moved[back] / last[back]))
     return share * moved
-
-
-def _settled(problem: JointProblem, end: Parabola, moved: Values) -> bool:
-    """Whether all coordinates have moved by a small fraction of their errors."""
-    moves = np.abs(moved[problem.parameters.free])
-    return bool((moves < SETTLED * _errors(problem, end)).all())

@@ -59,27 +59,32 @@ class SlicedJoint(Joint):
         ]
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the functions."""
-        times, components = self.sides.time_ns, self.matrix.shape[1] - SEGMENTS
+    def names(self) -> dict[str, list[str]]:
+        """Names of the functions by group, both beginning with the band of several."""
+        times, n = np.array_split(self.sides.time_ns, SEGMENTS), self.matrix.shape[1] - SEGMENTS
+        components = [f"component {i}" for i in range(n, 0, -1)]
+        bins = [f"current amplitude, bin {k + 1}" for k in range(len(self.places))]
         density, slices, amplitudes = (range(1, len(c) + 1) for c, _ in self._bands)
-        names = (
-            *(
-                f"samples about {t[len(t) // 2]:.0f} ns"
-                for t in np.array_split(times, SEGMENTS)
-            ),
-            *(f"component {components - i}" for i in range(components)),
-            *(f"current amplitude, bin {k + 1}" for k in range(len(self.places))),
-            *(
-                f"component {components - i}, current amplitude, bin {k + 1}"
-                for k in range(len(self.places) if self.products else 0)
-                for i in range(components)
-            ),
-            *(f"drift time, bin {k}" for k in density),
-            *(f"component {c + 2}, slice {k}" for c in range(OTHERS) for k in slices),
-            *(f"current amplitude, bin {j}, slice {k}" for j in amplitudes for k in slices),
-        )
-        return tuple(f"{self.band}: {name}" if self.band else name for name in names)
+        others = range(2, OTHERS + 2)
+        groups = {
+            "samples": [f"samples about {t[len(t) // 2]:.0f} ns" for t in times],
+            "components": components,
+            "current amplitude": bins,
+            "components with current amplitude": [
+                f"{component}, {bin_}" for bin_ in bins for component in components
+            ],
+            "drift time": [f"drift time, bin {k}" for k in density],
+            "components in slices": [
+                f"component {c}, slice {k}" for c in others for k in slices
+            ],
+            "current amplitude in slices": [
+                f"current amplitude, bin {j}, slice {k}" for j in amplitudes for k in slices
+            ],
+        }
+        if not self.products:
+            del groups["components with current amplitude"]
+        band = f"{self.band}: " if self.band else ""
+        return {f"{band}{of}": [f"{band}{name}" for name in own] for of, own in groups.items()}
 
     @property
     def pairs(self) -> float:
@@ -91,9 +96,8 @@ class SlicedJoint(Joint):
         (density, _), (slices, _), (amplitudes, _) = self._sliced(shape, pulses)
         columns = [super()._functions(pulses), density]
         for values in (shape[:, -2 : -2 - OTHERS : -1], amplitudes):
-            columns.append(
-                (values[:, :, np.newaxis] * slices[:, np.newaxis]).reshape(len(shape), -1)
-            )
+            products = values[:, :, np.newaxis] * slices[:, np.newaxis]
+            columns.append(products.reshape(len(shape), -1))
         return np.concatenate(columns, axis=1)
 
     def _slopes(self, pulses: Aligned, changes: Floats, of_log: Floats) -> Values:

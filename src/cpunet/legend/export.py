@@ -83,12 +83,12 @@ def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
     --------
     >>> from cpunet.electronics.exponentials import Exponentials
     >>> chain = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
-    >>> nearest = equivalent_kernel(chain)
+    >>> nearest = equivalent_kernel(chain.step)
     >>> 10 < nearest.sigma_ns < 30, 60 < nearest.tau_ns < 90
     (True, True)
     """
     time = np.arange(LENGTH, dtype=float) - BEGIN
-    step = undecayed.step(time)
+    step = undecayed(time)
     wanted = _about_peak(averaged(step))
 
     def scaled(parameters: Values) -> tuple[Values, float]:
@@ -128,7 +128,7 @@ def current_delay_ns(undecayed: StepResponse) -> float:
     The three averages look back over 48 ns each. Half of their total length is subtracted, so
     that they add no delay.
     """
-    current = averaged(undecayed.step(np.arange(LENGTH, dtype=float) - BEGIN))
+    current = averaged(undecayed(np.arange(LENGTH, dtype=float) - BEGIN))
     return float(current.argmax() - BEGIN - 0.5 * WINDOWS * (WINDOW - 1))
 
 

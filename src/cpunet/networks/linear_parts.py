@@ -18,13 +18,8 @@ from cpunet.recipes.schema import PreparationConfig
 FIRST_NS, DENSE_NS, LAST_NS, KNOTS = -256.0, 768.0, 7040.0, 20
 RISE_NS, MODES = 48.0, 28  # of the two poles it begins with; its free smooth modes
 # Size of deviations (edge, rise, tail), their reach, and how smooth they are in asinh(t / T)
-SIZES, REACH_NS, CURVED_NS, SMOOTH, WHITE = (
-    (0.12, 0.024, 0.006),
-    (192.0, 1920.0),
-    96.0,
-    0.35,
-    3e-4,
-)
+SIZES, REACH_NS = (0.12, 0.024, 0.006), (192.0, 1920.0)
+CURVED_NS, SMOOTH, WHITE = 96.0, 0.35, 3e-4
 NOISE = 3e-3  # of an inverse at first, over the height of a pulse
 
 
@@ -132,9 +127,8 @@ class LearnedResponse(Linear):
         for size, reach in zip(SIZES, REACH_NS, strict=False):
             sizes += size * np.exp(-((ns / reach) ** 2))
         like = np.exp(-0.5 * ((u[:, None] - u) / SMOOTH) ** 2)
-        values, vectors = np.linalg.eigh(
-            sizes[:, None] * sizes * like + WHITE**2 * np.eye(len(u))
-        )
+        prior = sizes[:, None] * sizes * like + WHITE**2 * np.eye(len(u))
+        values, vectors = np.linalg.eigh(prior)
         rise = np.maximum(ns, 0) / RISE_NS
         begin = (1 - (1 + rise) * np.exp(-rise)) * np.exp(-decay * np.maximum(knots, 0))
         modes = vectors[:, -MODES:] * np.sqrt(values[-MODES:])
@@ -150,9 +144,8 @@ class LearnedResponse(Linear):
         knots = self.begin + self.modes @ self.sizes
         rate = torch.log((knots[-1] / knots[-4]).clamp(0.5, 1.2)) / self.spacing
         late = torch.arange(1.0, 1 + self.late, device=rate.device)  # goes on as it ends
-        return torch.cat(
-            [(self.between @ knots)[: -self.late], knots[-1] * torch.exp(rate * late)]
-        )
+        free = (self.between @ knots)[: -self.late]
+        return torch.cat([free, knots[-1] * torch.exp(rate * late)])
 
     def spectrum(self) -> Tensor:
         return self.spectrum_of(self.step())
@@ -180,10 +173,8 @@ class LearnedInverse(nn.Module):
         charge: Tensor = torch.fft.irfft(r.current(windows) * undone, r.padded).cumsum(dim=1)
         charge = charge[:, r.before : r.before + r.config.length]
         base = charge[:, : r.config.baseline_samples].mean(dim=1, keepdim=True)
-        late = r.config.samples(LATE_NS)
-        return (charge - base) / (charge[:, -late:].mean(dim=1, keepdim=True) - base).clamp_min(
-            0.1
-        )
+        late = charge[:, -r.config.samples(LATE_NS) :].mean(dim=1, keepdim=True)
+        return (charge - base) / (late - base).clamp_min(0.1)
 
 
 LATE_NS = 960.0  # at the end of a window, whose mean is 1

@@ -64,9 +64,8 @@ class PositionalMap(nn.Module):
     def __init__(self, channels: int, samples: int, offset: int, dropout: float) -> None:
         super().__init__()
         # a function of the architecture, not of the training: not saved
-        self.register_buffer(
-            "values", positional_map(channels, samples, offset), persistent=False
-        )
+        values = positional_map(channels, samples, offset)
+        self.register_buffer("values", values, persistent=False)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -104,9 +103,8 @@ class PositionalUNet(nn.Module):
             return double_convolution(channels_in, channels_out, channels_out, residual)
 
         self.inlet = block(2 if residual else 1, m)
-        self.down = nn.ModuleList(
-            [block(m, 2 * m), block(2 * m, 4 * m), block(4 * m, 8 * m), block(8 * m, 8 * m)]
-        )
+        pairs = (m, 2 * m), (2 * m, 4 * m), (4 * m, 8 * m), (8 * m, 8 * m)
+        self.down = nn.ModuleList(block(i, o) for i, o in pairs)
         self.latent_mean = nn.Conv1d(8 * m, 8 * m, 1)
         if not residual:
             self.latent_log_variance = nn.Conv1d(8 * m, 8 * m, 1)

@@ -88,8 +88,10 @@ class DriftClock(Stored):
         end = _first(windows >= END * highest)
         later: Values = np.zeros(end.shape)
         if self.keeps_begin:
-            took = end - _first(windows > BEGIN * highest) + 1
-            later = self._duration(took, 1e-3 * dt_ns) - took
+            took = longer = (end - _first(windows > BEGIN * highest) + 1).astype(float)
+            for _ in range(ROUNDS):  # of t = u (1 + a + b t)
+                longer = took * self._factor(longer, 1e-3 * dt_ns)
+            later = longer - took
         before = end + later - np.arange(windows.shape[1])
         source = end - before / self._factor(before, 1e-3 * dt_ns)
         return at_times(windows, source)
@@ -99,13 +101,6 @@ class DriftClock(Stored):
         us = (dt_us * before).clip(0.0, LONGEST_US)
         factor = 1 + sum(term * us**i for i, term in enumerate(self.stretch))
         return np.maximum(factor, MIN_STRETCH)
-
-    def _duration(self, took: npt.NDArray[np.intp], dt_us: float) -> Values:
-        """Duration of a drift in samples in the detector, given that simulated."""
-        longer = took.astype(float)
-        for _ in range(ROUNDS):  # t = u (1 + a + b t)
-            longer = took * self._factor(longer, dt_us)
-        return longer
 
     def describe(self) -> dict[str, float]:
         """Fitted values by name, with the unit at the end of the name."""
@@ -202,10 +197,8 @@ class ElectronicsResponse(Stored):
 
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         self.config, self.dt_ns = config, np.array(float(dt_ns))
-        self.log_poles_ns, self.log_decay_us = (
-            np.log(config.poles_ns),
-            np.log([config.decay_us]),
-        )
+        self.log_poles_ns = np.log(config.poles_ns)
+        self.log_decay_us = np.log([config.decay_us])
         self.slow_ns = np.array(config.slow_ns, float)
         self.fast_decays_us = np.array(config.fast_decays_us, float)
         self.slow_weights = np.zeros(len(self.slow_ns))
@@ -248,8 +241,10 @@ class ElectronicsResponse(Stored):
             Shape (batch, record_length).
         """
         length = record_length(windows.shape[1], dt_ns := float(self.dt_ns))
-        padded = padded_length(length)
-        spectrum = current_spectrum(self.drifted(windows), padded, dt_ns)
+        moved, before, padded = self.drifted(windows), padding(dt_ns)[0], padded_length(length)
+        current = np.zeros((len(moved), before + moved.shape[1]), moved.dtype)
+        current[:, before:] = np.diff(moved, axis=1, prepend=0)
+        spectrum: Spectrum = scipy.fft.rfft(current, padded)
         spectrum *= self.transfer(padded).astype(np.complex64)
         signal: npt.NDArray[np.float32] = scipy.fft.irfft(spectrum, padded, overwrite_x=True)
         return signal[:, :length]
@@ -270,10 +265,8 @@ class ElectronicsResponse(Stored):
         """
         dt_ns = float(self.dt_ns)
         frequency = np.fft.rfftfreq(padded)
-        image = np.arange(-IMAGES, IMAGES + 1)[:, np.newaxis]
-        everywhere = frequency + image.astype(
-            float
-        )  # (images, frequencies), in units of 1/period
+        image = np.arange(-IMAGES, IMAGES + 1.0)[:, np.newaxis]
+        everywhere = frequency + image  # (images, frequencies), in units of 1/period
         passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
         passed = passed * (1 + self.sharpness / 24 * (2 * math.pi * everywhere) ** 2)
         fast = (_spline(everywhere) * passed).sum(axis=0)
@@ -370,20 +363,7 @@ def _spline(frequency: Values) -> Values:
     return np.asarray(np.sinc(frequency) ** 4 * 3 / (2 + np.cos(2 * math.pi * frequency)))
 
 
-def current_spectrum(windows: Floats, padded: int, dt_ns: float) -> Spectrum:
-    """Spectra of the current of windows (..., samples) within records."""
-    before = padding(dt_ns)[0]
-    current = np.zeros((*windows.shape[:-1], before + windows.shape[-1]), windows.dtype)
-    current[..., before:] = np.diff(windows, axis=-1, prepend=0)
-    spectrum: Spectrum = scipy.fft.rfft(current, padded)
-    return spectrum
-
-
 def padded_length(length: int) -> int:
-    """Length of the Fourier transform of a record of this length, in samples."""
-    return fast_length(math.ceil(MIN_FACTOR * length))
-
-
-def fast_length(least: int) -> int:
-    """Smallest even number of `least` or more with no prime factors except 2, 3 and 5."""
-    return 2 * int(scipy.fft.next_fast_len((least + 1) // 2, real=True))
+    """Length of the Fourier transform of a record of this length, even, in samples."""
+    half = (math.ceil(MIN_FACTOR * length) + 1) // 2
+    return 2 * int(scipy.fft.next_fast_len(half, real=True))

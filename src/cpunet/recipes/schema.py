@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
@@ -26,22 +26,22 @@ def _rising(ends: tuple[float, float]) -> tuple[float, float]:
 
 
 class Timed(Config):
-    """Settings with times, which are numbers of samples at a sampling period.
+    """Settings with times, which are numbers of samples at a sampling period."""
 
-    ``dt_ns`` is no setting: `at` gives it, and it is not stored.
-    """
-
-    dt_ns: Annotated[Positive | None, Field(exclude=True, repr=False)] = None
+    _dt_ns: float | None = PrivateAttr(None)
 
     def at(self, dt_ns: float) -> Self:
-        """The same settings for pulses with a sampling period in ns."""
-        return self.model_copy(update={"dt_ns": float(dt_ns)})
+        """The same settings, with all parts, for pulses with a sampling period in ns."""
+        parts = {name: part.at(dt_ns) for name, part in self if isinstance(part, Timed)}
+        timed = self.model_copy(update=parts)
+        timed._dt_ns = float(dt_ns)  # noqa: SLF001  # of a copy
+        return timed
 
     @property
     def sampled_ns(self) -> float:
         """The sampling period; `at` comes first."""
-        assert self.dt_ns is not None
-        return self.dt_ns
+        assert self._dt_ns is not None
+        return self._dt_ns
 
     def samples(self, time_ns: float) -> int:
         """Number of samples of a time in ns."""
@@ -217,9 +217,6 @@ class CutConfig(Config):
     baseline_sigmas: Positive
 
 
-_Number = Annotated[int, Field(ge=1, le=1000)]
-
-
 class LossConfig(Timed):
     """Weights of the eight losses and of the three windows of the L1 terms."""
 
@@ -236,12 +233,11 @@ class LossConfig(Timed):
     @property
     def edges(self) -> tuple[int, int]:
         """Samples at which the baseline and the rising edge end."""
-        return self.samples(self.baseline_ns), self.samples(
-            self.baseline_ns + self.rising_edge_ns
-        )
+        end_ns = self.baseline_ns + self.rising_edge_ns
+        return self.samples(self.baseline_ns), self.samples(end_ns)
 
 
-class TrainingConfig(Config):
+class TrainingConfig(Timed):
     """Settings of the game of generators and critics, see `cpunet.training.adversarial`.
 
     Rates rise over ``warmup`` iterations, and fall from ``decay_start`` on as the part that is
@@ -307,7 +303,7 @@ class MatchingConfig(Timed):
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     drift_terms: DriftTerms
-    noise_sets: _Number
+    noise_sets: Annotated[int, Field(ge=1, le=1000)]
 
     @property
     def before(self) -> int:
@@ -388,16 +384,8 @@ class SearchConfig(Config):
 Critics = Annotated[GruConfig | ConvolutionalConfig, Field(discriminator="name")]
 
 
-class ResidualConfig(Config):
-    """Networks behind a matched response, and its inverse, which learn what these do not do."""
-
-    generator: PunetConfig
-    discriminator: Critics
-    training: TrainingConfig
-
-
-class CycleGanSettings(NamedTuple):
-    """The parts of a recipe that make a CycleGAN."""
+class CycleGanConfig(Timed):
+    """A CycleGAN: alone, or behind a matched response and its inverse, which it corrects."""
 
     generator: PunetConfig
     discriminator: Critics
@@ -411,7 +399,7 @@ class MatchingSettings(NamedTuple):
     training: MatchingConfig
 
 
-class Recipe(Config):
+class Recipe(Timed):
     """Everything that determines a run except its files, its seed and its device."""
 
     name: str
@@ -421,7 +409,7 @@ class Recipe(Config):
     cuts: CutConfig
     generator: Annotated[PunetConfig | ResponseConfig, Field(discriminator="name")]
     discriminator: Critics | None
-    residual: ResidualConfig | None = None
+    residual: CycleGanConfig | None = None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
     search: dict[str, SearchConfig] | None = None
@@ -438,40 +426,22 @@ class Recipe(Config):
         >>> [load_recipe("published").at(dt).preparation.length for dt in (16, 10, 4)]
         [800, 1280, 3200]
         """
-        preparation, training, residual = (
-            self.preparation.at(dt_ns),
-            self.training,
-            self.residual,
-        )
-        if residual is not None:
-            game = residual.training
-            game = game.model_copy(update={"losses": game.losses.at(dt_ns)})
-            residual = residual.model_copy(update={"training": game})
-        if isinstance(training, MatchingConfig):
-            training = training.at(dt_ns)
-        else:
-            training = training.model_copy(update={"losses": training.losses.at(dt_ns)})
+        timed, preparation = super().at(dt_ns), self.preparation
         if isinstance(self.generator, PunetConfig) and self.generator.linear == "none":
             step = dt_ns * math.lcm(8, getattr(self.discriminator, "samples_per_step", 1))
             sides = ("before_ns", "after_ns")
             whole = {side: round(getattr(preparation, side) / step) * step for side in sides}
-            preparation = preparation.model_copy(update=whole)
-        return self.model_copy(
-            update={
-                "preparation": preparation,
-                "training": training,
-                "residual": residual,
-                "scores": self.scores.at(dt_ns),
-            }
-        )
+            preparation = timed.preparation.model_copy(update=whole)
+            return timed.model_copy(update={"preparation": preparation})
+        return timed
 
     @property
     def networks(self) -> bool:
         """Whether networks are trained."""
-        return self.residual is not None or isinstance(self.training, TrainingConfig)
+        return self.residual is not None or self.training.method == "cyclegan"
 
     @property
-    def cyclegan(self) -> CycleGanSettings:
+    def cyclegan(self) -> CycleGanConfig:
         """The settings of a CycleGAN.
 
         Raises
@@ -479,15 +449,12 @@ class Recipe(Config):
         CpunetError
             If the recipe does not train a CycleGAN.
         """
-        of = self if self.residual is None else self.residual
-        match of.generator, of.discriminator, of.training:
-            case (
-                PunetConfig() as generator,
-                GruConfig() | ConvolutionalConfig() as critic,
-                TrainingConfig() as training,
-            ):
-                return CycleGanSettings(generator, critic, training)
-        raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
+        if self.residual is not None:
+            return self.residual
+        if not self.networks:
+            raise CpunetError(f"recipe {self.name}: does not train a CycleGAN")
+        parts = {name: getattr(self, name) for name in CycleGanConfig.model_fields}
+        return CycleGanConfig(**parts)
 
     @property
     def matching(self) -> MatchingSettings:

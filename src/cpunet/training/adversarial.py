@@ -16,7 +16,9 @@ losses, an iteration, the loop.  Critics see views of pulses (`cpunet.training.v
 from __future__ import annotations
 
 import copy
+import logging
 import math
+import signal
 from collections.abc import Callable
 
 import torch
@@ -30,8 +32,10 @@ from cpunet.training.judging import JUDGED, Judge, judged
 from cpunet.training.optimisers import Optimisers
 from cpunet.training.run import Record
 from cpunet.training.sides import Sides
-from cpunet.training.unfinished import Interruption, State, restore, state_of
+from cpunet.training.unfinished import State, waiting_signals
 from cpunet.training.views import View, half_sample
+
+log = logging.getLogger(__name__)
 
 SIZE, FAST_NS, AROUND_NS = 0.1, 128.0, 2048.0  # of a change by U, its current, and its stretch
 SLOPE, SHARP, TOP = 0.2, 4.0, 6.0  # of the critic
@@ -54,9 +58,7 @@ class Residual(nn.Module):
         height = pulses.detach().amax(dim=1, keepdim=True).clamp_min(0.1)
         x = pulses.gather(1, index.clamp(0, pulses.shape[1] - 1)) / height
         seen = torch.stack([2 * x[:, 1:] - 1, self.scale * x.diff(dim=1)], dim=1)
-        change: Tensor = (
-            pad(SIZE * self.unet(seen)[:, 0], (1, 0)) * height
-        )  # first 0, then held
+        change: Tensor = pad(SIZE * self.unet(seen)[:, 0], (1, 0)) * height  # begins with 0
         since = torch.arange(1, 1 + pulses.shape[1], device=at.device) - at
         return change.gather(1, since.clamp(0, n))
 
@@ -109,13 +111,6 @@ class Critic(nn.Module):
         return self.out(joined)[:, 0]  # type: ignore[no-any-return]
 
 
-def critic_of(config: schema.ConvolutionalConfig | schema.GruConfig, view: View) -> nn.Module:
-    """A new critic that reads views."""
-    if isinstance(config, schema.GruConfig):
-        return GruDiscriminator(config)
-    return Critic(config, view.n_edge, view.size)
-
-
 def window_weights(config: schema.LossConfig, length: int) -> Tensor:
     """Weight of each sample in the L1 losses: baseline, edge and tail count by their means."""
     begin, end = config.edges
@@ -155,19 +150,22 @@ class Game:
     """Generators, critics of both sides, and an iteration of their training."""
 
     def __init__(
-        self, ren: Generator, iren: Generator, sides: Sides, settings: schema.CycleGanSettings
+        self, ren: Generator, iren: Generator, sides: Sides, settings: schema.CycleGanConfig
     ) -> None:
         self.ren, self.iren, self.sides, self.config = ren, iren, sides, settings.training
         c, critic, device = settings.training, settings.discriminator, sides.data.pulses.device
         self.weights = window_weights(c.losses, sides.preparation.length).to(device)
         some = self.with_noise(sides.sim.draw(min(SOME, 4 * sides.sim.seen)))
-        real, own = (
-            {"data": sides.data.pulses[: sides.data.seen], "sim": some},
-            sides.preparation,
-        )
+        real, own = {"data": sides.data.pulses[: sides.data.seen]}, sides.preparation
+        real["sim"] = some
         with torch.no_grad():
             self.views = {side: View(side, those, critic, own) for side, those in real.items()}
-        critics = {side: critic_of(critic, view) for side, view in self.views.items()}
+        critics = {
+            side: GruDiscriminator(critic)
+            if isinstance(critic, schema.GruConfig)
+            else Critic(critic, view.n_edge, view.size)
+            for side, view in self.views.items()
+        }
         self.critics = nn.ModuleDict(critics).to(device)
         self.generators = nn.ModuleDict({"ren": ren, "iren": iren}).to(device).train()
         self.average = copy.deepcopy(self.generators).requires_grad_(False)
@@ -179,6 +177,24 @@ class Game:
         self.iteration, self.rate, self.right = 0, 0.0, dict[str, float]()
         names = "generators", "critics", "average", "good", "optimisers", "judge"
         self.parts = {name: getattr(self, name) for name in names}  # which a state is of
+
+    def state(self) -> State:
+        """All that the next iterations depend on, except pulses and settings."""
+        return {
+            "iteration": self.iteration,
+            "right": dict(self.right),
+            "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
+            "parts": {name: part.state_dict() for name, part in self.parts.items()},
+        }
+
+    def restore(self, state: State) -> None:
+        """Continue from a state of the same pulses and settings."""
+        self.iteration, self.right = state["iteration"], dict(state["right"])
+        for name, part in self.parts.items():
+            part.load_state_dict(state["parts"][name])
+        torch.set_rng_state(state["random"][0])
+        if torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(state["random"][1:])
 
     @torch.no_grad()
     def with_noise(self, rows: Tensor) -> Tensor:
@@ -269,15 +285,16 @@ def train(
     and at Ctrl-C or SIGTERM, which act between iterations.  A loss or weight that is not finite
     is a `CpunetError`.
     """
-    with torch.random.fork_rng(), Interruption() as interruption:
+    with torch.random.fork_rng(), waiting_signals() as waiting:
         torch.manual_seed(seed)
         game, records = make(), list[Record]()
-        restore(game, start)
+        if start is not None:
+            game.restore(start)
         c = game.config
         while game.iteration < c.iterations and not game.judge.ended:
             losses, done = game.step(), game.iteration
             records.append({"iteration": done - 1, "rate": game.rate, "losses": losses})
-            stop = interruption.signal if done < c.iterations else 0
+            stop = bool(waiting) and done < c.iterations
             keep = stop or done == c.iterations or done % c.checkpoint_interval == 0
             if done % JUDGED == 0:
                 records[-1]["accuracy"] = judged(game)
@@ -290,10 +307,11 @@ def train(
                 listener(records)
                 records = []
             if keep:
-                save(state_of(game))
+                save(game.state())
             if stop:
                 text = f"stopped after {done} of {c.iterations} iterations"
-                interruption.act(f"{text}; resume goes on from it")
+                log.info(f"{text}; resume goes on from it")
+                signal.raise_signal(waiting[0])
         if records:
             listener(records)
     if game.judge.over.get("data") == "won":

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from cpunet.electronics.exponentials import FloatArray
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -20,10 +20,9 @@ from cpunet.training.closed_forms import (
     Chain,
     Numbers,
     chain_numbers,
-    fitted_errors,
     learned_chain,
+    moved_along_axes,
     noise_numbers,
-    propagated,
     reaches_ns,
     slow_numbers,
     with_noise,
@@ -55,6 +54,9 @@ class DescribedChain:
         All parameters of the fit.
     doubts
         Reasons why these do not describe a readout alone.
+    moved
+        Changes of derived numbers along each axis of the error ellipsoid, see
+        `moved_along_axes`.
     """
 
     run: Run
@@ -64,6 +66,7 @@ class DescribedChain:
     parameters: Numbers
     parameter_errors: Numbers
     doubts: list[str]
+    moved: dict[str, FloatArray]
 
 
 def describe_chain(run: Run) -> DescribedChain:
@@ -95,35 +98,33 @@ def describe_chain(run: Run) -> DescribedChain:
         slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
         return slow_numbers(slow) | numbers
 
-    errors = fitted_errors(response, fit.errors)
-    errors |= propagated(response, fit.covariance, derived)
     hidden = "slow_" if "deviation" not in parameters else HIDDEN
     values = {n: v for n, v in parameters.items() if not n.startswith(hidden)}
     values |= derived(response) | noise_numbers(chain)
     if fit.chi_square_per_moment is not None:
         values["chi_square_per_moment"] = fit.chi_square_per_moment
+    errors = {  # of the fit; those of times are of their logarithms
+        name: (value if label.startswith("log_") else 1.0) * fit.errors[label]
+        for name, (label, value) in response.named().items()
+        if label in fit.errors
+    }
+    moved = moved_along_axes(response, fit.covariance, derived)
+    errors |= {name: float(np.sqrt(sum(changes**2))) for name, changes in moved.items()}
+    of_values = {n: e for n, e in errors.items() if n in values and not PARTS.match(n)}
+    error, rms = fit.noise.get("rms_error"), fit.noise.get("rms")
+    if error and rms and chain.noise is not None:
+        # of the baselines, and of the height of a full charge
+        end_ns = reaches_ns(chain, preparation.align_fraction) + preparation.after_ns
+        sooner, at_once = (float(chain.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
+        relative = float(np.hypot(error / rms, sooner / at_once - 1))
+        of_values["noise_rms_kev"] = values["noise_rms_kev"] * relative
     doubts = beyond(parameters) + stretched(parameters, fit.gains)
     if response.by_height is not None:
         doubts.append("the electronics act by the height of a pulse; this is their linear part")
     if fit.causes:
         substitute = "these numbers stand in for what is wrong with the simulation, too"
         doubts.insert(0, f"the fit is {fit.verdict}; {substitute}: {fit.causes[0]}")
-    of_values = {n: e for n, e in errors.items() if n in values and not PARTS.match(n)}
-    of_values |= _noise_error(run, chain)
-    return DescribedChain(run, chain, values, of_values, parameters, errors, doubts)
-
-
-def _noise_error(run: Run, chain: Chain) -> Numbers:
-    """Error of the noise in keV, from the baselines and the height of a full charge."""
-    measured = {} if run.fit is None else run.fit.noise
-    error, rms = measured.get("rms_error"), measured.get("rms")
-    if not error or not rms or chain.noise is None:
-        return {}
-    preparation = run.recipe.preparation
-    end_ns = reaches_ns(chain, preparation.align_fraction) + preparation.after_ns
-    sooner, at_once = (float(chain.whole.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
-    kev = noise_numbers(chain)["noise_rms_kev"]
-    return {"noise_rms_kev": kev * float(np.hypot(error / rms, sooner / at_once - 1))}
+    return DescribedChain(run, chain, values, of_values, parameters, errors, doubts, moved)
 
 
 WORST = 8  # maximum number of deviating moments of a fit
@@ -133,26 +134,27 @@ _FAR = 3.0  # standard deviations
 
 def summary(run: Run) -> list[tuple[str, str]]:
     """Topics and texts on a run."""
-    fit = run.fit or FitInfo()
-    where = run.name
-    response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
-    when = run.started[:16].replace("T", " ")
-    tails = fit.tails
+    fit, where = run.fit or FitInfo(), run.name
+    worst = sorted(fit.pulls, key=lambda name: -abs(fit.pulls[name]))[:WORST]
+    off = (f"{name} {fit.pulls[name]:+.1f} σ" for name in worst if abs(fit.pulls[name]) > _FAR)
+    delay = (
+        f"{fit.delay_ns:.1f} ns, half rise of a step; translated pulses have it taken off t0"
+    )
     lines = [
         ("run", where),
         (
             "trained",
             f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; "
-            f"{when}, {run.seconds:.4g} s on {run.device}",
+            f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}",
         ),
         ("from", run.init or ""),
         ("simulated", _side(run.sim)),
         ("measured", _side(run.data)),
         ("fit", fit.verdict),
-        ("off", _deviations(fit.pulls)),
+        ("off", ", ".join(off)),
         *(("cause", cause) for cause in fit.causes),
-        ("response", _parameters(fit.parameters)),
-        ("delay", _delay(fit)),
+        ("response", ", ".join(_parameter(*item) for item in fit.parameters.items())),
+        ("delay", f"{fit.delay_ns:.1f} ns, {delay}" if fit.delay_ns else ""),
     ]
     if "baselines" in fit.noise:
         size = ""
@@ -161,17 +163,12 @@ def summary(run: Run) -> list[tuple[str, str]]:
             kev, error = (of.get("noise_rms_kev") for of in (chain.values, chain.errors))
             size = f"{with_std(kev, error)} keV (RMS), "
         lines.append(("noise", f"{size}of {fit.noise['baselines']:.0f} baselines"))
-    if tails is not None and "rate_khz" in tails.model_fields_set:
-        lines += tails.in_words()
+    if fit.tails is not None and "rate_khz" in fit.tails.model_fields_set:
+        lines += fit.tails.in_words()
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
+    response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]
-
-
-def _delay(fit: FitInfo) -> str:
-    if not fit.delay_ns:
-        return ""
-    return f"{fit.delay_ns:.1f} ns, half rise of a step; translated pulses have it taken off t0"
 
 
 def _side(side: SideInfo) -> str:
@@ -184,23 +181,13 @@ def _side(side: SideInfo) -> str:
     return f"{text}, left out {lost}" if lost else text
 
 
-def _deviations(pulls: Mapping[str, float]) -> str:
-    """Parts of the pulses that deviate, worst first."""
-    worst = sorted(pulls, key=lambda name: -abs(pulls[name]))[:WORST]
-    return ", ".join(f"{n} {pulls[n]:+.1f} σ" for n in worst if abs(pulls[n]) > _FAR)
-
-
-def _parameters(values: Mapping[str, float]) -> str:
-    """Parameters of a readout chain; ``slow_100_ns`` and such are shares of the charge."""
-    words = []
-    for name, value in values.items():
-        name = name.replace("drift_stretch_per_us", "drift-time scale, per µs")
-        name = name.replace("drift_stretch", "drift-time scale")
-        stem, _, unit = name.rpartition("_")
-        shown = f" {UNITS[unit]}" if unit in UNITS else ""
-        called = (stem if shown else name).replace("_", " ")
-        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation|drift-.*", name):
-            words.append(f"{called}{shown} {percent(100 * value)}")
-        else:
-            words.append(f"{called} {value:.4g}{shown}")
-    return ", ".join(words)
+def _parameter(name: str, value: float) -> str:
+    """A parameter of a readout chain; ``slow_100_ns`` and such are shares of the charge."""
+    name = name.replace("drift_stretch_per_us", "drift-time scale, per µs")
+    name = name.replace("drift_stretch", "drift-time scale")
+    stem, _, unit = name.rpartition("_")
+    shown = f" {UNITS[unit]}" if unit in UNITS else ""
+    called = (stem if shown else name).replace("_", " ")
+    if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation|drift-.*", name):
+        return f"{called}{shown} {percent(100 * value)}"
+    return f"{called} {value:.4g}{shown}"

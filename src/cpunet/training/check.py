@@ -124,18 +124,15 @@ class CheckResult:
         if not self.sides:
             raise CpunetError("no pulses of both sides to draw")
         names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
-        sides = {name: self.sides[side] for name, side in names.items()}
-        axes = {
-            "Time from 10 to 50 % [ns]": lambda inputs: _rise_ns(
-                _of_height_one(inputs), inputs.dt_ns
-            ),
-            "Current amplitude [1/sample]": _amplitudes,
-        }
+        dt_ns = self.sides["data"].dt_ns
+        pulses = {name: _of_height_one(self.sides[side]) for name, side in names.items()}
+        rises = {name: _rise_ns(of, dt_ns) for name, of in pulses.items()}
+        amplitudes = {name: current_amplitude(of, dt_ns) for name, of in pulses.items()}
         return sides_figure(
-            {name: _of_height_one(inputs) for name, inputs in sides.items()},
-            {axis: {n: of(inputs) for n, inputs in sides.items()} for axis, of in axes.items()},
-            self.sides["data"].dt_ns,
-            {name: len(inputs.prepared) for name, inputs in sides.items()},
+            pulses,
+            {"Time from 10 to 50 % [ns]": rises, "Current amplitude [1/sample]": amplitudes},
+            dt_ns,
+            {name: len(self.sides[side].prepared) for name, side in names.items()},
         )
 
     def save(self, path: str | Path, force: bool = False) -> None:
@@ -218,8 +215,7 @@ def check(
     ``cpunet check --sim sim.lh5 --data raw.lh5 --data-table all``
     """
     both = read.files(sim, data)
-    picture = None if out is None else Path(out)
-    alone = both[1].table != ALL
+    picture, alone = None if out is None else Path(out), both[1].table != ALL
     if picture is not None:
         given = None if isinstance(recipe, Recipe) else recipe
         files = *both[0].files, *both[1].files, given
@@ -238,16 +234,13 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
     """Read both sides as in a training, and compare them."""
     if isinstance(pair, CpunetError):
         return CheckResult([_refusal(pair)])
-    selection = parse_selection(peak, recipe.peaks)
-    findings: list[Finding] = []
+    selection, findings = parse_selection(peak, recipe.peaks), list[Finding]()
     sets: dict[str, InputSet] = {}
     kinds: tuple[tuple[str, Kind], ...] = (("data", "measured"), ("sim", "simulated"))
     for (side, kind), file in zip(kinds, pair[::-1], strict=True):
+        how = {"tell": False, "shorten": side == "data"}
         try:
-            measured = side == "data"
-            sets[side] = load_pulses(
-                file, kind, recipe, selection, tell=False, shorten=measured
-            )
+            sets[side] = load_pulses(file, kind, recipe, selection, **how)
             recipe = sets[side].recipe
         except CpunetError as error:
             findings.append(_refusal(error))
@@ -263,19 +256,40 @@ def compare_sides(
     sim: InputSet, data: InputSet, selection: EnergySelection, preparation: PreparationConfig
 ) -> list[Finding]:
     """Compare two prepared sets."""
-    findings = [*_required(sim, data, selection)]
-    if any(finding.level == Level.ERROR for finding in findings):
-        return findings
+    findings = []
+    try:  # without these a training raises an error
+        require_same_sampling(sim, data)
+        findings.append(Finding(Level.FINE, f"every {data.dt_ns:g} ns"))
+        notes = require_both_sides(sim, data, selection)
+        findings += [Finding(Level.WARNING, note) for note in notes]
+    except CpunetError as error:
+        return [*findings, _refusal(error)]
     too_short = [*_too_short(sim, preparation)]
     findings += too_short
     for inputs, side in ((sim, "simulated"), (data, "measured")):
-        findings += [_count(inputs, side), *_lines(inputs, side, selection)]
+        n = len(inputs.prepared)
+        text = f"{inputs.path.name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
+        remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
+        findings += [_judged(text, remedy, n >= FEW, n < MIN_PULSES)]
+        findings += _lines(inputs, side, selection)
         if not too_short:  # else pulses in their own baselines would be blamed on others
             findings += _left_out(inputs, side)
     if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
         return findings  # too few to compare shapes
-    spreads = [] if too_short else [_spread(sim, data)]
-    return [*findings, *spreads, _amplitude(sim, data)]
+    if not too_short:
+        findings.append(_spread(sim, data))
+    # no readout increases current amplitudes much
+    highest = [
+        float(np.nanquantile(current_amplitude(_of_height_one(inputs), inputs.dt_ns), 0.9))
+        for inputs in (sim, data)
+    ]
+    ratio = highest[1] / highest[0]
+    text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
+    remedy = (
+        "electronics cannot make pulses sharper: another detector, too wide a cloud, or other "
+        "energies"
+    )
+    return [*findings, _judged(text, remedy, ratio < SHARPER, ratio > OTHER_SHARPER)]
 
 
 def _judged(text: str, remedy: str, fine: bool, other: bool = False) -> Finding:
@@ -287,32 +301,6 @@ def _judged(text: str, remedy: str, fine: bool, other: bool = False) -> Finding:
 
 def _refusal(error: CpunetError) -> Finding:
     return Finding(Level.ERROR, error.text, error.remedy)
-
-
-def _required(sim: InputSet, data: InputSet, selection: EnergySelection) -> Iterator[Finding]:
-    """Check the conditions without which a training raises an error."""
-    try:
-        require_same_sampling(sim, data)
-    except CpunetError as error:
-        yield _refusal(error)
-    else:
-        yield Finding(Level.FINE, f"every {data.dt_ns:g} ns")
-    try:
-        notes = require_both_sides(sim, data, selection)
-    except CpunetError as error:
-        yield _refusal(error)
-    else:
-        yield from (Finding(Level.WARNING, note) for note in notes)
-
-
-def _count(inputs: InputSet, side: str) -> Finding:
-    n = len(inputs.prepared)
-    text = f"{inputs.path.name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
-    if n >= FEW:
-        return Finding(Level.FINE, text)
-    level = Level.ERROR if n < MIN_PULSES else Level.WARNING
-    remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
-    return Finding(level, text, remedy)
 
 
 REMEDIES = {
@@ -346,25 +334,19 @@ def _too_short(sim: InputSet, preparation: PreparationConfig) -> Iterator[Findin
     waveforms, at = _of_height_one(sim), preparation.at(sim.dt_ns).samples_before
     begin = at - (waveforms > BEGUN).argmax(axis=1)
     end = waveforms.shape[1] - (waveforms[:, ::-1] < 1 - BEGUN).argmax(axis=1) - at
-    rooms = {
-        "before_ns": (
-            begin,
-            preparation.before_ns - preparation.baseline_ns,
-            "begin",
-            "before",
-        ),
-        "after_ns": (end, preparation.after_ns - preparation.decay_fit_ns, "rise", "after"),
-    }
-    for name, (samples, room_ns, what, where) in rooms.items():
+    for where, what, samples, window_ns, taken_ns in (
+        ("before", "begin", begin, preparation.before_ns, preparation.baseline_ns),
+        ("after", "rise", end, preparation.after_ns, preparation.decay_fit_ns),
+    ):
         longest_ns = float(np.quantile(samples, LONGEST)) * sim.dt_ns
-        if longest_ns > room_ns:
-            wanted = getattr(preparation, name) + longest_ns - room_ns
+        if longest_ns > (room_ns := window_ns - taken_ns):
+            wanted = window_ns + longest_ns - room_ns
             yield Finding(
                 Level.WARNING,
                 f"the window is shorter than the drift: pulses {what} up to "
                 f"{longest_ns:.0f} ns {where} half of their height, for which it has "
                 f"{room_ns:.0f} ns",
-                f"preparation.{name}={100 * math.ceil(wanted / 100)} in `settings`",
+                f"preparation.{where}_ns={100 * math.ceil(wanted / 100)} in `settings`",
             )
 
 
@@ -376,11 +358,9 @@ def _left_out(inputs: InputSet, side: str) -> Iterator[Finding]:
     selected = len(inputs.prepared) + sum(counts.values())
     for label, n in counts.items():
         if n > LOST * selected or label == Rejection.COPIES.label:
-            text = (
-                f"{inputs.path.name}: {100 * n / selected:.0f} % of the {side} pulses left out"
-            )
+            part = f"{100 * n / selected:.0f} % of the {side} pulses left out ({label})"
             remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
-            yield Finding(Level.WARNING, f"{text} ({label})", remedy)
+            yield Finding(Level.WARNING, f"{inputs.path.name}: {part}", remedy)
 
 
 def _lines(inputs: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
@@ -406,15 +386,34 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
 
     A readout adds nearly the same time to long rises, and hides differences of short ones.
     """
-    measured = _rise_ns(_of_height_one(data), data.dt_ns)
-    rises = [_slowed_rises_ns(sim, float(np.median(measured))), measured]
-    ranges = [_range(rise) for rise in rises]
+    dt_ns, waveforms = sim.dt_ns, _of_height_one(sim)
+    measured, simulated = _rise_ns(_of_height_one(data), dt_ns), _rise_ns(waveforms, dt_ns)
+    median_ns = float(np.median(measured))
+    if np.median(simulated) < median_ns:  # then behind a Gaussian response of this median
+
+        def rises(sigma_ns: float) -> Values:
+            slow = gaussian_filter1d(waveforms, sigma_ns / dt_ns, axis=1, mode="nearest")
+            return _rise_ns(slow, dt_ns)
+
+        low, high = 0.0, median_ns
+        while high - low > dt_ns / ROUNDING:
+            middle = (low + high) / 2
+            slower = np.median(rises(middle)) < median_ns
+            low, high = (middle, high) if slower else (low, middle)
+        simulated = rises(high)
+
+    def range_(values: Values) -> float:
+        low, high = np.quantile(values, (0.05, 0.95))
+        return float(high - low)
+
+    ranges = [range_(rise) for rise in (simulated, measured)]
     errors = [
-        np.std([_range(rise[k::PARTS]) for k in range(PARTS)]) / PARTS**0.5 for rise in rises
+        np.std([range_(rise[k::PARTS]) for k in range(PARTS)]) / PARTS**0.5
+        for rise in (simulated, measured)
     ]
     text = "drift times (10 to 50 %) spread over {:.0f} ns simulated, {:.0f} ns measured"
     ratio = ranges[1] / max(ranges[0], 1e-9)
-    chance = float(np.hypot(SURE * np.hypot(*errors), ROUNDING * data.dt_ns))
+    chance = float(np.hypot(SURE * np.hypot(*errors), ROUNDING * dt_ns))
     fine = 1 / SPREAD_RATIO < ratio < SPREAD_RATIO or abs(ranges[1] - ranges[0]) < chance
     other = not 1 / OTHER_SPREAD < ratio < OTHER_SPREAD
     remedy = (
@@ -426,45 +425,11 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
     return _judged(text.format(*ranges), remedy, fine, other)
 
 
-def _slowed_rises_ns(sim: InputSet, median_ns: float) -> Values:
-    """Rises of simulated pulses behind a Gaussian response, if need be, of this median."""
-    waveforms = _of_height_one(sim)
-
-    def rises(sigma_ns: float) -> Values:
-        slow = gaussian_filter1d(waveforms, sigma_ns / sim.dt_ns, axis=1, mode="nearest")
-        return _rise_ns(slow, sim.dt_ns)
-
-    low, high = 0.0, median_ns
-    at_once = _rise_ns(waveforms, sim.dt_ns)
-    if np.median(at_once) >= median_ns:
-        return at_once
-    while high - low > sim.dt_ns / ROUNDING:
-        middle = (low + high) / 2
-        low, high = (middle, high) if np.median(rises(middle)) < median_ns else (low, middle)
-    return rises(high)
-
-
-def _amplitude(sim: InputSet, data: InputSet) -> Finding:
-    """Compare the current amplitudes, which no readout increases much."""
-    highest = [float(np.nanquantile(_amplitudes(inputs), 0.9)) for inputs in (sim, data)]
-    ratio = highest[1] / highest[0]
-    text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
-    remedy = (
-        "electronics cannot make pulses sharper: another detector, too wide a cloud, or other "
-        "energies"
-    )
-    return _judged(text, remedy, ratio < SHARPER, ratio > OTHER_SHARPER)
-
-
 def _of_height_one(inputs: InputSet) -> FloatArray:
     """Some pulses scaled to height 1, whatever the level of their prepared tails."""
     waveforms = inputs.prepared.pulses.waveforms
     waveforms = waveforms[spread(len(waveforms), MAX_PULSES)]
     return np.asarray(waveforms / waveforms.max(axis=1, keepdims=True), np.float32)
-
-
-def _amplitudes(inputs: InputSet) -> Values:
-    return current_amplitude(_of_height_one(inputs), inputs.dt_ns)
 
 
 def _rise_ns(waveforms: FloatArray, dt_ns: float) -> Values:
@@ -475,8 +440,3 @@ def _rise_ns(waveforms: FloatArray, dt_ns: float) -> Values:
         np.where((waveforms < fraction) & rising, samples, 0).max(axis=1) for fraction in RISES
     )
     return np.asarray((end - begin) * dt_ns, float)
-
-
-def _range(values: Values) -> float:
-    low, high = np.quantile(values, (0.05, 0.95))
-    return float(high - low)

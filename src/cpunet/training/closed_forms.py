@@ -9,9 +9,8 @@ along each of its axes.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -43,75 +42,37 @@ _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
 
 
-class StepResponse(Protocol):
-    """A step response, in units of the full charge, and its derivative per ns."""
-
-    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """At times in ns after the step."""
-
-    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Its derivative."""
+StepResponse = Callable[[npt.ArrayLike], FloatArray]
+"""A step response, in units of the full charge, at times in ns after the step."""
 
 
-class WithDeviation:
-    """A closed form plus a deviation of its step response.
+def _deviating(chain: Exponentials, time_ns: FloatArray, deviation: FloatArray) -> StepResponse:
+    """The step response of a closed form, plus a deviation given at some times.
 
     Later, the whole decays as at the end of the windows, see `ElectronicsResponse`.
-
-    Parameters
-    ----------
-    chain
-        The chain.
-    time_ns, deviation
-        Times, and deviation at each.
     """
+    spline = CubicSpline(time_ns, deviation)
 
-    def __init__(
-        self, chain: Exponentials, time_ns: npt.NDArray[np.floating[Any]], deviation: FloatArray
-    ) -> None:
-        self.chain, self.first, self.last = chain, time_ns[0], time_ns[-1]
-        self.deviation = CubicSpline(time_ns, deviation)
-        early, late = self._inside(np.array(LATE_NS))
-        self.rate = np.log(max(late / early, MIN_LEFT)) / (LATE_NS[1] - LATE_NS[0])
+    def inside(time: FloatArray) -> FloatArray:
+        added = np.where(time < time_ns[0], 0.0, spline(time))
+        return np.asarray(chain.step(time) + added)
 
-    def _inside(self, time_ns: FloatArray) -> FloatArray:
-        deviation = np.where(time_ns < self.first, 0.0, self.deviation(time_ns))
-        return np.asarray(self.chain.step(time_ns) + deviation)
+    early, late = inside(np.array(LATE_NS))
+    rate = np.log(max(late / early, MIN_LEFT)) / (LATE_NS[1] - LATE_NS[0])
 
-    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Its response to a step."""
+    def step(t_ns: npt.ArrayLike) -> FloatArray:
         time = np.asarray(t_ns, float)
-        after = np.maximum(time - self.last, 0.0)
-        return np.asarray(self._inside(time - after) * np.exp(self.rate * after))
+        after = np.maximum(time - time_ns[-1], 0.0)
+        return np.asarray(inside(time - after) * np.exp(rate * after))
 
-    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Its derivative."""
-        return _derivative(self, t_ns)
+    return step
 
 
-class PoleZeroed:
+def _pole_zeroed(step: StepResponse) -> StepResponse:
     """A step response without the decay of its late part, which becomes 1."""
-
-    def __init__(self, whole: StepResponse) -> None:
-        self.whole = whole
-        late_ns = np.linspace(*LATE_NS, 100)
-        self.slope, self.level = np.polyfit(late_ns, np.log(whole.step(late_ns)), 1)
-
-    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Its response to a step."""
-        time = np.asarray(t_ns, float)
-        return np.asarray(self.whole.step(time) * np.exp(-self.slope * time - self.level))
-
-    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Its derivative."""
-        return _derivative(self, t_ns)
-
-
-def _derivative(response: StepResponse, t_ns: npt.ArrayLike) -> FloatArray:
-    early, late = (
-        response.step(np.asarray(t_ns) + end) for end in (-0.5 * _FINE_NS, 0.5 * _FINE_NS)
-    )
-    return np.asarray((late - early) / _FINE_NS)
+    late_ns = np.linspace(*LATE_NS, 100)
+    slope, level = np.polyfit(late_ns, np.log(step(late_ns)), 1)
+    return lambda t_ns: step(t_ns) * np.exp(-slope * np.asarray(t_ns, float) - level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +83,8 @@ class Chain:
     ----------
     name
         Name in legends.
-    whole, undecayed
-        The chain, and the chain without its decays, whose step response ends at 1.
+    step, undecayed
+        Step response of the chain, and of the chain without its decays, which ends at 1.
     noise
         Equally spaced frequencies from 0 in MHz and noise power density in keV²/MHz; None if
         unknown.
@@ -132,7 +93,7 @@ class Chain:
     """
 
     name: str
-    whole: StepResponse
+    step: StepResponse
     undecayed: StepResponse
     noise: tuple[FloatArray, FloatArray] | None = None
     draws: CubicSpline | None = None
@@ -166,18 +127,18 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
         ``noise_rms_kev`` and ``noise_corner_mhz``, the frequency at which the noise power falls
         to half.
     """
-    step, flat = chain.whole.step(_TIMES_NS), PoleZeroed(chain.whole)
+    step, flat = chain.step(_TIMES_NS), _pole_zeroed(chain.step)
     end_ns = _reaches_ns(step, preparation.align_fraction) + preparation.after_ns
     numbers = {
         name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
         for name, low in _RISES.items()
     }
     for time in (500, 1000):
-        numbers[f"missing_{time}_ns"] = float(1 - flat.step(time))
+        numbers[f"missing_{time}_ns"] = float(1 - flat(time))
     inside = _TIMES_NS[LATE_NS[0] > _TIMES_NS]
-    numbers["overshoot"] = max(0.0, float(flat.step(inside).max()) - 1)
+    numbers["overshoot"] = max(0.0, float(flat(inside).max()) - 1)
     tail_ns = np.arange(end_ns - preparation.decay_fit_ns, end_ns, dt_ns)
-    slope = np.polyfit(tail_ns, np.log(np.maximum(chain.whole.step(tail_ns), 1e-3)), 1)[0]
+    slope = np.polyfit(tail_ns, np.log(np.maximum(chain.step(tail_ns), 1e-3)), 1)[0]
     if slope < 0:
         numbers["effective_decay_us"] = float(-1e-3 / slope)
     return numbers | noise_numbers(chain)
@@ -185,7 +146,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
 
 def reaches_ns(chain: Chain, fraction: float) -> float:
     """Time in ns after a step at which its response reaches a fraction of its maximum."""
-    return _reaches_ns(chain.whole.step(_TIMES_NS), fraction)
+    return _reaches_ns(chain.step(_TIMES_NS), fraction)
 
 
 def noise_numbers(chain: Chain) -> Numbers:
@@ -194,9 +155,8 @@ def noise_numbers(chain: Chain) -> Numbers:
         return {}
     frequency, density = chain.noise
     # frequency 0 is the baseline; the last represents half a step
-    numbers = {
-        "noise_rms_kev": float(np.sqrt((density[1:-1].sum() + density[-1] / 2) * frequency[1]))
-    }
+    power = (density[1:-1].sum() + density[-1] / 2) * frequency[1]
+    numbers = {"noise_rms_kev": float(np.sqrt(power))}
     low, high = (part * frequency[-1] for part in _PLATEAU)
     plateau = np.median(density[(frequency >= low) & (frequency <= high)])
     smooth = uniform_filter1d(density, _SMOOTHED)
@@ -239,7 +199,7 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
         shares = (late * shares).tolist()
     whole = undecayed * Exponentials.decaying(shares, decays)
     if not response.config.deviations:
-        return Chain(name, whole, undecayed)
+        return Chain(name, whole.step, undecayed.step)
     # a sample is the mean over its period
     time_ns = np.asarray(deviation_lags(dt_ns := float(response.dt_ns)) + 0.5) * dt_ns
     without = with_settings(response, deviations=False)
@@ -247,22 +207,21 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     padded = padded_length(2 * len(time_ns))
     both = (scipy.fft.irfft(of.transfer(padded), padded) for of in (response, without))
     deviation = np.subtract(*both)[deviation_lags(dt_ns)]
-    deviating = WithDeviation(whole, time_ns, deviation)
+    deviating = _deviating(whole, time_ns, deviation)
     draws = CubicSpline(time_ns, response.deviation_draws.T)
-    return Chain(name, deviating, PoleZeroed(deviating), draws=draws)
+    return Chain(name, deviating, _pole_zeroed(deviating), draws=draws)
 
 
 def true_chain_of(electronics: Electronics) -> Chain:
     """The closed form of a true chain."""
-    endless = electronics.model_copy(
-        update={"decays": (Decay(fraction=1, tau_us=_FOREVER_US),)}
-    )
+    forever = Decay(fraction=1, tau_us=_FOREVER_US)
+    endless = electronics.model_copy(update={"decays": (forever,)})
     name = f"true response ({electronics.name})"
     samples, dt_ns = record_samples(electronics.dt_ns), electronics.dt_ns
     power = noise_power(electronics.noise.spectrum, dt_ns, samples)
     frequency = np.asarray(np.fft.rfftfreq(samples, dt_ns * 1e-3), float)
     density = electronics.noise.rms_kev**2 * power / frequency[1]
-    return Chain(name, electronics.transfer, endless.transfer, (frequency, density))
+    return Chain(name, electronics.transfer.step, endless.transfer.step, (frequency, density))
 
 
 def with_noise(
@@ -273,7 +232,7 @@ def with_noise(
     # height of a full charge whose tail has the level of prepared pulses
     tail_ns = preparation.after_ns - 0.5 * preparation.tail_ns
     tail_ns += reaches_ns(chain, preparation.align_fraction)
-    height = preparation.tail_level / float(chain.whole.step(tail_ns))
+    height = preparation.tail_level / float(chain.step(tail_ns))
     dt_us = 1e-3 * noise.dt_ns
     frequency = np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float)
     # both signs of the frequency
@@ -286,9 +245,8 @@ def true_parameters(electronics: Electronics) -> Numbers:
     numbers = {f"pole_{i + 1}_ns": tau for i, tau in enumerate(poles)}
     # an overshoot is a slow part of negative sign
     parts = [(electronics.slow, 1), (electronics.overshoot, -1)]
-    numbers |= slow_numbers(
-        [(part.tau_ns, sign * part.fraction) for part, sign in parts if part]
-    )
+    slow = [(part.tau_ns, sign * part.fraction) for part, sign in parts if part]
+    numbers |= slow_numbers(slow)
     if ring := electronics.ringing:
         numbers["ringing"] = ring.fraction
         numbers["ringing_mhz"] = ring.frequency_MHz
@@ -307,18 +265,19 @@ def slow_numbers(parts: Sequence[tuple[float, float]]) -> Numbers:
     return numbers
 
 
-def propagated(
+def moved_along_axes(
     response: ElectronicsResponse,
     covariance: Sequence[Sequence[float]],
     numbers: Callable[[ElectronicsResponse], Numbers],
-) -> Numbers:
-    r"""Standard deviations of derived numbers of a response.
+) -> dict[str, FloatArray]:
+    r"""Changes of derived numbers of a response along each axis of its error ellipsoid.
 
-    .. math:: \sigma_f^2 = \sum_k \left[ \tfrac{1}{2} \left(
-        f(p + \sigma_k e_k) - f(p - \sigma_k e_k) \right) \right]^2
+    .. math:: \Delta_k = \tfrac{1}{2} \left(
+        f(p + \sigma_k e_k) - f(p - \sigma_k e_k) \right)
 
-    with the axes :math:`\sigma_k e_k` of the error ellipsoid of the parameters :math:`p`, the
-    decays among them in the coordinates of `SmoothParameters`.
+    with the axes :math:`\sigma_k e_k` for the parameters :math:`p`, the decays among them in
+    the coordinates of `SmoothParameters`.  The variance of a number is
+    :math:`\sum_k \Delta_k^2`, and covariances are scalar products.
 
     Parameters
     ----------
@@ -332,11 +291,12 @@ def propagated(
     Returns
     -------
     dict
-        Standard deviation by name, of numbers that are defined at both ends of every axis;
+        Changes by name, shape (axes,), of numbers that are defined at both ends of every axis;
         empty if the covariance does not match the parameters.
     """
-    ends = [numbers(end) for pair in error_ends(response, covariance) for end in pair]
-    return _half_ranges(ends) if ends else {}
+    ends = [(numbers(a), numbers(b)) for a, b in error_ends(response, covariance)]
+    names = [n for n in (ends[0][0] if ends else ()) if all(n in a and n in b for a, b in ends)]
+    return {n: np.array([0.5 * (a[n] - b[n]) for a, b in ends]) for n in names}
 
 
 MAX_AXES = 12  # of the errors of a deviation, of which the others are negligible
@@ -345,7 +305,7 @@ MAX_AXES = 12  # of the errors of a deviation, of which the others are negligibl
 def error_ends(
     response: ElectronicsResponse, covariance: Sequence[Sequence[float]]
 ) -> list[tuple[ElectronicsResponse, ElectronicsResponse]]:
-    """A response at both ends of each axis of its error ellipsoid, see `propagated`."""
+    """A response at both ends of each axis of its error ellipsoid."""
     ends: list[tuple[ElectronicsResponse, ElectronicsResponse]] = []
     if response.config.deviations:  # their draws contain the parameters of the chain
         _, sizes, axes = np.linalg.svd(response.deviation_draws, full_matrices=False)
@@ -370,23 +330,3 @@ def error_ends(
             both.append(copy.deepcopy(moved))
         ends.append((both[0], both[1]))
     return ends
-
-
-def _half_ranges(ends: Sequence[Numbers]) -> Numbers:
-    """Root of the sum of squares of half the differences between pairs of ends."""
-    errors: Numbers = {}
-    for name in ends[0]:
-        if all(name in end for end in ends):
-            values = np.array([end[name] for end in ends])
-            half = 0.5 * (values[::2] - values[1::2])
-            errors[name] = float(np.sqrt(sum(half**2)))
-    return errors
-
-
-def fitted_errors(response: ElectronicsResponse, errors: Mapping[str, float]) -> Numbers:
-    """Errors of the fit under the names of `ElectronicsResponse.describe`."""
-    return {
-        name: (value if label.startswith("log_") else 1.0) * float(errors[label])
-        for name, (label, value) in response.named().items()
-        if label in errors
-    }

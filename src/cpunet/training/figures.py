@@ -112,7 +112,7 @@ def response_figure(
     steps, errors = [], []
     for chain, colour, width in drawn:
         half_ns = reaches_ns(chain, 0.5)
-        steps.append(chain.whole.step(long_ns + half_ns))
+        steps.append(chain.step(long_ns + half_ns))
         look: dict[str, Any] = {"color": colour, "linewidth": width}
         panels["step"].plot(long_ns, steps[-1], label=chain.name, **look)
         band = SIGMAS * chain.error(long_ns + half_ns)
@@ -121,8 +121,9 @@ def response_figure(
             around = steps[-1] - band, steps[-1] + band
             panels["step"].fill_between(long_ns, *around, color=colour, alpha=0.3, label=text)
         errors.append(band)
-        panels["impulse"].plot(short_ns, 1e3 * chain.whole.impulse(short_ns + half_ns), **look)
-        panels["tail"].plot(1e-3 * tail, chain.whole.step(tail + half_ns), **look)
+        early, late = (chain.step(short_ns + half_ns + end * GRID_NS / 4) for end in (-1, 1))
+        panels["impulse"].plot(short_ns, 2e3 * (late - early) / GRID_NS, **look)
+        panels["tail"].plot(1e-3 * tail, chain.step(tail + half_ns), **look)
         if chain.noise is None:
             continue
         # equidistant on the logarithmic axis: low frequencies individually, high ones averaged

@@ -9,7 +9,6 @@ random would be mistaken for signal unless it was drawn many times for each puls
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 import scipy.linalg
 
@@ -75,7 +74,22 @@ def fit_inverse(
         )
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(len(sim), min(len(sim), MAX_PULSES), replace=False))
-    windows, delay, used = _translated(generator, sim[rows], energy_kev[rows], recipe)
+    # windows without noise, prepared like the data
+    records = np.concatenate([generator(sim[rows[some]]) for some in blocks(len(rows))])
+    if (by_height := generator.response.by_height) is not None:
+        records = np.asarray(by_height(records, energy_kev[rows]), np.float32)
+    # a record without noise can have equal samples at its top without being clipped
+    update = {"saturation_run": records.shape[1] + 1}
+    preparation, dt_ns = recipe.preparation.model_copy(update=update), generator.noise_dt_ns
+    prepared = prepare(Pulses.of(records, dt_ns=dt_ns), preparation, "measured")
+    if len(prepared) < MIN_PULSES:
+        raise CpunetError(
+            f"only {len(prepared)} of {len(rows)} translated pulses can be prepared, the "
+            f"inverse needs {MIN_PULSES}: {prepared.rejections}; check the fit of the response"
+        )
+    # sample of the simulated pulse at sample 0 of its window
+    delay = prepared.align_sample - preparation.samples_before - padding(dt_ns)[0]
+    windows, used = prepared.pulses.waveforms, prepared.index
     inverse = LinearInverse(recipe.preparation.length, training)
     inverse.half_height[...] = 0.5 * np.median(windows.max(axis=1))
     sample = inverse.half_sample(windows)
@@ -91,34 +105,6 @@ def fit_inverse(
     weights = scipy.linalg.solve(own, measured.T @ wanted / len(measured), assume_a="pos").T
     inverse.mean_in[:], inverse.mean_out[:], inverse.weights[:] = mean_in, mean_out, weights
     return inverse
-
-
-def _translated(
-    generator: ResponseGenerator, sim: FloatArray, energy_kev: Values, recipe: Recipe
-) -> tuple[FloatArray, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Noise-free translated windows prepared like the data, and the shift of each pulse.
-
-    Returns
-    -------
-    tuple
-        Windows (n', samples); sample of the simulated pulse at sample 0 of its window, (n',);
-        rows of the pulses that could be prepared, (n',).
-    """
-    preparation = recipe.preparation
-    records = np.concatenate([generator(sim[rows]) for rows in blocks(len(sim))])
-    if (by_height := generator.response.by_height) is not None:
-        records = np.asarray(by_height(records, energy_kev), np.float32)
-    # a record without noise can have equal samples at its top without being clipped
-    config = preparation.model_copy(update={"saturation_run": records.shape[1] + 1})
-    dt_ns = float(generator.response.dt_ns)
-    prepared = prepare(Pulses.of(records, dt_ns=dt_ns), config, "measured")
-    if len(prepared) < MIN_PULSES:
-        raise CpunetError(
-            f"only {len(prepared)} of {len(sim)} translated pulses can be prepared, the "
-            f"inverse needs {MIN_PULSES}: {prepared.rejections}; check the fit of the response"
-        )
-    delay = prepared.align_sample - preparation.samples_before - padding(dt_ns)[0]
-    return prepared.pulses.waveforms, delay, prepared.index
 
 
 def _noise_covariance(noise: BaselineNoise, sizes: LinearInverse, pulse: Values) -> Values:

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import logging
-import resource
-import sys
 import time
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import numpy as np
 
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
-from cpunet.kernels import threads
 from cpunet.networks import require_torch
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -35,24 +30,14 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import EnergySelection, parse_selection
 from cpunet.recipes.schema import PunetConfig, Recipe
-from cpunet.training.chain_fit import Fitter, Listener
+from cpunet.training.chain_fit import Fitter
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import fit_response
-from cpunet.training.run import (
-    INFO,
-    RUN,
-    Record,
-    Run,
-    RunLike,
-    append_losses,
-    as_run,
-    read_losses,
-    versions,
-)
+from cpunet.training.run import INFO, RUN, Record, Run, RunLike, as_run, versions
 from cpunet.training.verdict import FitInfo
 
 log = logging.getLogger(__name__)
@@ -68,12 +53,10 @@ class TrainingJob:
         Settings, energies, seed, and the device to train on.
     sim, data
         Prepared pulses of both sides.
-    folder
-        Folder to write to.
     init
         Run to start from.
-    resume
-        Whether a training of networks is to be resumed.
+    checkpoints, resume
+        Folder of the checkpoints of networks, and whether their training is to be resumed.
     continuum
         Reads the pulses of both sides away from all lines.
     """
@@ -84,36 +67,18 @@ class TrainingJob:
     device: str
     sim: InputSet
     data: InputSet
-    folder: Path
     init: Run | None = None
+    checkpoints: Path | None = None
     resume: bool = False
     continuum: Continuum | None = None
 
     @classmethod
-    def of(
-        cls,
-        pair: Pair,
-        folder: Path,
-        *,
-        recipe: Recipe,
-        peak: str,
-        init: Run | None,
-        **how: Any,
-    ) -> Self:
+    def of(cls, pair: Pair, recipe: Recipe, peak: str, init: Run | None, **how: Any) -> Self:
         """Read and prepare both sides, and warn of what makes a training on them doubtful."""
         selection = parse_selection(peak, recipe.peaks)
-
         data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
         recipe = data.recipe
-
-        def simulated(energies: EnergySelection, tell: bool = True) -> InputSet:
-            return load_pulses(pair[0], "simulated", recipe, energies, tell=tell)
-
-        def both(energies: EnergySelection) -> tuple[InputSet, InputSet]:
-            measured = load_pulses(pair[1], "measured", recipe, energies, tell=False)
-            return simulated(energies, tell=False), measured
-
-        sim = simulated(selection)
+        sim = load_pulses(pair[0], "simulated", recipe, selection)
         require_same_sampling(sim, data)
         require_both_sides(sim, data, selection)
         for finding in compare_sides(sim, data, selection, recipe.preparation):
@@ -122,38 +87,37 @@ class TrainingJob:
         if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
             kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
             raise CpunetError(f"{init.name}: {kinds}; resample them")
+
+        def both(energies: EnergySelection) -> tuple[InputSet, InputSet]:
+            measured = load_pulses(pair[1], "measured", recipe, energies, tell=False)
+            return load_pulses(pair[0], "simulated", recipe, energies, tell=False), measured
+
         away = continuum(recipe)
         fewest = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
-        more = None
         if fewest >= MIN_PULSES and not selection.ranges_kev:
-            more = partial(both, away)
-        how |= {"sim": sim, "data": data, "init": init, "continuum": more}
-        return cls(recipe.at(data.dt_ns), peak, folder=folder, **how)
+            how["continuum"] = partial(both, away)
+        return cls(recipe.at(data.dt_ns), peak, sim=sim, data=data, init=init, **how)
 
-    def trained(self, out: Path | None) -> Run:
-        """Train, and write the folder of the job, which becomes `out`."""
+    def trained(self) -> Run:
+        """Train what the recipe says."""
         keep_freed_memory()
-        train: Callable[[TrainingJob], Run] = train_chain
-        if self.recipe.training.method == "cyclegan":
+        with one_thread_for_matrices():
+            if self.recipe.training.method == "matching":
+                return train_chain(self)
             from cpunet.training.network_runs import train_networks  # torch takes seconds
 
-            train = train_networks
-        with one_thread_for_matrices():
-            run = train(self)
-        run.write(self.folder)
-        run = run.model_copy(update={"folder": out})
-        vars(run)["records"] = read_losses(self.folder)  # the folder moves, or goes
-        return run
+            return train_networks(self)
 
     def run(
         self,
-        parts: Mapping[str, Any],
+        parts: dict[str, Any],
         recipe: Recipe,
         started: str,
         seconds: float,
+        records: list[Record],
         **more: Any,
     ) -> Run:
-        """The run of trained networks.
+        """The run of trained parts.
 
         Parameters
         ----------
@@ -161,38 +125,31 @@ class TrainingJob:
             ``ren``, ``iren`` and others to store.
         recipe
             Recipe as trained; a stretch or deviations may have been added to its chain.
-        started, seconds
-            When the training began, and the time that it took.
+        started, seconds, records
+            When the training began, the time that it took, and its log.
         more
             Further facts of the run.
         """
-        unit = 2**20 if sys.platform == "darwin" else 2**10
-        memory = {"host": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}
-        if self.device.startswith("cuda"):
-            import torch
-
-            memory["gpu"] = torch.cuda.max_memory_allocated(self.device) / 2**20
-        return Run.of(
+        run = Run.of(
             parts,
             recipe,
             peak=self.peak,
             seed=self.seed,
             init=None if self.init is None else self.init.name,
             device=self.device,
-            threads=threads(),
             started=started,
             seconds=round(seconds, 1),
-            peak_memory_mb={where: round(mb, 1) for where, mb in memory.items()},
             dt_ns=self.data.dt_ns,
             versions=versions(),
             sim=self.sim.provenance(),
             data=self.data.provenance(),
             **more,
         )
+        return run.model_copy(update={"log": records})
 
 
 def of_channel(
-    name: str, pair: Pair, folder: Path, *, init: RunLike | None, force: bool, **how: Any
+    name: str, pair: Pair, folder: Path, *, init: RunLike | None, **how: Any
 ) -> Path:
     """The folder of the run of a channel, trained in a process of its own."""
     if how["resume"] and (folder / INFO).is_file():
@@ -200,7 +157,7 @@ def of_channel(
         return folder
     if isinstance(init, str | Path):
         init = own_folder(Path(init), name, INFO)
-    trained_in(folder, pair, init, force, **how)
+    trained_in(folder, pair, init, **how)
     return folder
 
 
@@ -210,18 +167,22 @@ def trained_in(
     """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes."""
     start = None if init is None else as_run(init)
     files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
-    place: AbstractContextManager[Path | str]
-    if out is None:
-        place = TemporaryDirectory()
-    elif how["recipe"].networks:
+    networks, folder = how["recipe"].networks, None
+    if networks:
         require_torch()
-        from cpunet.training.unfinished import unfinished_folder
+    with ExitStack() as stack:
+        if out is not None and networks:
+            from cpunet.training.unfinished import unfinished_folder
 
-        place = unfinished_folder(out, *files, resume=how["resume"], force=force)
-    else:
-        place = folder_written_aside(out, RUN, *files, force=force)
-    with place as folder:
-        return TrainingJob.of(pair, Path(folder), init=start, **how).trained(out)
+            unfinished = unfinished_folder(out, *files, resume=how["resume"], force=force)
+            how["checkpoints"] = stack.enter_context(unfinished)
+        elif out is not None:
+            folder = stack.enter_context(folder_written_aside(out, RUN, *files, force=force))
+        run = TrainingJob.of(pair, init=start, **how).trained()
+        if out is not None:
+            folder = folder or stack.enter_context(folder_written_aside(out, RUN, force=force))
+            run.write(folder)
+    return run.model_copy(update={"folder": out})
 
 
 def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
@@ -238,50 +199,66 @@ def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
             f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
             f"give a run of {like.name}"
         )
-    response: ElectronicsResponse = run.fill(
-        "ren", ResponseGenerator(generator, run.dt_ns)
-    ).response
-    return response
+    return run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
 
 
-def fitted(
-    job: TrainingJob, start: ElectronicsResponse | None, listen: Listener
-) -> tuple[ResponseGenerator, FitInfo]:
-    """Measure the noise, fit the response, and say how well it describes the data.
-
-    Parameters
-    ----------
-    job
-        Pulses of both sides, and a recipe with a response to fit.
-    start
-        Response to start from, if any.
-    listen
-        Function called with step and chi-square.
+def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> Run:
+    """Fit a readout chain, starting from that of ``init`` or from `start`, if given.
 
     Raises
     ------
     CpunetError
         If pulses or baselines are too few, or the fit diverges.
     """
+    started, clock = datetime.now(UTC), time.perf_counter()
     recipe, (sim, data) = job.recipe, (job.sim.prepared, job.data.prepared)
-    noise, tails = trace_noise(job.data, recipe.preparation)
-    if start is not None:  # its deviations are those of another readout
-        terms = min(start.config.drift_terms, recipe.matching.training.drift_terms)
-        start = with_settings(start, drift_terms=terms, deviations=False, by_height=False)
-        recipe = recipe.model_copy(update={"generator": start.config})
-    rng, drawn = np.random.default_rng(job.seed), noise.tails
-    sets = PulseSets(sim.pulses, data.pulses, noise.noise, recipe, rng, drawn, job.continuum)
-    decay = None if drawn is None else drawn.known_decay
-    response, info = fit_response(sets, Fitter(recipe.matching.training, decay, listen), start)
+    if job.init is not None:
+        start = known_response(job.init, recipe)
+    records = list[Record]()
+    with stage("Fitting") as bar:  # the number of steps is not foreseen
+
+        def listen(step: int, chi_square: float) -> None:
+            losses = {"chi_square": chi_square}
+            records.append({"iteration": step, "rate": 0.0, "losses": losses})
+            bar.update(1)
+            bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
+
+        noise, tails = trace_noise(job.data, recipe.preparation)
+        if start is not None:  # its deviations are those of another readout
+            terms = min(start.config.drift_terms, recipe.matching.training.drift_terms)
+            start = with_settings(start, drift_terms=terms, deviations=False, by_height=False)
+            recipe = recipe.model_copy(update={"generator": start.config})
+        rng, drawn = np.random.default_rng(job.seed), noise.tails
+        pulses = sim.pulses, data.pulses
+        sets = PulseSets(*pulses, noise.noise, recipe, rng, drawn, job.continuum)
+        decay = None if drawn is None else drawn.known_decay
+        fitter = Fitter(recipe.matching.training, decay, listen)
+        response, info = fit_response(sets, fitter, start)
     chain = ResponseGenerator(response.config, job.sim.dt_ns)
     chain.response, chain.tails = response, drawn
     chain.set_noise(noise.noise)
-    of_noise = {
-        "baselines": noise.noise.n_baselines,
-        "rms": noise.noise.rms,
-        "rms_error": noise.noise.rms_error,
-    }
-    return chain, info.model_copy(update={"noise": of_noise, "tails": tails})
+    n, rms, error = noise.noise.n_baselines, noise.noise.rms, noise.noise.rms_error
+    of_noise = {"baselines": n, "rms": rms, "rms_error": error}
+    info = info.model_copy(update={"noise": of_noise, "tails": tails})
+    _say(info)
+    # a stretch or deviations may have been added
+    recipe = job.recipe.model_copy(update={"generator": response.config})
+    of_sim = sim.pulses.waveforms, sim.pulses.energy_kev
+    iren = fit_inverse(chain, *of_sim, recipe, seed=job.seed)
+    parts: dict[str, Any] = {"ren": chain, "iren": iren}
+    if recipe.residual is not None:
+        from cpunet.training.network_runs import learned_residuals
+
+        residuals, gains, of_networks = learned_residuals(job, recipe, chain, iren)
+        info = info.model_copy(update={"gains": info.gains | gains})
+        records = of_networks or records
+        for part, gain in gains.items():
+            log.info(f"{part}: {gain}")
+        parts |= residuals
+        if not residuals:  # the readout alone
+            recipe = recipe.model_copy(update={"residual": None})
+    took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
+    return job.run(parts, recipe, began, took, records, fit=info)
 
 
 def _say(info: FitInfo) -> None:
@@ -303,40 +280,3 @@ def _say(info: FitInfo) -> None:
         log.info(f"  {number}. {cause}")
     for doubt in beyond(info.parameters):
         log.warning(doubt)
-
-
-def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> Run:
-    """Fit a readout chain, starting from that of ``init`` or from `start`, if given."""
-    started, clock = datetime.now(UTC), time.perf_counter()
-    if job.init is not None:
-        start = known_response(job.init, job.recipe)
-    with stage("Fitting") as bar:  # the number of steps is not foreseen
-
-        def listen(step: int, chi_square: float) -> None:
-            losses = {"chi_square": chi_square}
-            record: Record = {"iteration": step, "rate": 0.0, "losses": losses}
-            if job.recipe.residual is None:  # else the log is that of the networks
-                append_losses(job.folder, [record])
-            bar.update(1)
-            bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
-
-        chain, info = fitted(job, start, listen)
-    _say(info)
-    # a stretch or deviations may have been added
-    recipe = job.recipe.model_copy(update={"generator": chain.response.config})
-    sim = job.sim.prepared.pulses
-    iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)
-    parts: dict[str, Any] = {"ren": chain, "iren": iren}
-    if recipe.residual is not None:
-        from cpunet.training.network_runs import learned_residuals
-
-        learned = learned_residuals(job, recipe, chain, iren)
-        info = info.model_copy(update={"gains": info.gains | learned.gains})
-        for part, gain in learned.gains.items():
-            log.info(f"{part}: {gain}")
-        if learned.parts:
-            parts |= learned.parts
-        else:  # the readout alone
-            recipe = recipe.model_copy(update={"residual": None})
-    took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
-    return job.run(parts, recipe, began, took, fit=info)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -53,9 +53,9 @@ def generators(recipe: Recipe, decay: float = 0.0) -> dict[str, Generator]:
     """New generators, with a learned linear part or none; `decay` is the data's per sample."""
     config, preparation = recipe.cyclegan.generator, recipe.preparation
     if config.linear == "none":
-        unets = (PositionalUNet(config, preparation.length) for _ in range(2))
         return {
-            part: Generator(unet) for part, unet in zip(("ren", "iren"), unets, strict=True)
+            part: Generator(PositionalUNet(config, preparation.length))
+            for part in ("ren", "iren")
         }
     response = LearnedResponse(preparation, decay)
     linear = {"ren": response, "iren": LearnedInverse(response)}
@@ -65,8 +65,18 @@ def generators(recipe: Recipe, decay: float = 0.0) -> dict[str, Generator]:
 
 def train_networks(job: TrainingJob) -> Run:
     """Train the generators of a CycleGAN, or resume their training."""
-    recipe, own = job.recipe, job.recipe.preparation
-    noise, info = _noise(job)
+    recipe, own, noise, info = job.recipe, job.recipe.preparation, None, None
+    if recipe.cyclegan.training.noise == "baselines":
+        try:
+            noise, tails = trace_noise(job.data, own)
+        except CpunetError as error:
+            raise CpunetError(
+                f"{job.data.path}: no baselines to draw noise from ({error}); or train "
+                "without it (training.noise=none in `settings`)"
+            ) from error
+        info = FitInfo(tails=tails)
+    if job.init is not None:
+        require_same_kind(job.init, recipe)
     late = job.data.prepared.pulses.waveforms[:, -own.decay_fit_samples :].mean(axis=0)
     decay = -np.polyfit(np.arange(len(late)), np.log(np.maximum(late, 1e-3)), 1)[0]
 
@@ -77,8 +87,6 @@ def train_networks(job: TrainingJob) -> Run:
                 fill_generator(job.init, part, network)
         return made
 
-    if job.init is not None:
-        require_same_kind(job.init, recipe)
     game, run = _played(job, recipe, make, noise)
     parts: dict[str, Any] = {}
     for part, side in (("ren", "sim"), ("iren", "data")):
@@ -91,28 +99,9 @@ def train_networks(job: TrainingJob) -> Run:
         parts["noise"] = KeptNoise(noise.dt_ns)
         parts["noise"].set_noise(noise.noise)
     more: dict[str, Any] = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-    return job.run(
-        parts,
-        recipe,
-        run.started,
-        run.seconds,
-        **more,
-        **({} if info is None else {"fit": info}),
-    )
-
-
-def _noise(job: TrainingJob) -> tuple[TraceNoise | None, FitInfo | None]:
-    """Noise for the translations of simulated pulses, and what tails the data have."""
-    if job.recipe.cyclegan.training.noise == "none":
-        return None, None
-    try:
-        noise, tails = trace_noise(job.data, job.recipe.preparation)
-    except CpunetError as error:
-        raise CpunetError(
-            f"{job.data.path}: no baselines to draw noise from ({error}); or train "
-            "without it (training.noise=none in `settings`)"
-        ) from error
-    return noise, FitInfo(tails=tails)
+    if info is not None:
+        more["fit"] = info
+    return job.run(parts, recipe, run.started, run.seconds, run.records, **more)
 
 
 def fill_generator(run: Run, part: str, network: Generator, device: str = "cpu") -> Generator:
@@ -123,13 +112,12 @@ def fill_generator(run: Run, part: str, network: Generator, device: str = "cpu")
 
 def require_same_kind(init: Run, recipe: Recipe) -> None:
     """Raise a `CpunetError` if the networks of a run cannot be a start for a recipe."""
-    other = init.recipe
-    if other.generator.name != "punet":
+    if init.recipe.generator.name != "punet":
         raise CpunetError(
-            f"{init.name}: a readout chain ({other.name}), from which no network can start; "
-            "give a run of networks"
+            f"{init.name}: a readout chain ({init.recipe.name}), from which no network can "
+            "start; give a run of networks"
         )
-    theirs, own = other.preparation, recipe.preparation
+    theirs, own = init.recipe.preparation, recipe.preparation
     if (theirs.length, theirs.samples_before) != (own.length, own.samples_before):
         raise CpunetError(
             f"{init.name}: its networks know windows of {theirs.samples_before} + "
@@ -145,10 +133,10 @@ def _played(
     noise: TraceNoise | None,
 ) -> tuple[Game, UnfinishedRun]:
     """Play the game of a recipe, or the rest of it, with all that is needed to resume it."""
-    settings, threads = recipe.cyclegan, torch.get_num_threads()
+    settings = recipe.cyclegan
     exclude: Any = {"search": True, "training": _LOGS, "residual": {"training": _LOGS}}
     run = UnfinishedRun(
-        job.folder,
+        job.checkpoints,
         {
             "recipe": recipe.model_dump(mode="json", exclude=exclude),
             "peak": job.peak,
@@ -157,8 +145,6 @@ def _played(
             "simulation": job.sim.fingerprint(),
             "data": job.data.fingerprint(),
         },
-        # it changes the last bits
-        {"device": job.device, "threads": threads, "torch": torch.__version__},
     )
     state = run.begin(resume=job.resume)
     pair = (side.prepared.pulses for side in (job.sim, job.data))
@@ -167,13 +153,13 @@ def _played(
     if min(sim.seen, data.seen) < MANY:  # which a large critic knows by heart
         critic = settings.discriminator
         small = critic.model_copy(update=SMALL.get(critic.name))
-        settings = settings._replace(discriminator=small)
+        settings = settings.model_copy(update={"discriminator": small})
     sides = Sides(sim, data, recipe.preparation, noise, settings.generator.linear != "none")
     left = settings.training.iterations - (state["iteration"] if state else 0)
     with stage("Training", left) as bar:
 
         def listen(records: list[Record]) -> None:
-            run.log(records)
+            run.records += records
             bar.update(len(records))
 
         def begin() -> Game:
@@ -181,7 +167,6 @@ def _played(
             return Game(pair["ren"], pair["iren"], sides, settings)
 
         game = train(begin, job.seed, listener=listen, save=run.save, start=state)
-    run.finish()
     return game, run
 
 
@@ -207,23 +192,22 @@ def settle(network: nn.Module, side: Side, config: TrainingConfig) -> None:
         layer.p = fraction
 
 
-class Learned(NamedTuple):
-    """Residuals that held-out pulses gain by, by part, and a line on each that was tried."""
-
-    parts: dict[str, Residual]
-    gains: dict[str, str]
-
-
 def learned_residuals(
     job: TrainingJob, recipe: Recipe, chain: ResponseGenerator, inverse: LinearInverse
-) -> Learned:
-    """Train U-Nets behind a response and its inverse, and keep what held-out pulses gain by."""
+) -> tuple[dict[str, Residual], dict[str, str], list[Record]]:
+    """Train U-Nets behind a response and its inverse, and keep what held-out pulses gain by.
+
+    Returns
+    -------
+    tuple
+        U-Nets that are kept by part, a line on each that was tried, and the log.
+    """
     n = min(len(job.sim.prepared), len(job.data.prepared))
     if n < ENOUGH or chain.response.by_height is not None:
         why = f"{n} pulses of a side, a critic needs {ENOUGH}"
         if n >= ENOUGH:
             why = "they know no energies, by which the electronics act"
-        return Learned({}, {"networks": f"left out; {why}"})
+        return {}, {"networks": f"left out; {why}"}, []
     config, preparation = recipe.cyclegan.generator, recipe.preparation
     noise = TraceNoise(chain.noise, chain.tails)
 
@@ -232,20 +216,20 @@ def learned_residuals(
         made = (Generator(Residual(config, preparation.sampled_ns), of) for of in linear)
         return dict(zip(("ren", "iren"), made, strict=True))
 
-    game, _ = _played(job, recipe, make, noise)
+    game, run = _played(job, recipe, make, noise)
     parts, gains = dict[str, Residual](), dict[str, str]()
-    for name, results in (
+    for name, (scale, line) in (
         ("ren", _ren_scale(game, chain, recipe)),
         ("iren", _iren_scale(game)),
     ):
-        gains[f"U-Net of {name.upper()}"] = results.line
+        gains[f"U-Net of {name.upper()}"] = line
         residual = game.averaged(name).unet
-        if results.scale and isinstance(residual, Residual):
+        if scale and isinstance(residual, Residual):
             with torch.no_grad():
                 for values in residual.unet.outlet.parameters():
-                    values.mul_(results.scale)
+                    values.mul_(scale)
             parts[f"{name}_residual"] = residual
-    return Learned(parts, gains)
+    return parts, gains, run.records
 
 
 def applied(network: nn.Module) -> Callable[[Any], npt.NDArray[np.float32]]:
@@ -260,21 +244,14 @@ def applied(network: nn.Module) -> Callable[[Any], npt.NDArray[np.float32]]:
     return change
 
 
-class Scale(NamedTuple):
-    """Part of what a U-Net adds with which held-out pulses are best, and a line on it."""
-
-    scale: float
-    line: str
-
-    @classmethod
-    def of(cls, best: int, gain: float, error: float, text: str) -> Scale:
-        """The best of `SCALES`, if it gains."""
-        if gain <= 0 or gain < SURE * error:
-            return cls(0.0, f"left out; {text}")
-        return cls(SCALES[best], f"used, scaled by {SCALES[best]:g}; {text}")
+def _scale(best: int, gain: float, error: float, text: str) -> tuple[float, str]:
+    """The best of `SCALES`, if it gains, and a line on it."""
+    if gain <= 0 or gain < SURE * error:
+        return 0.0, f"left out; {text}"
+    return SCALES[best], f"used, scaled by {SCALES[best]:g}; {text}"
 
 
-def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> Scale:
+def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[float, str]:
     """Scale of REN's U-Net with which a classifier of held-out pulses is least right."""
     sim, data, preparation = game.sides.sim, game.sides.data, recipe.preparation
     charge, real = (side.pulses[side.seen :][:MOST].cpu().numpy() for side in (sim, data))
@@ -300,11 +277,11 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> Scale:
     best = int(np.argmin([result.auc for result in results]))
     text = f"AUC of held-out pulses {results[0].auc:.3f} → {results[-1].auc:.3f}"
     error = results[0].auc_std
-    return Scale.of(best, results[0].auc - results[best].auc, error, f"{text} ± {error:.3f}")
+    return _scale(best, results[0].auc - results[best].auc, error, f"{text} ± {error:.3f}")
 
 
 @torch.no_grad()
-def _iren_scale(game: Game) -> Scale:
+def _iren_scale(game: Game) -> tuple[float, str]:
     """Scale of IREN's U-Net with which held-out cycles end closest to where they began."""
     sides, (ren, iren) = game.sides, (game.averaged(part) for part in ("ren", "iren"))
     assert ren.linear is not None
@@ -321,4 +298,4 @@ def _iren_scale(game: Game) -> Scale:
     rms = [float(square.mean().sqrt()) for square in squares]
     text = f"RMS of held-out cycles {rms[0]:.2e} → {rms[-1]:.2e}"
     error = max(float(gains.std()) / len(rows) ** 0.5, LEAST * float(squares[0].mean()) / SURE)
-    return Scale.of(best, float(gains.mean()), error, text)
+    return _scale(best, float(gains.mean()), error, text)

@@ -16,6 +16,7 @@ from cpunet.outputs import refuse_existing
 from cpunet.pulses.loading import SideInfo
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PunetConfig
+from cpunet.settings import flat
 from cpunet.training.run import Run, differing, versions
 
 # Published layer names → names here.
@@ -89,16 +90,10 @@ def import_weights(
         raise CpunetError(
             f"{ren} and {iren}: generators of widths {sorted(widths)}; give a pair"
         )
-    settings: dict[str, float] = {"generator.width": widths.pop()}
     # windows of as many samples, whatever the period
-    parts = {
-        "preparation": published.preparation,
-        "training.losses": published.cyclegan[2].losses,
-    }
-    for part, config in parts.items():
-        for name, value in config.model_dump().items():
-            if name.endswith("_ns"):
-                settings[f"{part}.{name}"] = value * dt_ns / PUBLISHED_DT_NS
+    times = flat(published.model_dump(include={"preparation", "training"}))
+    settings = {n: v * dt_ns / PUBLISHED_DT_NS for n, v in times if n.endswith("_ns")}
+    settings["generator.width"] = widths.pop()
     recipe = load_recipe("published", settings)
     run = Run.of(
         networks,
@@ -137,9 +132,8 @@ def _load_state(path: Path) -> State:
             f"{path}: no plain state dict of tensors, or damaged ({type(error).__name__}); "
             "nothing of it was executed"
         ) from error
-    if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
-    ):
+    pairs = state.items() if isinstance(state, dict) else [(None, state)]
+    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
         raise CpunetError(f"{path}: no state dict; give a file such as fep_REN.pt")
     return dict(state)
 

@@ -159,10 +159,32 @@ class Response:
             self.plot().savefig(folder / "response.png", dpi=_DPI)
 
     def __str__(self) -> str:
+        alone = len(self.runs) == 1  # with several runs errors have no room
         head = ["", *(Path(chain.run.name).name for chain in self.runs)]
+        sources = [(chain.values, chain.errors if alone else {}) for chain in self.runs]
         if self.truth is not None:
-            head += [self.truth.name, *(["difference", "σ"] if len(self.runs) == 1 else [])]
-        return text_table(head, list(map(self._cells, self._names)), title="Readout response")
+            head += [self.truth.name, *(["difference", "σ"] if alone else [])]
+            sources.append((self.true_values, {}))
+        rows = []
+        for name in self._names:
+            _, label, unit = _row(name)
+            scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
+            cells = [f"{label} [{unit}]" if unit else label]
+            for pair in sources:
+                cells.append(
+                    with_std(*(scale * of[name] if name in of else None for of in pair))
+                )
+            if self.truth is not None and alone:
+                difference, true = self.difference.get(name), self.true_values.get(name)
+                text = ""
+                if difference is not None and unit == "%":  # of shares in percentage points
+                    text = f"{100 * difference:+.2f} pp"
+                elif difference is not None and true:
+                    text = f"{100 * difference / true:+.1f} %"
+                sigma = self.sigma.get(name)
+                cells += [text, "" if sigma is None else f"{sigma:+.1f}"]
+            rows.append(cells)
+        return text_table(head, rows, title="Readout response")
 
     def __repr__(self) -> str:
         truth = "" if self.truth is None else f", truth {self.truth.name}"
@@ -175,27 +197,6 @@ class Response:
         sources = [*(chain.values for chain in self.runs), self.true_values]
         names = {name: None for source in sources for name in source}
         return sorted(names, key=lambda name: _row(name)[0])
-
-    def _cells(self, name: str) -> list[str]:
-        """A row of the table."""
-        _, label, unit = _row(name)
-        scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
-        alone = len(self.runs) == 1  # with several runs errors have no room
-
-        def cell(values: Numbers, errors: Numbers) -> str:
-            scaled = [scale * of[name] if name in of else None for of in (values, errors)]
-            return with_std(*scaled)
-
-        cells = [f"{label} [{unit}]" if unit else label]
-        cells += (cell(chain.values, chain.errors if alone else {}) for chain in self.runs)
-        if self.truth is None:
-            return cells
-        true, sigma = self.true_values.get(name), self.sigma.get(name)
-        cells.append(cell(self.true_values, {}))
-        if alone:
-            cells.append(_difference(self.difference.get(name), true, unit))
-            cells.append("" if sigma is None else f"{sigma:+.1f}")
-        return cells
 
 
 def response(
@@ -238,7 +239,17 @@ def response(
     if out is not None:
         place = str(truth) if isinstance(truth, str | Path) else None
         refuse_existing(Path(out), place, *(run.folder for run in opened), force=force)
-    electronics = _electronics(truth)
+    electronics = truth
+    if isinstance(truth, str | Path):
+        if Path(truth).is_dir():
+            path = Path(truth) / "stand.json"
+            content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
+            electronics = checked(
+                Electronics, content.get("electronics"), f"{path}: electronics"
+            )
+        else:
+            electronics = read_electronics(truth)
+    assert electronics is None or isinstance(electronics, Electronics)
     result = Response([describe_chain(run) for run in opened], electronics)
     if electronics is not None and not np.isclose(electronics.dt_ns, opened[0].dt_ns):
         raise CpunetError(
@@ -254,17 +265,6 @@ def response(
     return result
 
 
-def _electronics(truth: str | Path | Electronics | None) -> Electronics | None:
-    """The true readout, if given, of a stand from its ``stand.json``."""
-    if truth is None or isinstance(truth, Electronics):
-        return truth
-    if not Path(truth).is_dir():
-        return read_electronics(truth)
-    path = Path(truth) / "stand.json"
-    content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
-    return checked(Electronics, content.get("electronics"), f"{path}: electronics")
-
-
 def _row(name: str) -> tuple[int, str, str]:
     """Place, label and unit of a quantity in `ROWS`."""
     return next(
@@ -272,12 +272,3 @@ def _row(name: str) -> tuple[int, str, str]:
         for place, (pattern, (text, unit)) in enumerate(ROWS.items())
         if re.fullmatch(pattern, name)
     )
-
-
-def _difference(difference: float | None, true: float | None, unit: str) -> str:
-    """Relative, but of shares in percentage points."""
-    if difference is None:
-        return ""
-    if unit == "%":
-        return f"{100 * difference:+.2f} pp"
-    return f"{100 * difference / true:+.1f} %" if true else ""

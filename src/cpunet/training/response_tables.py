@@ -10,12 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import median_abs_deviation
 
-from cpunet.networks.generators import ResponseGenerator
-from cpunet.recipes.schema import ResponseConfig
 from cpunet.settings import plain, yaml_text
-from cpunet.training.aligned import Values
 from cpunet.training.chain_description import DescribedChain
-from cpunet.training.closed_forms import chain_numbers, error_ends, learned_chain
 
 # What a page of channels shows, and where a channel stands out: so many robust standard
 # deviations from the median, of at least so many channels.
@@ -30,42 +26,24 @@ SHOWN = {
 FAR, FEW = 4.0, 5
 
 
-def correlations(chain: DescribedChain) -> tuple[list[str], Values]:
-    """Names of the numbers of a chain that its fit determines, and their correlations."""
-    run, fit = chain.run, chain.run.fit
-    if fit is None or not isinstance(run.recipe.generator, ResponseConfig):
-        return [], np.zeros((0, 0))
-    generator = run.fill("ren", ResponseGenerator(run.recipe.generator, run.dt_ns))
-    ends = [
-        [
-            chain_numbers(learned_chain(end, ""), run.recipe.preparation, run.dt_ns)
-            for end in pair
-        ]
-        for pair in error_ends(generator.response, fit.covariance)
-    ]
-    names = [
-        n for n in chain.errors if chain.errors[n] and all(n in e for p in ends for e in p)
-    ]
-    moved = np.array([[0.5 * (a[n] - b[n]) for n in names] for a, b in ends])
-    moved = moved.reshape(len(ends), len(names))
-    sizes = np.sqrt((moved**2).sum(axis=0))
-    names = [name for name, size in zip(names, sizes, strict=True) if size > 0]
-    moved, sizes = moved[:, sizes > 0], sizes[sizes > 0]
-    return names, (moved.T @ moved) / np.outer(sizes, sizes)
-
-
 def as_yaml(chains: Mapping[str, DescribedChain]) -> str:
     """Value and error of each number, and correlations, by channel."""
     content = {}
     for name, chain in chains.items():
-        names, matrix = correlations(chain)
+        names = [name for name in chain.moved if chain.errors.get(name)]
+        moved = np.array([chain.moved[name] for name in names])  # (numbers, axes)
+        covariance = moved @ moved.T if names else np.zeros((0, 0))
+        sizes = np.sqrt(covariance.diagonal())
         content[name] = {
             "run": chain.run.name,
             "good": chain.run.ok,
             "numbers": {
                 n: {"value": v, "error": chain.errors.get(n)} for n, v in chain.values.items()
             },
-            "correlations": {"names": names, "matrix": matrix.round(4).tolist()},
+            "correlations": {
+                "names": names,
+                "matrix": (covariance / np.outer(sizes, sizes)).round(4).tolist(),
+            },
         }
     return yaml_text(plain(content))
 

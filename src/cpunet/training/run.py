@@ -17,13 +17,13 @@ import json
 import logging
 import platform
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -56,13 +56,6 @@ log = logging.getLogger(__name__)
 
 FORMAT = 3
 """Format of run folders; those of other versions cannot be loaded."""
-
-
-class Shaped(Protocol):
-    """Array of either library."""
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
 
 
 Record = dict[str, float | int | dict[str, float]]
@@ -104,12 +97,15 @@ class Run(InfoPart):
         Versions of the software.
     imported
         Files of imported weights, by part.
+    log
+        Records of the training, if it was not read from a folder.
     """
 
     dt_ns: Annotated[float, Field(gt=0, le=1e9)]
     recipe: Recipe = Field(**_NOT_STORED)
     weights: dict[str, Array] = Field(**_NOT_STORED)
     folder: Path | None = Field(None, **_NOT_STORED)
+    log: list[Record] | None = Field(None, **_NOT_STORED)
     peak: str
     seed: Annotated[int, Field(ge=0)] | None
     device: str
@@ -178,7 +174,10 @@ class Run(InfoPart):
             raise CpunetError(f"{path}: damaged ({wrong}); train again") from error
 
     def write(self, folder: Path) -> None:
-        """Write weights, recipe and provenance into an existing folder."""
+        """Write weights, log, recipe and provenance into an existing folder."""
+        lines = [json.dumps(record) + "\n" for record in self.records]
+        if lines:
+            (folder / LOSSES).write_text("".join(lines), encoding="utf-8")
         (folder / WEIGHTS).write_bytes(save(self.weights))
         settings = yaml_text(self.recipe.model_dump(mode="json"))
         (folder / RECIPE).write_text(settings, encoding="utf-8")
@@ -187,18 +186,15 @@ class Run(InfoPart):
         (folder / INFO).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
     def save(self, folder: str | Path, force: bool = False) -> Self:
-        """Write the run, with its losses, to a folder; return the run of that folder.
+        """Write the run to a folder, and return the run of that folder.
 
         Raises
         ------
         CpunetError
             If the folder exists and `force` is off, or is not a run.
         """
-        records = self.records
         with folder_written_aside(Path(folder), RUN, self.folder, force=force) as aside:
             self.write(aside)
-            if records:
-                append_losses(aside, records)
         return self.model_copy(update={"folder": Path(folder)})
 
     def fill(self, part: str, network: Network, device: str = "cpu") -> Network:
@@ -210,11 +206,8 @@ class Run(InfoPart):
             If the weights are of another architecture, not finite, or all zero.
         """
         where, prefix = (self.folder or Path()) / WEIGHTS, f"{part}."
-        own = {
-            key.removeprefix(prefix): values
-            for key, values in self.weights.items()
-            if key.startswith(prefix)
-        }
+        weights = self.weights.items()
+        own = {key.removeprefix(prefix): of for key, of in weights if key.startswith(prefix)}
         if wrong := differing(own, arrays_of(network)):
             raise CpunetError(
                 f"{where}: weights of another network: {len(wrong)} tensors differ, first "
@@ -258,7 +251,13 @@ class Run(InfoPart):
     @cached_property
     def records(self) -> list[Record]:
         """Records of the training's log; empty without a log."""
-        return [] if self.folder is None else read_losses(self.folder)
+        path = (self.folder or Path()) / LOSSES
+        if self.log is not None or self.folder is None or not path.is_file():
+            return self.log or []
+        try:
+            return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        except ValueError as error:
+            raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
 
     @cached_property
     def losses(self) -> DataFrame:
@@ -395,8 +394,8 @@ def arrays_of(part: Stored | nn.Module) -> dict[str, Array]:
     return {name: values.detach().cpu().numpy() for name, values in part.state_dict().items()}
 
 
-def differing(own: Mapping[str, Shaped], expected: Mapping[str, Shaped]) -> list[str]:
-    """Names of arrays that only a single side has, or in another shape."""
+def differing(own: Mapping[str, Any], expected: Mapping[str, Any]) -> list[str]:
+    """Names of arrays, of either library, that only a single side has, or in another shape."""
     shapes = [{name: value.shape for name, value in side.items()} for side in (own, expected)]
     return sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()})
 
@@ -434,20 +433,3 @@ def versions() -> dict[str, str]:
         with suppress(PackageNotFoundError):  # torch is needed by networks only
             numbers[name] = version(name)
     return numbers
-
-
-def append_losses(folder: Path, records: Iterable[Mapping[str, Any]]) -> None:
-    """Add training records to the folder's log."""
-    with (folder / LOSSES).open("a") as stream:
-        stream.writelines(json.dumps(record) + "\n" for record in records)
-
-
-def read_losses(folder: Path) -> list[Record]:
-    """Return the training records; empty if the log is missing."""
-    path = folder / LOSSES
-    if not path.is_file():
-        return []
-    try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    except ValueError as error:
-        raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error

@@ -11,7 +11,6 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -307,11 +306,9 @@ class HeldOut:
         CpunetError
             If the training fails.
         """
-        sides = self.fit_sim, self.fit_data
-        with TemporaryDirectory() as folder:
-            whole = recipe.at(sides[0].dt_ns)
-            job = TrainingJob(whole, "", seed, device, *sides, Path(folder))
-            return REN.of(job.trained(None), device)
+        whole = recipe.at(self.fit_sim.dt_ns)
+        job = TrainingJob(whole, "", seed, device, self.fit_sim, self.fit_data)
+        return REN.of(job.trained(), device)
 
 
 def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
