@@ -40,10 +40,10 @@ def main() -> None:
         seeds = np.random.SeedSequence(seed).generate_state(3, np.uint32).tolist()
         here = []
         for shift, side_seed in zip((Shift(), Shift.of(["default"])), seeds, strict=False):
-            physics = shift.settings(SimulationSettings())
+            physics = shift.applied(SimulationSettings())
             source = physics.source_height_mm, physics.source_radius_mm, side_seed
             events = GammaSource({FEP: arguments.events}, *source)
-            here.append(events_of(Side(shift.detector(read_detector("icpc")), physics, events)))
+            here.append(events_of(Side(shift.applied(read_detector("icpc")), physics, events)))
         for all_of_side, these in zip(sides, here, strict=True):
             all_of_side.append(these)
         print(seed, *deviations(*here), sep=" | ", flush=True)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.fft
 
+from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit

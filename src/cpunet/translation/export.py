@@ -17,11 +17,12 @@ import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.networks.generators import ResponseGenerator
+from cpunet.networks.generators import LinearInverse, ResponseGenerator
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray
 from cpunet.training.run import RunLike, used_run
+from cpunet.translation.onnx_readout import chain_model, inverse_model
 from cpunet.translation.translator import IREN, REN, Translator
 
 # Lowest version of the file format that holds the operators: what an older runtime reads.
@@ -123,50 +124,41 @@ def graph_of(network: Any, length: int) -> Graph:
     for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a network,
     unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
     """
+
+    def windows(n: int) -> Inputs:
+        """Prepared pulses with edges of several widths and positions."""
+        rng = np.random.default_rng(n)
+        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
+        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
+        return {"windows": charge.astype(np.float32)}
+
     behind = getattr(network, "linear", None) or getattr(network, "residual", None)
     if behind is not None:
         raise CpunetError(
             "ONNX graphs have a readout or a network, this run has both in series; export one "
             "of the recipe fast"
         )
-    if isinstance(network, ResponseGenerator) and network.response.by_height is not None:
-        raise CpunetError(
-            "the electronics of this run act by the height of a pulse, and a graph has no "
-            "energies; train on one line alone for the linear part"
-        )
-    torch = needed("torch")
+    if isinstance(network, ResponseGenerator):
+        if network.response.by_height is not None:
+            raise CpunetError(
+                "the electronics of this run act by the height of a pulse, and a graph has no "
+                "energies; train on one line alone for the linear part"
+            )
+        model = chain_model(network.response, length)
+        return Graph(model, windows, lambda given: network(given["windows"]))
+    if isinstance(network, LinearInverse):
+        model = inverse_model(network)
+        return Graph(model, windows, lambda given: network(given["windows"]))
     needed("onnxscript")
-    from cpunet.translation import onnx_graphs as graphs
+    from cpunet.translation.onnx_network import NetworkGraph
 
-    graph: Any
-    latent: tuple[int, int] | None = None  # (channels, samples) of the draw of a network
+    graph = NetworkGraph(network.unet)
 
-    def example(n: int) -> Inputs:
-        """Prepared pulses with edges of several widths and positions, and a draw."""
-        rng = np.random.default_rng(n)
-        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
-        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
-        windows = {"windows": charge.astype(np.float32)}
-        if latent is None:
-            return windows
-        drawn = np.random.default_rng(n).normal(size=(n, *latent))
-        return windows | {"epsilon": drawn.astype(np.float32)}
+    def with_epsilon(n: int) -> Inputs:
+        drawn = np.random.default_rng(n).normal(size=(n, *graph.latent)).astype(np.float32)
+        return windows(n) | {"epsilon": drawn}
 
-    if not hasattr(network, "unet"):
-        if isinstance(network, ResponseGenerator):
-            graph, output = graphs.ReadoutGraph(network.response, length), "records"
-        else:
-            graph, output = graphs.InverseGraph(network), "pulses"
-        model = graphs.onnx_model(graph, example(2), output)
-        return Graph(model, example, lambda given: network(given["windows"]))
-    latent = network.unet.latent_mean.out_channels, length // 16
-    graph = graphs.NetworkGraph(network.unet)
-
-    def expected(given: Inputs) -> FloatArray:
-        with torch.inference_mode():
-            return np.asarray(graph(*map(torch.from_numpy, given.values())).numpy())
-
-    return Graph(graphs.onnx_model(graph, example(2), "translated"), example, expected)
+    return Graph(graph.model(with_epsilon(2)), with_epsilon, graph.expected)
 
 
 def write_onnx(graph: Graph, path: Path, facts: dict[str, Any]) -> float:

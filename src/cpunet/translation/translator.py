@@ -239,6 +239,8 @@ class Translator:
             result = result.waveforms if ndim == 2 else result.waveforms[0]
         return result  # type: ignore[no-any-return]
 
+    __call__ = translate
+
     def translate_pulses(
         self,
         pulses: Pulses,
