@@ -106,8 +106,8 @@ def test_a_shift_is_no_difference(shift, sigma):
     truth = edge(TIME - 350, sigma)[np.newaxis].astype(np.float32)
     moved = edge(TIME - 350 - shift, sigma)[np.newaxis].astype(np.float32)
     scores = paired_scores(moved, truth, 100)
-    assert scores["rmse"] < 3e-5
-    assert scores["edge_rmse"] < 6e-5
+    assert scores.rmse < 3e-5
+    assert scores.edge_rmse < 6e-5
 
 
 def test_noise_scores_its_own_size():
@@ -115,7 +115,7 @@ def test_noise_scores_its_own_size():
     truth = np.repeat(edge(TIME - 350, 30.0)[np.newaxis], 300, axis=0)
     noisy = (truth + rng.normal(0, 1e-3, truth.shape)).astype(np.float32)
     # interpolation between samples smooths white noise a little
-    assert paired_scores(noisy, truth.astype(np.float32), 100)["rmse"] == pytest.approx(
+    assert paired_scores(noisy, truth.astype(np.float32), 100).rmse == pytest.approx(
         1e-3, rel=0.2
     )
 
@@ -125,11 +125,11 @@ def test_windows_of_the_two_scores():
     other = truth.copy()
     other[0, 520] -= 0.1  # beyond the edge's window, and not its maximum
     scores = paired_scores(other, truth, 100)
-    assert scores["edge_rmse"] < 1e-6
-    assert scores["rmse"] == pytest.approx(0.1 / np.sqrt(2 * 800), rel=0.01)
+    assert scores.edge_rmse < 1e-6
+    assert scores.rmse == pytest.approx(0.1 / np.sqrt(2 * 800), rel=0.01)
     other[0, 490] -= 0.1
     expected = 0.1 / np.sqrt(2 * 201)
-    assert paired_scores(other, truth, 100)["edge_rmse"] == pytest.approx(expected, rel=0.01)
+    assert paired_scores(other, truth, 100).edge_rmse == pytest.approx(expected, rel=0.01)
 
 
 def test_pairs_that_cannot_be_aligned_are_counted():
@@ -137,10 +137,10 @@ def test_pairs_that_cannot_be_aligned_are_counted():
     broken = truth.copy()
     broken[1] = 0
     broken[3, 5] = np.nan
-    assert paired_scores(broken, truth, 100)["unaligned"] == 2
+    assert paired_scores(broken, truth, 100).unaligned == 2
     nothing = paired_scores(broken[[1]], truth[[1]], 100)
-    assert np.isnan(nothing["rmse"])
-    assert nothing["unaligned"] == 1
+    assert nothing.rmse is None
+    assert nothing.unaligned == 1
 
 
 def prepared(index, n_read):

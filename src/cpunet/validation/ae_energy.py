@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.optimize
 from iminuit import Minuit
-from matplotlib.figure import Figure
+from pydantic import Field
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.plotting import COLOURS, GROUP, STACKED, group, label, panels, styled
 from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP, Range
+from cpunet.validation.comparisons import Result
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
@@ -110,8 +110,7 @@ class Course:
     resolution: WidthLaw
 
 
-@dataclass(frozen=True)
-class AgainstEnergy:
+class AgainstEnergy(Result):
     """A/E against energy.
 
     Attributes
@@ -125,7 +124,7 @@ class AgainstEnergy:
     """
 
     multi_site: bool | None = None
-    methods: dict[str, Course] | None = None
+    methods: dict[str, Course] = Field(default_factory=dict)
     missing: str | None = None
 
 
@@ -168,7 +167,7 @@ def against_energy(
         method: _course([p for p in site_fits if (p.low_kev, p.high_kev) in common])
         for method, site_fits in points.items()
     }
-    return AgainstEnergy(bands is all_bands, methods)
+    return AgainstEnergy(multi_site=bands is all_bands, methods=methods)
 
 
 def site_fit(
@@ -211,37 +210,6 @@ def site_fit(
     return centre + width * mean, width * error, sigma, sigma * log_error, len(x)
 
 
-@styled
-def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
-    """Relative shift and relative width of the single-site peak of A/E against energy.
-
-    Parameters
-    ----------
-    methods
-        ``methods`` of `against_energy`.
-    """
-    figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
-    for method, course in methods.items():
-        colour, line = COLOURS[method], course.mean
-        energy, mean, error, sigma, sigma_error = _columns(course.points)
-        look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
-        for axes, value, spread in (
-            (above, mean / course.scale - 1, error / course.scale),
-            (below, sigma / mean, sigma_error / mean),
-        ):
-            group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
-        along = np.linspace(energy.min(), energy.max(), 100)
-        text = f"{label(method)}: {line.per_mev_percent:+.3f} ± "
-        text += f"{line.per_mev_error_percent:.3f} % per MeV"
-        fit = {"color": colour, "gid": GROUP + method}
-        above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
-        below.plot(along, 100 * course.resolution.of(along), **fit)
-    above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
-    below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
-    above.legend()
-    return figure
-
-
 def _points(
     amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
 ) -> list[SiteFit]:
@@ -264,7 +232,7 @@ def _points(
 
 def _course(points: list[SiteFit]) -> Course:
     """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
-    energy, mean, error, sigma, sigma_error = _columns(points)
+    energy, mean, error, sigma, sigma_error = columns(points)
     design = np.stack([energy - REFERENCE_KEV, np.ones(len(energy))], axis=1) / error[:, None]
     slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
     covariance = np.linalg.inv(design.T @ design) / scale**2
@@ -295,7 +263,7 @@ def _course(points: list[SiteFit]) -> Course:
     return Course(points, float(scale), scale_error, line, law)
 
 
-def _columns(points: Sequence[SiteFit]) -> Values:
+def columns(points: Sequence[SiteFit]) -> Values:
     """Fitted values of the points, as rows of an array."""
     return np.array([[getattr(point, name) for point in points] for name in FITTED])
 

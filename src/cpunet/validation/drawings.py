@@ -14,11 +14,10 @@ from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import A_OVER_E, data_axis
 from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
-from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
-from cpunet.validation.noise import spectrum_of_noise
 from cpunet.validation.peaks import MeanPulse, PeakSets, around_half
 from cpunet.validation.run_figures import (
+    ae_energy_figure,
     cycle_figure,
     further_histograms,
     loss_curves,
@@ -27,8 +26,8 @@ from cpunet.validation.run_figures import (
     parameter_histograms,
     roc_figure,
     shape_figure,
+    spectrum_of_noise,
 )
-from cpunet.validation.verdicts import held_out, judged_parameters
 
 # methods in the figures; a reader may hide some
 DRAWN = ("data", "raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth")
@@ -44,10 +43,11 @@ T = TypeVar("T")
 def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
-    if peaks := held_out(evaluated.metrics):
-        drawn["overlap with data"] = partial(overlap_figure, evaluated.metrics, peaks)
-    if evaluated.ae_energy.methods:
-        drawn["A over E and energy"] = partial(ae_energy_figure, evaluated.ae_energy.methods)
+    metrics = evaluated.metrics
+    if peaks := metrics.held_out:
+        drawn["overlap with data"] = partial(overlap_figure, metrics, peaks)
+    if courses := metrics.ae_energy.methods:
+        drawn["A over E and energy"] = partial(ae_energy_figure, courses)
     for peak in evaluated.sets:
         if peak.name in evaluated.values:
             of_peak = _of_peak(peak, evaluated)
@@ -86,7 +86,7 @@ def _shown(by_method: Mapping[str, T], methods: Collection[str] = DRAWN) -> dict
 
 def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
     name, dt_ns, bins = peak.name, evaluated.run.dt_ns, evaluated.run.recipe.scores.max_bins
-    scores, values = evaluated.metrics["peaks"][name], _shown(evaluated.values[name])
+    scores, values = evaluated.metrics.peaks[name], _shown(evaluated.values[name])
     drawn: dict[str, Drawing] = {}
     further: dict[str, dict[str, Values]] = {}
     for parameter, data in values["data"].items():
@@ -94,7 +94,7 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
         if not np.isfinite(data).any():
             continue
         if parameter in (*PARAMETERS, *MAIN_FIGURES):
-            axis, compared = data_axis(data, bins), judged_parameters(scores)[parameter]
+            axis, compared = data_axis(data, bins), scores.judged[parameter]
             how = (by_method, axis, parameter, name, compared)
             drawn[parameter.replace("_", " ")] = partial(parameter_histograms, *how)
         else:
@@ -115,8 +115,8 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
     drawn["superpulses"] = partial(shape_figure, columns, dt_ns, title)
     if (single := _single_pulse(peak)) is not None:
         drawn["single pulse"] = single
-    if "missing" not in scores["noise"]["data"]:
-        noise = _shown(scores["noise"], ("frequency_mhz", "data", "ren"))
+    if not scores.noise["data"].missing:
+        noise = _shown(scores.noise, ("data", "ren"))
         drawn["noise"] = partial(spectrum_of_noise, noise, name)
     return drawn
 

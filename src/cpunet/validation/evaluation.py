@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from cpunet.validation.a_over_e import (
     subtracted,
     survival_table,
 )
-from cpunet.validation.ae_energy import AgainstEnergy, against_energy
+from cpunet.validation.ae_energy import against_energy
 from cpunet.validation.comparisons import Missing
 from cpunet.validation.methods import (
     Translations,
@@ -43,9 +42,9 @@ from cpunet.validation.methods import (
     translate_all,
     true_responses,
 )
+from cpunet.validation.metrics import Metrics, PeakScores
 from cpunet.validation.peaks import (
     ByMethod,
-    PeakScores,
     PeakSets,
     Slices,
     aligned_means,
@@ -53,8 +52,6 @@ from cpunet.validation.peaks import (
     moved_values,
     score_peak,
 )
-from cpunet.validation.report import as_stored
-from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 
@@ -70,18 +67,15 @@ class Evaluation:
     sets, values, slices
         Pulses, and parameters and mean pulses by method, each by peak.  The latter two exist
         only for scored peaks.
-    ae_energy
-        A/E against energy.
     metrics
-        Content of ``metrics.json``.
+        All numbers.
     """
 
     run: Run
     sets: list[PeakSets]
     values: Mapping[str, ByMethod]
     slices: Mapping[str, Mapping[str, Slices]]
-    ae_energy: AgainstEnergy
-    metrics: dict[str, Any]
+    metrics: Metrics
 
 
 @one_thread_for_matrices()
@@ -164,39 +158,30 @@ def evaluate(
     ranges = _range_survivals(translations, survivals, recipe)
     if not isinstance(survivals, Missing) and not isinstance(ranges, Missing):
         survivals = subtracted(survivals, ranges)
-    tails = None if run.fit is None else run.fit.tails
-    ae_energy = against_energy(
-        {method: translations.amplitudes[method] for method in ("data", "ren")},
-        translations.energy_kev,
-        {name: span for name, (span, _) in _lines(recipe).items()},
-    )
-    metrics = {
-        "compared": _compared(run, sim_set, data_set),
-        "peaks": peaks,
-        "ae_survival": survivals,
-        "ae_details": {"survival by energy range": ranges},
-        "ae_energy": ae_energy,
-        "a_over_e_scale": {method: list(spread) for method, spread in scales.items()},
-        "baseline_methods": {
-            "fits": {
-                name: method.describe() for name, method in baseline_methods.methods.items()
-            },
+    metrics = Metrics(
+        compared=_compared(run, sim_set, data_set),
+        peaks=peaks,
+        ae_survival=survivals,
+        ae_details={"survival by energy range": ranges},
+        ae_energy=against_energy(
+            {method: translations.amplitudes[method] for method in ("data", "ren")},
+            translations.energy_kev,
+            {name: span for name, (span, _) in _lines(recipe).items()},
+        ),
+        a_over_e_scale=scales,
+        baseline_methods={
+            "fits": {name: of.describe() for name, of in baseline_methods.methods.items()},
             "missing": baseline_methods.missing,
         },
-        "training": {"recipe": recipe.name}
+        training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
-        "tails": None if tails is None else tails.model_dump(exclude_unset=True),
-        "rejections": {
+        tails=None if run.fit is None else run.fit.tails,
+        rejections={
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,
         },
-    }
-    stored = as_stored(metrics)
-    stored["verdicts"] = {
-        "summary": [summary(stored, name, "ren") for name in values],
-        "table": verdict_table(stored),
-    }
-    return Evaluation(run, sets, values, slices, ae_energy, stored)
+    )
+    return Evaluation(run, sets, values, slices, metrics)
 
 
 def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
@@ -218,8 +203,8 @@ def _range_survivals(
 ) -> dict[str, dict[str, RangeSurvival]] | Missing:
     """A/E survival of gamma lines, sideband-subtracted, and of continua, after given cuts."""
     if isinstance(ae_survival, Missing):
-        return Missing(f"there is no A/E cut: {ae_survival.missing}")
-    cuts, errors = ae_survival[DEP].cut or {}, ae_survival[DEP].cut_std or {}  # of each method
+        return Missing(missing=f"there is no A/E cut: {ae_survival.missing}")
+    cuts, errors = ae_survival[DEP].cut, ae_survival[DEP].cut_std  # of each method
     ranges = {name: line for name, line in _lines(recipe).items() if name != DEP}
     ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
     return {

@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +38,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.translation.forms import wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
+from cpunet.validation.metrics import PairedScores
 
 log = logging.getLogger(__name__)
 
@@ -74,14 +74,6 @@ def true_responses(path: Path, sim: InputSet) -> FloatArray:
     if len(used) and not any(np.isfinite(trace).all() for trace in used):
         raise CpunetError(f"{path}: no response is finite; give noise-free traces")
     return used
-
-
-class PairedScores(TypedDict):
-    """RMS differences of pulse pairs in units of the full charge, and pairs left out."""
-
-    rmse: float
-    edge_rmse: float
-    unaligned: int
 
 
 def pair_squares(
@@ -125,13 +117,6 @@ def scores_of_squares(squares: Values) -> PairedScores:
 
     over pulses :math:`p` and samples :math:`k`.
 
-    Returns
-    -------
-    dict
-        ``rmse`` and ``edge_rmse`` in units of the full charge (NaN if no pair is left), and
-        ``unaligned``, the number of pairs left out because one of the two does not cross
-        half of its maximum.
-
     Examples
     --------
     A time shift is no difference of shape:
@@ -140,15 +125,15 @@ def scores_of_squares(squares: Values) -> PairedScores:
     >>> time = np.arange(100)
     >>> early, late = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40, 50)])
     >>> squares = pair_squares({"ren": late[None]}, early[None], edge_samples=10)
-    >>> round(scores_of_squares(squares["ren"])["rmse"], 6)
+    >>> round(scores_of_squares(squares["ren"]).rmse, 6)
     0.0
     """
     rmse, edge_rmse = (
-        float(np.sqrt(total / count)) if count else float("nan")
+        np.sqrt(total / count) if count else None
         for total, count in squares.sum(axis=0).reshape(2, 2)
     )
     unaligned = int((squares[:, 1] == 0).sum())
-    return {"rmse": rmse, "edge_rmse": edge_rmse, "unaligned": unaligned}
+    return PairedScores(rmse=rmse, edge_rmse=edge_rmse, unaligned=unaligned)
 
 
 def _squares(difference: Values) -> Values:

@@ -27,13 +27,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.processes import usable_cores
@@ -47,8 +48,9 @@ from cpunet.training.closed_forms import error_ends
 from cpunet.training.run import Run
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import REN
-from cpunet.validation.comparisons import Compared, Missing, compare
-from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
+from cpunet.validation.comparisons import Missing, compare
+from cpunet.validation.methods import Translations, scores_of_squares
+from cpunet.validation.metrics import PairedScores, PeakScores
 from cpunet.validation.noise import baseline_spectra
 
 BEFORE_NS, AFTER_NS = 1600.0, 2400.0  # of a mean pulse before and after half maximum
@@ -212,45 +214,10 @@ class PeakSets:
         rows = self.rows["raw"]
         return rows[self.translations.comparable[rows]]
 
-    def paired_scores(self) -> dict[str, PairedScores] | None:
-        """Paired scores by method; None if the truth is unknown."""
+    def paired_scores(self) -> dict[str, PairedScores]:
+        """Paired scores by method; none if the truth is unknown."""
         rows, squares = self.known_to_all(), self.translations.squares
-        return {
-            name: scores_of_squares(of_method[rows]) for name, of_method in squares.items()
-        } or None
-
-
-@dataclass(frozen=True, eq=False)
-class PeakScores:
-    """Scores of a peak, its entry in ``metrics.json``.
-
-    Attributes
-    ----------
-    n_sim, n_data
-        Numbers of pulses.
-    not_prepared
-        Number of translated pulses that cannot be prepared like data, by method.
-    parameters, further
-        Comparison of each parameter, of `PARAMETERS` and of all others.
-    two_sample
-        Classifier test between each method and the data.
-    noise
-        Result of `baseline_spectra`.
-    paired
-        Paired scores by method; None if the truth is unknown.
-    missing
-        Reason why the peak is not scored.
-    """
-
-    n_sim: int
-    n_data: int
-    not_prepared: dict[str, int]
-    parameters: dict[str, Compared] = field(default_factory=dict)
-    further: dict[str, Compared] | None = None
-    two_sample: dict[str, TwoSample | Missing] | None = None
-    noise: Mapping[str, Any] | None = None
-    paired: dict[str, PairedScores] | None = None
-    missing: str | None = None
+        return {method: scores_of_squares(of[rows]) for method, of in squares.items()}
 
 
 def score_peak(
@@ -293,12 +260,15 @@ def score_peak(
         for method, whole in peak.translations.whole.items()
         if method != "data"
     }
-    counted = PeakScores(len(raw), len(data), {m: n for m, n in lost.items() if n})
+    result = PeakScores(
+        n_sim=len(raw), n_data=len(data), not_prepared={m: n for m, n in lost.items() if n}
+    )
     sides = (("simulated", raw), ("measured", data))
     few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
     if few:
-        missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
-        return {}, replace(counted, missing=missing)
+        result.parameters = {}
+        result.missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
+        return {}, result
     dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
     values = {
         method: all_parameters(
@@ -326,7 +296,7 @@ def score_peak(
         }
         for chosen in (True, False)
     )
-    parameters, further = (
+    result.parameters, result.further = (
         compare(
             of["data"],
             {m: of_method for m, of_method in of.items() if m != "data"},
@@ -336,20 +306,16 @@ def score_peak(
         )
         for of in (chief, others)
     )
-    noise = baseline_spectra(
+    result.two_sample = classifier_tests(peak, chief, seed)
+    result.noise = baseline_spectra(
         {method: peak.windows(method)[:, :samples].copy() for method in values},
         {m: recipe.preparation.samples_before + of["t01"] / dt_ns for m, of in values.items()},
         samples,
         dt_ns,
     )
-    return values, replace(
-        counted,
-        parameters=parameters,
-        further=further,
-        two_sample=classifier_tests(peak, chief, seed),
-        noise=noise,
-        paired=peak.paired_scores(),
-    )
+    if paired := peak.paired_scores():
+        result.paired = paired
+    return values, result
 
 
 def classifier_tests(
@@ -373,7 +339,7 @@ def classifier_tests(
         try:
             return classifier_auc(data, peak.windows(method), seed=seed, features=features)
         except CpunetError as error:
-            return Missing(str(error))
+            return Missing(missing=str(error))
 
     methods = list(values)[1:]
     with ThreadPoolExecutor(usable_cores()) as pool:
@@ -385,11 +351,29 @@ PULSES = 300  # of a peak, for which an effect is calculated
 Ends = Sequence[tuple[REN, REN]]
 
 
+@dataclass(frozen=True, eq=False)
+class _DrawnOnce(BaselineNoise):
+    """Noise that is drawn once for the same energies: all ends of an error have one seed."""
+
+    drawn: dict[bytes, tuple[FloatArray, Mapping[str, Any]]] = field(default_factory=dict)
+
+    def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
+        key = energy_kev.tobytes()
+        if key not in self.drawn:
+            noise = super().draw(energy_kev, length, rng)
+            noise.flags.writeable = False
+            self.drawn[key] = noise, rng.bit_generator.state
+        noise, rng.bit_generator.state = self.drawn[key]
+        return noise
+
+
 def fit_ends(run: Run, ren: REN) -> Ends:
     """A translator at both ends of each axis of the errors; none of a network."""
-    backend = ren.backend
+    backend = copy.copy(ren.backend)
     if run.fit is None or not isinstance(backend, ResponseBackend):
         return []
+    if backend.noise is not None:
+        backend.noise = _DrawnOnce(**vars(backend.noise))
 
     def at(response: ElectronicsResponse) -> REN:
         moved = copy.copy(ren)

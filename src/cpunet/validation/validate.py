@@ -16,8 +16,8 @@ from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, used_run
 from cpunet.validation.compare import compared
+from cpunet.validation.metrics import Metrics
 from cpunet.validation.report import REPORT, Report
-from cpunet.validation.verdicts import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -148,15 +148,15 @@ def _notes(run: Run, metrics: Metrics, truth: Path | None) -> list[str]:
         "distribution do not reach 100 at finite size: data vs data is what two samples of the "
         "measured distribution have at these sizes.",
     ]
-    tails = metrics["tails"] or {}
-    if tails.get("rate_khz"):
+    tails = metrics.tails
+    if tails is not None and tails.rate_khz:
         shares = ", ".join(
             f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
-            for size, share in tails["percent_above"].items()
+            for size, share in tails.percent_above.items()
         )
         notes.append(
-            f"Traces of the training lie on pile-up tails, {tails['rate_khz']:.2f} ± "
-            f"{tails['rate_error_khz']:.2f} kHz decaying with {tails['decay_us']:.1f} µs: "
+            f"Traces of the training lie on pile-up tails, {tails.rate_khz:.2f} ± "
+            f"{tails.rate_error_khz:.2f} kHz decaying with {tails.decay_us:.1f} µs: "
             f"percent of the traces, measured (by the law), {shares}. All translations and the "
             "truth have tails drawn by this law, as likely as they pass the quality cuts."
         )
