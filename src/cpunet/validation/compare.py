@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import refuse_existing, written_aside
+from cpunet.outputs import refuse_existing, refuse_inputs, written_aside
 from cpunet.plotting import label
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.pulses.two_sample import TwoSample
@@ -163,7 +163,11 @@ class Comparison:
         from cpunet.html_pages import rendered
 
         path = Path(path)
-        _refuse(path, self.folders.values(), force=force)
+        if path.is_dir():
+            raise CpunetError(
+                f"{path}: is a folder", "give the name of a page, as compare.html"
+            )
+        refuse_existing(path, *self.folders.values(), force=force)
         links = {
             name: quote(os.path.relpath(folder / PAGE, path.parent))
             for name, folder in self.folders.items()
@@ -171,33 +175,19 @@ class Comparison:
         }
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
         title = f"{label(self.method)}: {len(self.metrics)} runs compared"
-        runs = []
-        for name, metrics in self.metrics.items():
-            off, judged = metrics.off(self.method)
-            text = f"{off} of {judged} off" if judged else "not judged"
-            marked = off > 2 and off > 0.2 * judged  # one or two of many may be off
-            if metrics.training.get("ok") is False:
-                text, marked = f"{text}, a bad fit", True
-            lines = [metrics.summary(peak, self.method) for peak in metrics.peaks]
-            about = "; ".join(f"{key}: {of}" for key, of in metrics.compared.items())
-            runs.append(
-                {"name": name, "text": text, "marked": marked, "lines": lines, "about": about}
-            )
-        values = {"title": title, "comparison": self, "runs": runs, "links": links}
-        page = rendered("compare.html", **values, peaks=peaks, far=f"{FAR:g}")
+        values = {"title": title, "comparison": self, "links": links, "peaks": peaks}
         with written_aside(path) as aside:
-            aside.write_text(page, encoding="utf-8")
+            aside.write_text(
+                rendered("compare.html", **values, far=f"{FAR:g}"), encoding="utf-8"
+            )
 
     def __str__(self) -> str:
         lines = []
         if self.path is None or len(self.metrics) <= FEW:
-            shown = [
-                "" if i and self.rows[i - 1].peak == row.peak else row.peak
-                for i, row in enumerate(self.rows)
-            ]
+            peaks = [row.peak for row in self.rows]
             rows = [
-                [peak, row.score, *row.texts]
-                for peak, row in zip(shown, self.rows, strict=True)
+                ["" if last == row.peak else row.peak, row.score, *row.texts]
+                for last, row in zip(["", *peaks], self.rows, strict=False)
             ]
             title = f"Scores of {self.method}, the best with *"
             lines = [text_table(["peak", "score", *self.metrics], rows, words=2, title=title)]
@@ -255,19 +245,12 @@ def compare(
         return response(*runs, out=out, force=force)
     scored = [report for report in reports if not isinstance(report, Run)]
     if out is not None:
-        files = [report for report in scored if not isinstance(report, Report)]
-        _refuse(Path(out), files, force=force)
+        refuse_inputs(Path(out), *(of for of in scored if not isinstance(of, Report)))
     comparison = compared(scored, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)
     return replace(comparison, path=Path(out))
-
-
-def _refuse(out: Path, reports: Iterable[str | Path | None], *, force: bool) -> None:
-    if out.is_dir():
-        raise CpunetError(f"{out}: is a folder", "give the name of a page, as compare.html")
-    refuse_existing(out, *reports, force=force)
 
 
 def compared(
