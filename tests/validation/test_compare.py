@@ -267,5 +267,6 @@ def test_bad_metrics_are_told(two, tmp_path, defect):
 
 
 def test_a_folder_is_no_page(two, tmp_path):
+    (tmp_path / "folder").mkdir()
     with pytest.raises(CpunetError, match="is a folder; give the name of a page"):
-        compare(*two, out=tmp_path, force=True)
+        compare(*two, out=tmp_path / "folder", force=True)

@@ -364,22 +364,26 @@ def _peak_survival(values: Values, cut: float, cuts: Values) -> Spread:
     return 100 * passing / n, error
 
 
-def dep_scale(dep_ae: Values, seed: int = 0) -> Spread:
+def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, Spread]:
     """Position of the single-site peak of A/E in the double-escape peak, and its error.
 
     Parameters
     ----------
     dep_ae
-        A/E of the events of the peak; values that are not finite are left out.
+        A/E of the events of the peak by method; values that are not finite are left out.
+        Nothing is returned if a method has too few others.
     seed
         Seed of the bootstraps.
     """
-    finite_ae = dep_ae[np.isfinite(dep_ae)]
-    if finite_ae.size < MIN_EVENTS:
-        return np.nan, np.nan
-    rng = np.random.default_rng(seed)
-    drawn = [most_frequent(rng.choice(finite_ae, finite_ae.size)) for _ in range(SCALES)]
-    return most_frequent(finite_ae), float(np.std(drawn, ddof=1))
+    finite = {method: values[np.isfinite(values)] for method, values in dep_ae.items()}
+    if not all(values.size >= MIN_EVENTS for values in finite.values()):
+        return {}
+    scales = {}
+    for method, values in finite.items():
+        rng = np.random.default_rng(seed)
+        drawn = [most_frequent(rng.choice(values, values.size)) for _ in range(SCALES)]
+        scales[method] = most_frequent(values), float(np.std(drawn, ddof=1))
+    return scales
 
 
 def subtracted(

@@ -357,11 +357,9 @@ def _names(reports: Sequence[Path]) -> list[str]:
     parts = [(path.parent if path.is_file() else path).parts for path in given]
     while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
         parts = [part[:-1] for part in parts]
-    longest = max(map(len, parts), default=1)
-    names: list[str] = []
-    for depth in range(1, longest + 1):
+    for depth in range(1, max(map(len, parts), default=1) + 1):
         names = [str(Path(*part[-depth:])) for part in parts]
         if len(set(names)) == len(names):
             return names
     # names that are still equal refer to the same report
-    return [f"{Path(name).name} ({i})" for i, name in enumerate(names, start=1)]
+    return [f"{part[-1]} ({i})" for i, part in enumerate(parts, start=1)]

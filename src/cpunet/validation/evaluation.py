@@ -9,14 +9,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
-from cpunet.pulses.parameters import tail_slope
+from cpunet.pulses.parameters import Values, tail_slope
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.shape_parameters import median_decay_ns
@@ -27,9 +25,8 @@ from cpunet.validation.a_over_e import (
     DEP,
     Range,
     RangeSurvival,
-    Spread,
     SurvivalRow,
-    dep_scale,
+    dep_scales,
     peak_survival,
     subtracted,
     survival_table,
@@ -47,10 +44,10 @@ from cpunet.validation.peaks import (
     ByMethod,
     PeakSets,
     Slices,
-    aligned_means,
     fit_ends,
     moved_values,
     score_peak,
+    sliced,
 )
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
@@ -103,7 +100,8 @@ def evaluate(
     names = list(dict.fromkeys([*recipe.peaks, trained_on, *others]))
     # energies of the peaks, with all sidebands and continua
     selection = parse_selection(",".join(names), recipe.peaks)
-    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    lines = _lines(recipe)
+    more = [band for _, sidebands in lines.values() for band in sidebands]
     more += recipe.scores.continuum_kev.values()
     selection = replace(selection, ranges_kev=(*selection.ranges_kev, *more))
     sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
@@ -126,7 +124,9 @@ def evaluate(
     slices: dict[str, dict[str, Slices]] = {}
     ends = fit_ends(run, ren)
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        scales = _dep_scales(sets, seed)
+        dep = next((peak.rows for peak in sets if peak.name == DEP), {})
+        amplitudes, energy_kev = translations.amplitudes, translations.energy_kev
+        scales = dep_scales({m: amplitudes[m][rows] for m, rows in dep.items()}, seed)
         samples = recipe.preparation.at(ren.dt_ns).decay_fit_samples
         decays = {  # as an analysis has one for a channel
             method: median_decay_ns(tail_slope(windows, ren.dt_ns, samples))
@@ -140,33 +140,32 @@ def evaluate(
             if by_method:
                 values[peak.name] = by_method
                 rise = {method: v["rise_01_90"] for method, v in by_method.items()}
-                slices[peak.name] = aligned_means(peak.windows, rise, run.dt_ns)
+                slices[peak.name] = sliced(peak.windows, rise, run.dt_ns)
             bar.update(1)
     if not values:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    survivals = survival_table(
+    survivals, ranges = _survivals(
         {
             name: {method: v["current_amplitude"] for method, v in of_peak.items()}
             for name, of_peak in values.items()
         },
         {name: of_peak["current_amplitude"] for name, of_peak in moved.items() if of_peak},
-        seed=seed,
+        translations,
+        lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
+        seed,
     )
-    ranges = _range_survivals(translations, survivals, recipe)
-    if not isinstance(survivals, Missing) and not isinstance(ranges, Missing):
-        survivals = subtracted(survivals, ranges)
     metrics = Metrics(
         compared=_compared(run, sim_set, data_set),
         peaks=peaks,
         ae_survival=survivals,
         ae_details={"survival by energy range": ranges},
         ae_energy=against_energy(
-            {method: translations.amplitudes[method] for method in ("data", "ren")},
-            translations.energy_kev,
-            {name: span for name, (span, _) in _lines(recipe).items()},
+            {method: amplitudes[method] for method in ("data", "ren")},
+            energy_kev,
+            {name: span for name, (span, _) in lines.items()},
         ),
         a_over_e_scale=scales,
         baseline_methods={
@@ -184,44 +183,28 @@ def evaluate(
     return Evaluation(run, sets, values, slices, metrics)
 
 
-def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
-    """Position of the single-site peak of A/E in the DEP, and its error, by method."""
-    dep = next((peak for peak in sets if peak.name == DEP), None)
-    if dep is None:
-        return {}
-    scales = {
-        method: dep_scale(dep.translations.amplitudes[method][rows], seed)
-        for method, rows in dep.rows.items()
-    }
-    return scales if np.isfinite(list(scales.values())).all() else {}
-
-
-def _range_survivals(
+def _survivals(
+    ae: Mapping[str, Mapping[str, Values]],
+    moved: Mapping[str, Values],
     translations: Translations,
-    ae_survival: dict[str, SurvivalRow] | Missing,
-    recipe: Recipe,
-) -> dict[str, dict[str, RangeSurvival]] | Missing:
-    """A/E survival of gamma lines, sideband-subtracted, and of continua, after given cuts."""
-    if isinstance(ae_survival, Missing):
-        return Missing(missing=f"there is no A/E cut: {ae_survival.missing}")
-    cuts, errors = ae_survival[DEP].cut, ae_survival[DEP].cut_std  # of each method
-    ranges = {name: line for name, line in _lines(recipe).items() if name != DEP}
-    ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
-    return {
+    bands: Mapping[str, tuple[Range, list[Range]]],
+    seed: int,
+) -> tuple[dict[str, SurvivalRow] | Missing, dict[str, dict[str, RangeSurvival]] | Missing]:
+    """A/E survival of peaks, and of bands of energy with their sidebands subtracted."""
+    table = survival_table(ae, moved, seed=seed)
+    if isinstance(table, Missing):
+        return table, Missing(missing=f"there is no A/E cut: {table.missing}")
+    cuts, errors = table[DEP].cut, table[DEP].cut_std
+    values, kev = translations.amplitudes, translations.energy_kev
+    ranges = {
         name: {
-            method: peak_survival(
-                values,
-                translations.energy_kev[method],
-                cuts[method],
-                span,
-                sidebands,
-                errors[method],
-            )
-            for method, values in translations.amplitudes.items()
-            if method in cuts
+            m: peak_survival(values[m], kev[m], cut, span, sidebands, errors[m])
+            for m, cut in cuts.items()
         }
-        for name, (span, sidebands) in ranges.items()
+        for name, (span, sidebands) in bands.items()
+        if name != DEP
     }
+    return subtracted(table, ranges), ranges
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
@@ -253,10 +236,11 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
         f"{run.sim.used} simulated and {run.data.used} measured pulses",
         run.started[:10],
     )
+    legend = re.match(r"l\d+-(p\d\d)-(r\d{3})-", data.path.name)
     facts = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
-        "period": period_of(data.path),
+        "period": legend and f"{legend[1]} {legend[2]}",
     }
     compared = {name: str(value) for name, value in facts.items() if value is not None}
     compared |= {
@@ -271,15 +255,3 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
     if run.fit is not None and run.fit.verdict:
         compared["fit"] = run.fit.verdict
     return compared | {"scored with": f"cpunet {cpunet.__version__}"}
-
-
-def period_of(path: Path) -> str | None:
-    """Period and run in a file name of LEGEND; None for other names.
-
-    Examples
-    --------
-    >>> period_of(Path("l200-p03-r001-cal-20230318T012144Z-tier_raw.lh5"))
-    'p03 r001'
-    """
-    match = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
-    return None if match is None else f"{match[1]} {match[2]}"

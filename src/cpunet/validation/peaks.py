@@ -105,68 +105,42 @@ class Slices:
     edges: Values
 
 
-def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
-    """Edges of slices with equal numbers of measured pulses.
-
-    Parameters
-    ----------
-    rise_time
-        Rise times of the measured pulses in ns; NaN and infinity are ignored.
-    slices
-        Number of slices; one more edge is returned, in ns.
-
-    Examples
-    --------
-    >>> slice_edges(np.arange(101.0), slices=4)
-    array([  0.,  25.,  50.,  75., 100.])
-    """
-    finite = rise_time[np.isfinite(rise_time)]
-    return np.quantile(finite, np.linspace(0, 1, slices + 1))
-
-
 def around_half(windows: FloatArray, dt_ns: float) -> FloatArray:
     """Pulses from `BEFORE_NS` before their half maximum to `AFTER_NS` after it."""
     before, after = round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns)
     return align_half_maximum(windows, before, after)
 
 
-def aligned_means(
-    windows: Callable[[str], FloatArray], rise_time: Mapping[str, Values], dt_ns: float
+def sliced(
+    windows: Callable[[str], FloatArray],
+    rise_time: Mapping[str, Values],
+    dt_ns: float,
+    slices: int = SLICES,
 ) -> dict[str, Slices]:
-    """Mean pulses of each method, in the same slices for all.
+    """Mean pulses of each method, in the same slices of the rise time for all.
 
     Parameters
     ----------
     windows
         Prepared pulses of a method, shape ``(n, length)``.
     rise_time
-        Their rise times in ns by method, those of the measured pulses under ``"data"``.
+        Their rise times in ns by method.  The edges divide the finite ones of the measured
+        pulses, under ``"data"``, into equal numbers; the last slice includes its upper edge.
     dt_ns
         Sampling period in ns.
+    slices
+        Number of slices.
     """
-    edges = slice_edges(rise_time["data"])
-    return {
-        method: sliced(around_half(windows(method), dt_ns), times, edges)
-        for method, times in rise_time.items()
-    }
-
-
-def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
-    """Mean pulse of each slice.
-
-    Parameters
-    ----------
-    aligned
-        Pulses aligned by `align_half_maximum`, shape ``(n, samples)``.
-    rise_time
-        Rise time of each pulse in ns, shape ``(n,)``.
-    edges
-        Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
-    """
-    inside = (rise_time >= edges[0]) & (rise_time <= edges[-1])  # not those that are NaN
-    place = np.searchsorted(edges[1:-1], rise_time, side="right")
-    means = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
-    return Slices(MeanPulse.of(aligned), means, edges)
+    measured = rise_time["data"][np.isfinite(rise_time["data"])]
+    edges = np.quantile(measured, np.linspace(0, 1, slices + 1))
+    means = {}
+    for method, times in rise_time.items():
+        aligned = around_half(windows(method), dt_ns)
+        place = np.searchsorted(edges[1:-1], times, side="right")
+        place[~((times >= edges[0]) & (times <= edges[-1]))] = -1  # also those that are NaN
+        pulses = tuple(MeanPulse.of(aligned[place == i]) for i in range(slices))
+        means[method] = Slices(MeanPulse.of(aligned), pulses, edges)
+    return means
 
 
 MIN_PULSES = 10  # minimum number of pulses of a distribution
@@ -289,24 +263,11 @@ def score_peak(
             error = np.hypot(own, other)
             moved_by = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
             ends[method][A_OVER_E] = moved_by[np.newaxis]
-    chief, others = (
-        {
-            m: {name: v for name, v in of.items() if (name in PARAMETERS) is chosen}
-            for m, of in values.items()
-        }
-        for chosen in (True, False)
-    )
-    result.parameters, result.further = (
-        compare(
-            of["data"],
-            {m: of_method for m, of_method in of.items() if m != "data"},
-            recipe.scores,
-            seed,
-            ends,
-        )
-        for of in (chief, others)
-    )
-    result.two_sample = classifier_tests(peak, chief, seed)
+    others = {m: of_method for m, of_method in values.items() if m != "data"}
+    compared = compare(values["data"], others, recipe.scores, seed, ends)
+    result.parameters = {name: compared.pop(name) for name in PARAMETERS}
+    result.further = compared
+    result.two_sample = classifier_tests(peak, values, seed)
     result.noise = baseline_spectra(
         {method: peak.windows(method)[:, :samples].copy() for method in values},
         {m: recipe.preparation.samples_before + of["t01"] / dt_ns for m, of in values.items()},
@@ -333,9 +294,12 @@ def classifier_tests(
         Seed of the folds.
     """
     data = peak.windows("data")
+    chief = {
+        m: {name: of_method[name] for name in PARAMETERS} for m, of_method in values.items()
+    }
 
     def tested(method: str) -> TwoSample | Missing:
-        features = values["data"], values[method]
+        features = chief["data"], chief[method]
         try:
             return classifier_auc(data, peak.windows(method), seed=seed, features=features)
         except CpunetError as error:

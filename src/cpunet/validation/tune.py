@@ -143,7 +143,7 @@ def tune(
             )
             values = {key: _suggested(trial, key, of) for key, of in space.items()}
             try:
-                ren = held_out.train(with_values(recipe, values), seed, device)
+                ren = held_out.train(read_settings(Recipe, recipe, values), seed, device)
                 study.tell(trial, held_out.score(ren))
             except CpunetError as error:
                 trial.set_user_attr(REASON, str(error))
@@ -185,7 +185,7 @@ def _write(out: Path, study: Study, recipe: Recipe) -> None:
         first = next(iter(reasons), "interrupted")
         raise CpunetError(f"{out}: no trial has a score; the first: {first}") from error
     description = f"{recipe.description}; tuned, trial {best.number}"
-    tuned = with_values(recipe, best.params).model_copy(
+    tuned = read_settings(Recipe, recipe, best.params).model_copy(
         update={"name": f"{recipe.name}-tuned", "description": description}
     )
     with written_aside(out / BEST) as aside:
@@ -210,21 +210,10 @@ def own_values(recipe: Recipe, space: Mapping[str, Distribution]) -> dict[str, A
             raise CpunetError(f"space: {key}: there is no such setting")
         for value in of.choices if hasattr(of, "choices") else (of.low, of.high):
             try:
-                with_values(recipe, {key: value})
+                read_settings(Recipe, recipe, {key: value})
             except CpunetError as error:
                 raise CpunetError(f"space: {error}") from error
     return {key: values[key] for key in space}
-
-
-def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
-    """A recipe with other values.
-
-    Raises
-    ------
-    CpunetError
-        If a value is not allowed.
-    """
-    return read_settings(Recipe, recipe, values)
 
 
 def _contains(of: Distribution, value: Any) -> bool:
@@ -273,9 +262,18 @@ class HeldOut:
         CpunetError
             If too few pulses would be held out.
         """
-        rng = np.random.default_rng(seed)
-        fit_sim, held_sim = _split(sim, rng)
-        fit_data, held_data = _split(data, rng)
+        rng, sides = np.random.default_rng(seed), []
+        for side in (sim, data):
+            prepared = side.prepared
+            rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
+            if n < MIN_PULSES:
+                raise CpunetError(
+                    f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, and "
+                    f"{MIN_PULSES} are needed; select more energies (`peak`) or give more"
+                )
+            rest = replace(side, prepared=prepared[np.sort(rows[n:])])
+            sides.append((rest, prepared.pulses[np.sort(rows[:n])]))
+        (fit_sim, held_sim), (fit_data, held_data) = sides
         values = pulse_parameters(held_data, recipe.preparation, recipe.scores)
         n_sim, n_data = len(held_sim), len(held_data)
         draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
@@ -320,16 +318,3 @@ class HeldOut:
             whole = recipe.at(sides[0].dt_ns)
             job = TrainingJob(whole, "", seed, device, *sides, Path(folder))
             return REN.of(job.trained(None), device)
-
-
-def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
-    """The pulses of a side to fit, and those held out."""
-    prepared = side.prepared
-    rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
-    if n < MIN_PULSES:
-        raise CpunetError(
-            f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, "
-            f"and {MIN_PULSES} are needed; select more energies (`peak`) or give more"
-        )
-    rest = replace(side, prepared=prepared[np.sort(rows[n:])])
-    return rest, prepared.pulses[np.sort(rows[:n])]
