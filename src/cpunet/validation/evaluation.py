@@ -119,24 +119,30 @@ def evaluate(
     )
     translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
     sets = [PeakSets.of(n, parse_selection(n, recipe.peaks), translations) for n in names]
+    dep = next((peak.rows for peak in sets if peak.name == DEP), {})
+    amplitudes, energy_kev = translations.amplitudes, translations.energy_kev
+    scales = dep_scales({m: amplitudes[m][rows] for m, rows in dep.items()}, seed)
+    samples = recipe.preparation.at(ren.dt_ns).decay_fit_samples
+    decays = {  # as an analysis has one for a channel
+        method: median_decay_ns(tail_slope(windows, ren.dt_ns, samples))
+        for method, windows in translations.windows.items()
+    }
+    ends = fit_ends(run, ren)
+    score = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
+
+    def scored(peak: PeakSets) -> tuple[dict[str, Values], ByMethod, PeakScores]:
+        moved = moved_values(peak, ends, seed)
+        return moved, *score(peak, moved)
+
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
-    ends = fit_ends(run, ren)
+    moved_amplitudes: dict[str, Values] = {}
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        dep = next((peak.rows for peak in sets if peak.name == DEP), {})
-        amplitudes, energy_kev = translations.amplitudes, translations.energy_kev
-        scales = dep_scales({m: amplitudes[m][rows] for m, rows in dep.items()}, seed)
-        samples = recipe.preparation.at(ren.dt_ns).decay_fit_samples
-        decays = {  # as an analysis has one for a channel
-            method: median_decay_ns(tail_slope(windows, ren.dt_ns, samples))
-            for method, windows in translations.windows.items()
-        }
-        ended = pool.map(partial(moved_values, ends=ends, seed=seed), sets)
-        moved = {peak.name: values for peak, values in zip(sets, ended, strict=True)}
-        work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
-        scored = pool.map(work, sets, moved.values())
-        for peak, (by_method, peaks[peak.name]) in zip(sets, scored, strict=True):
+        for peak, (moved, by_method, scores) in zip(sets, pool.map(scored, sets), strict=True):
+            peaks[peak.name] = scores
+            if moved:
+                moved_amplitudes[peak.name] = moved["current_amplitude"]
             if by_method:
                 values[peak.name] = by_method
                 rise = {method: v["rise_01_90"] for method, v in by_method.items()}
@@ -152,7 +158,7 @@ def evaluate(
             name: {method: v["current_amplitude"] for method, v in of_peak.items()}
             for name, of_peak in values.items()
         },
-        {name: of_peak["current_amplitude"] for name, of_peak in moved.items() if of_peak},
+        moved_amplitudes,
         translations,
         lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
         seed,

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
-from cpunet.electronics.finishing import finish
+from cpunet.electronics.finishing import Finished, finish
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.electronics.superpulses import BASELINE_METHODS
 from cpunet.errors import CpunetError
@@ -303,23 +303,30 @@ def translate_all(
     generator = np.random.default_rng(seed)
     # all methods get the same noise
     rngs = {name: np.random.default_rng(seed) for name in others}
-    with stage("Translating", len(pulses)) as bar:
+
+    def finished(name: str, rows: slice) -> Finished:
+        method, raw = baselines.methods.get(name), pulses.waveforms[rows]
+        return finish(
+            given[name][rows] if method is None else method.translate(raw),
+            recipe.preparation,
+            dt_ns=pulses.dt_ns,
+            noise=noise,
+            energy_kev=pulses.energy_kev[rows],
+            seed=rngs[name],
+        )
+
+    with (
+        stage("Translating", len(pulses)) as bar,
+        ThreadPoolExecutor(usable_cores()) as pool,
+    ):
         for rows in blocks(len(pulses)):
             block = pulses[rows]
+            done = {name: pool.submit(finished, name, rows) for name in others}
             clean = {"raw": block.waveforms}
-            for name in others:
-                method = baselines.methods.get(name)
-                finished = finish(
-                    given[name][rows] if method is None else method.translate(block.waveforms),
-                    recipe.preparation,
-                    dt_ns=block.dt_ns,
-                    noise=noise,
-                    energy_kev=block.energy_kev,
-                    seed=rngs[name],
-                )
-                clean[name] = finished.clean
+            for name, translated in done.items():
+                clean[name] = translated.result().clean
                 if noise is not None:
-                    noisy[name][rows] = finished.windows
+                    noisy[name][rows] = translated.result().windows
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
             for windows in clean.values():
