@@ -97,16 +97,13 @@ def pair_squares(
         samples that both records of a pair have, and over the ``2 * edge_samples + 1`` samples
         around the crossing; all 0 where a pulse cannot be aligned.
     """
-    squares = {method: np.zeros((len(truth), 4)) for method in methods}
-    for rows in blocks(len(truth)):
-        half = truth.shape[1]
-        aligned = aligned_block(truth[rows], half, half)
-        edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
-        for method, translated in methods.items():
-            difference = aligned_block(translated[rows], half, half)
-            difference -= aligned
-            squares[method][rows, :2] = _squares(difference)
-            squares[method][rows, 2:] = _squares(difference[:, edge])
+    half, squares = truth.shape[1], {}
+    aligned = aligned_block(truth, half, half)
+    edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
+    for method, translated in methods.items():
+        difference = aligned_block(translated, half, half) - aligned
+        parts = _squares(difference), _squares(difference[:, edge])
+        squares[method] = np.concatenate(parts, axis=1)
     return squares
 
 

@@ -206,13 +206,12 @@ class Report:
             If there is no such peak, or no such parameter is scored there.
         """
         from cpunet.plotting import own_axes
-        from cpunet.validation.drawings import DRAWN
         from cpunet.validation.run_figures import draw_parameter
 
         peak = next(iter(self.values)) if peak is None else peak
         of_peak = named(self.values, peak, "scored peak")
         compared = named(self.metrics.peaks[peak].parameters, parameter, "scored parameter")
-        values = {m: of_peak[m][parameter] for m in DRAWN if m in of_peak}
+        values = {method: of_method[parameter] for method, of_method in of_peak.items()}
         axis = self.hist(peak, parameter).axes[1]
         ax = own_axes(ax)
         draw_parameter(ax, values, axis, parameter, compared)

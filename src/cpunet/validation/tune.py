@@ -57,7 +57,7 @@ MIN_PULSES = 20  # minimum per side for a distribution
 MAX_LOST = 0.01  # share of lost translations: losing bad ones would improve the score
 # pulses and their comparison must be the same for all trials, so only these may be tuned
 TUNED = ("generator", "discriminator", "training")
-UNCHANGED, REASON, BEGUN = "unchanged recipe", "reason", "begun with"  # user attributes
+REASON, BEGUN = "reason", "begun with"  # user attributes
 
 
 def tune(
@@ -129,7 +129,7 @@ def tune(
     begun |= {"simulation": simulated.fingerprint(), "data": measured.fingerprint()}
     study = _study(out, begun)
     if not study.trials and all(_contains(of, own[key]) for key, of in space.items()):
-        study.enqueue_trial(own, {UNCHANGED: True})
+        study.enqueue_trial(own)
     ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
     with stage("Trials", trials) as bar:
         while (done := len(study.get_trials(states=ended))) < trials:
