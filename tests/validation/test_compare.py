@@ -161,17 +161,12 @@ def metrics(*ious: float) -> dict[str, Any]:
     }
 
 
-def page_of(folder: Path, runs: dict[str, tuple[float, ...]], **more: Any) -> str:
-    """The page ``pages/index.html`` of reports with these IoU; without one there is none."""
-    for name, ious in runs.items():
-        (folder / name / "report").mkdir(parents=True)
-        if ious:
-            text = json.dumps(metrics(*ious))
-            (folder / name / "report" / "metrics.json").write_text(text)
-            (folder / name / "report" / "report.html").write_text("<p>here</p>")
-    out = folder / "pages" / "index.html"
-    compare(*(folder / name / "report" for name in runs), out=out, **more)
-    return out.read_text("utf-8")
+def report(folder: Path, *ious: float) -> Path:
+    """A report with these IoU."""
+    folder.mkdir(parents=True)
+    (folder / "metrics.json").write_text(json.dumps(metrics(*ious)))
+    (folder / "report.html").write_text("<p>here</p>")
+    return folder
 
 
 def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
@@ -181,7 +176,11 @@ def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
         "V01/p04": (87.0, 85.5),
         "B 2#?<&/p04": (50.0,),
     }
-    page = page_of(tmp_path, runs)
+    folders = [report(tmp_path / name / "report", *ious) for name, ious in runs.items()]
+    compare(*folders, tmp_path / "V01/p05/report", out=tmp_path / "pages" / "index.html")
+    page = (tmp_path / "pages" / "index.html").read_text("utf-8")
+    assert "<strong>No report:</strong> V01/p05." in page
+    assert "3 of 4 reports" in page
     assert '<td class="off">3 of 5 off</td>' in page
     assert "<td>0 of 3 off</td>" in page
     assert "drift time off by 37.1 sigma (p &lt; 1e-12)" in page
@@ -192,44 +191,21 @@ def test_every_report_is_linked_and_what_is_off_is_counted(tmp_path):
     assert "B 2#?&lt;&amp;/p04" in page
 
 
-def test_missing_reports_are_listed(tmp_path):
-    runs: dict[str, tuple[float, ...]] = {"V01/p03": (87.0,), "V01/p04": ()}
-    page = page_of(tmp_path / "b", runs)
-    assert "<strong>No report:</strong> p04." in page
-    assert "1 of 2 reports" in page
-    with pytest.raises(CpunetError, match="none of the 1 reports is there"):
-        page_of(tmp_path / "c", {"V01/p04": ()})
-
-
-def report(folder: Path, iou: float, **more: int) -> Path:
-    folder.mkdir(parents=True)
-    content = metrics(iou)
-    content["peaks"]["SEP"] |= more
-    (folder / "metrics.json").write_text(json.dumps(content))
-    return folder
-
-
 @pytest.fixture
 def two(tmp_path) -> list[Path]:
     return [report(tmp_path / "first", 80.0), report(tmp_path / "second", 85.0)]
 
 
-def test_a_report_in_memory_is_compared(two):
+def test_reports_have_the_names_of_their_folders(two, tmp_path):
     run = metrics(70.0) | {"compared": {"run": "new"}}
     made = compare(Report(Metrics(**run), {}), two[0])
     assert str(made).splitlines()[1].split() == ["peak", "score", "new", "first"]
-
-
-def test_demo_folders_and_files(two, tmp_path):
-    report(tmp_path / "demo" / "report", 70.0)
-    made = compare(tmp_path / "demo", two[0] / "metrics.json")
-    assert [*made.metrics] == ["demo", "first"]
-
-
-def test_names_are_made_unique(tmp_path):
-    folders = [report(tmp_path / run / "report", 80.0) for run in ("a", "b")]
-    assert [*compare(*folders).metrics] == ["a", "b"]
-    assert [*compare(folders[0], folders[0]).metrics] == ["report (1)", "report (2)"]
+    a, b, _ = (report(tmp_path / run / "report", 80.0) for run in ("a", "b", "demo"))
+    assert [*compare(tmp_path / "demo", two[0] / "metrics.json").metrics] == ["demo", "first"]
+    assert [*compare(a, b).metrics] == ["a", "b"]
+    assert [*compare(a, a).metrics] == ["report (1)", "report (2)"]
+    with pytest.raises(CpunetError, match="none of the 1 reports is there"):
+        compare(tmp_path / "nothing")
 
 
 def test_the_command(two, tmp_path, capsys):

@@ -87,26 +87,25 @@ def test_iou_is_symmetric_and_between_0_and_100(a, b):
     assert score == pytest.approx(iou(b, a, UNIT))
 
 
-def test_events_outside_the_range_lower_the_iou():
-    inside = np.full(10, 0.55)
-    mostly_outside = np.r_[0.55, np.full(9, 5.0)]
+def test_no_event_is_dropped_from_an_iou():
+    inside, numbers, nans = np.full(10, 0.55), np.full(10, 0.5), np.full(10, np.nan)
     # with density histograms these would score 100 %
-    assert iou(inside, mostly_outside, UNIT) == pytest.approx(100 * 0.1 / 1.9)
+    assert iou(inside, np.r_[0.55, np.full(9, 5.0)], UNIT) == pytest.approx(100 * 0.1 / 1.9)
     assert iou(inside, np.full(3, -5.0), UNIT) == 0
     assert iou(np.full(3, -5.0), np.full(3, 5.0), UNIT) == 0
-
-
-def test_nans_are_no_match_for_numbers_nor_for_the_overflow():
-    numbers, nans = np.full(10, 0.5), np.full(10, np.nan)
-    assert iou(numbers, nans, UNIT) == 0
-    assert iou(np.full(10, 99.0), nans, UNIT) == 0
+    # nor are NaNs a match for numbers or for the overflow
+    assert iou(numbers, nans, UNIT) == iou(np.full(10, 99.0), nans, UNIT) == 0
     assert iou(numbers, np.r_[numbers, nans], UNIT) == pytest.approx(100 * 0.5 / 1.5)
 
 
-def test_an_empty_set_has_no_score():
-    assert np.isnan(iou(np.array([]), np.array([0.5]), UNIT))
-    assert np.isnan(wasserstein(np.array([]), np.array([0.5])))
-    assert np.isnan(iou_error(np.array([]), np.array([0.5]), UNIT, both_resampled(0, 1, 5, 0)))
+def test_without_values_there_is_no_score():
+    empty, nothing, some = np.array([]), np.array([np.nan]), np.array([1.0, 2.0])
+    assert np.isnan(iou(empty, some, UNIT))
+    assert np.isnan(wasserstein(empty, some))
+    assert np.isnan(iou_error(empty, some, UNIT, both_resampled(0, 2, 5, 0)))
+    assert np.isnan(wasserstein_error(nothing, some, both_resampled(1, 2, 5, 0)))
+    assert np.isnan(null_wasserstein(nothing, resampled_twice(1, 5, 5, 5, 0))).all()
+    assert np.isnan(null_wasserstein(some, resampled_twice(2, 0, 5, 5, 0))).all()
 
 
 def peak_with_tail(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -214,18 +213,6 @@ def test_the_null_of_a_uniform_distribution_is_the_area_under_a_bridge():
     assert null == pytest.approx(area * np.sqrt(2 / 5000), rel=0.08)
 
 
-def test_a_distance_without_values_has_no_error_and_no_null():
-    nothing, some = np.array([np.nan]), np.array([1.0, 2.0])
-    assert np.isnan(wasserstein_error(nothing, some, both_resampled(1, 2, 5, 0)))
-    assert np.isnan(null_wasserstein(nothing, resampled_twice(1, 5, 5, 5, 0))).all()
-    assert np.isnan(null_wasserstein(some, resampled_twice(2, 0, 5, 5, 0))).all()
-
-
-def test_a_shift_is_the_distance_of_the_finite_values():
-    a = np.linspace(0, 1, 1000)
-    assert wasserstein(a, np.r_[a + 0.25, np.nan, np.inf]) == pytest.approx(0.25)
-
-
 def parameters(seed: int, shift: float = 0.0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     return {
@@ -269,22 +256,13 @@ def test_compare_without_usable_data_gives_none(values):
 
 @pytest.mark.parametrize("size", [2, 50])
 def test_histograms_of_the_draws_are_multinomial(size, either_way):
-    bins = np.repeat([1, 2, 4], [1, 3, 6])
+    bins = np.repeat([1, 2, 4, 5], [1, 3, 4, 2])  # the last is drawn and not counted
     found = Resampled.of(10, size, 20_000, np.random.default_rng(12)).counts(bins, 5)
     assert found.shape == (5, 20_000)
-    assert set(found.sum(axis=0)) == {size}
-    p = np.array([0, 1, 3, 0, 6]) / 10
+    p = np.array([0, 1, 3, 0, 4]) / 10
     assert found.mean(axis=1) == pytest.approx(size * p, rel=0.03)
     covariance = size * (np.diag(p) - np.outer(p, p))
     assert np.cov(found) == pytest.approx(covariance, abs=0.03 * size)
-
-
-def test_events_beyond_the_last_bin_are_drawn_and_not_counted(either_way):
-    found = Resampled.of(4, 400, 500, np.random.default_rng(1)).counts(
-        np.array([0, 1, 2, 2]), 2
-    )
-    assert found.sum(axis=0).mean() == pytest.approx(200, rel=0.02)
-    assert found.sum(axis=0).std() == pytest.approx(10, rel=0.15)
 
 
 def test_all_parameters_see_the_same_events():
