@@ -168,7 +168,15 @@ def ae_survival(
     # for this quantile the acceptance of new events is exact on average for any sample size
     cut = float(np.quantile(dep, 1 - ACCEPTANCE, method="weibull"))
     cuts = resampled_quantiles(dep, 1 - ACCEPTANCE, bootstraps, rng)
-    peaks = {name: _peak_survival(values, cut, cuts) for name, values in others.items()}
+    peaks: dict[str, Spread] = {}
+    for name, values in others.items():
+        finite = np.sort(values[np.isfinite(values)])
+        n, peaks[name] = finite.size, (np.nan, np.nan)
+        if n:
+            passing = n - int(np.searchsorted(finite, cut))
+            of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
+            error = float(100 * np.hypot(survival_error(passing, n), of_cut))
+            peaks[name] = 100 * passing / n, error
     return cut, float(cuts.std(ddof=1)), peaks
 
 
@@ -351,17 +359,6 @@ def survival_error(passing: int, n: int) -> float:
     """
     p = (passing + 1) / (n + 2)
     return float(np.sqrt(p * (1 - p) / (n + 3)))
-
-
-def _peak_survival(values: Values, cut: float, cuts: Values) -> Spread:
-    finite = np.sort(values[np.isfinite(values)])
-    n = finite.size
-    if not n:
-        return np.nan, np.nan
-    passing = n - int(np.searchsorted(finite, cut))
-    of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
-    error = float(100 * np.hypot(survival_error(passing, n), of_cut))
-    return 100 * passing / n, error
 
 
 def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, Spread]:

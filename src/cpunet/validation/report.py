@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import json
-import shutil
 from collections import UserDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -110,19 +109,19 @@ class Report:
         """
         from pandas import DataFrame
 
+        index = ["peak", "parameter", "method"]
         rows = [
-            {
-                **{"peak": peak, "parameter": parameter, "method": method},
-                **{"iou": iou, "iou_std": compared.iou_std.get(method)},
-                **{"ceiling": compared.iou.get("ceiling")},
-                **{"wasserstein": compared.wasserstein.get(method)},
-            }
+            [
+                *(peak, parameter, method, iou, of.iou_std.get(method)),
+                *(of.iou.get("ceiling"), of.wasserstein.get(method)),
+            ]
             for peak, scores in self.metrics.peaks.items()
-            for parameter, compared in scores.parameters.items()
-            for method, iou in compared.iou.items()
+            for parameter, of in scores.parameters.items()
+            for method, iou in of.iou.items()
             if method != "ceiling"
         ]
-        return DataFrame(rows).set_index(["peak", "parameter", "method"])
+        columns = [*index, "iou", "iou_std", "ceiling", "wasserstein"]
+        return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
         peaks = {name: name for name in self.metrics.scored}
@@ -139,11 +138,11 @@ class Report:
         return [self.metrics.summary(peak) for peak in self.metrics.scored]
 
     @property
-    def figures(self) -> Mapping[str, Figure | Picture]:
-        """Figures by name, drawn on every access; of an opened report its pictures."""
+    def figures(self) -> Mapping[str, Figure | Path]:
+        """Figures by name, drawn on every access; of an opened report its SVG files."""
         if self.drawn is None:
             files = [] if self.folder is None else sorted(self.folder.glob("*.svg"))
-            return {file.stem.replace("_", " "): Picture(file) for file in files}
+            return {file.stem.replace("_", " "): file for file in files}
         return _Figures(self.drawn)
 
     def hist(
@@ -311,31 +310,6 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:
         raise CpunetError(
             f"{file}: holds no scores by peak", "give a report of cpunet validate"
         ) from error
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure of a report that was opened: its SVG file, which a notebook shows."""
-
-    path: Path
-
-    def _repr_svg_(self) -> str:
-        return self.path.read_text(encoding="utf-8")
-
-    def savefig(self, path: str | Path) -> None:
-        """Copy the picture.
-
-        Raises
-        ------
-        CpunetError
-            If another format is asked for.
-        """
-        if Path(path).suffix.lower() != ".svg":
-            raise CpunetError(
-                f"{path}: an opened report has its figures as SVG",
-                "give a name in .svg, or validate again for others",
-            )
-        shutil.copyfile(self.path, path)
 
 
 class _Figures(UserDict[str, Any]):
