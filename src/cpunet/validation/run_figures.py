@@ -173,26 +173,18 @@ def overlap_figure(metrics: Metrics, peaks: Sequence[str]) -> Figure:
         scores = metrics.peaks[peak]
         compared = {n: c for n, c in scores.judged.items() if c.iou.get("ceiling") is not None}
         methods = [m for m in scores.methods if m != "raw"]
-        for x, comparison in enumerate(compared.values()):
-            iou, error = comparison.iou, comparison.iou_std
-            middle, half = iou["ceiling"] or 0.0, error["ceiling"] or 0.0
-            band = {"color": DATA_FILL, "lw": 0, "zorder": 0}
-            axes.fill_between([x - 0.45, x + 0.45], middle - half, middle + half, **band)
-            axes.hlines(middle, x - 0.45, x + 0.45, color=COLOURS["data"], lw=1)
-            for i, method in enumerate(methods):
-                if iou.get(method) is not None:
-                    drawn = axes.errorbar(
-                        x + 0.7 * ((i + 0.5) / len(methods) - 0.5),
-                        iou[method],
-                        error[method],
-                        label=label(method) if x == 0 else "_",
-                        color=COLOURS[method],
-                        marker="o",
-                        markersize=3.5,
-                        lw=0,
-                        elinewidth=1,
-                    )
-                    group(drawn, method)
+        x, every = np.arange(len(compared)), ["ceiling", *methods]
+        of = compared.values()
+        iou = {m: np.array([c.iou.get(m) for c in of], float) for m in every}
+        error = {m: np.array([c.iou_std.get(m) for c in of], float) for m in every}
+        half = error["ceiling"]
+        axes.bar(x, 2 * half, 0.9, iou["ceiling"] - half, color=DATA_FILL, zorder=0)
+        axes.hlines(iou["ceiling"], x - 0.45, x + 0.45, color=COLOURS["data"], lw=1)
+        for i, method in enumerate(methods):
+            at = x + 0.7 * ((i + 0.5) / len(methods) - 0.5)
+            look = {"color": COLOURS[method], "marker": "o", "markersize": 3.5, "lw": 0}
+            look |= {"elinewidth": 1, "label": label(method)}
+            group(axes.errorbar(at, iou[method], error[method], **look), method)
         axes.set(title=peak, xticks=range(len(compared)), ylim=(0, 100))
         texts = [QUANTITIES.get(name, name.replace("_", " ")) for name in compared]
         axes.set_xticklabels(texts, rotation=30, ha="right")
