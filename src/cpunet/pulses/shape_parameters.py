@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import hist
 import numpy as np
-from scipy.signal import fftconvolve
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
@@ -72,6 +71,8 @@ def legend_parameters(
     aligned
         Sample from which times count.
     """
+    from scipy.signal import fftconvolve  # half of SciPy
+
     with _IMPORT:
         pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff = _processors()
     corrected = np.asarray(waveforms, float)

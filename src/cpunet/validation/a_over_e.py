@@ -23,7 +23,6 @@ from types import MappingProxyType
 import numpy as np
 from pydantic import Field
 
-from cpunet.electronics.baseline_methods import most_frequent
 from cpunet.pulses.parameters import Values
 from cpunet.validation.comparisons import (
     ByMethod,
@@ -372,6 +371,9 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, Spread]
     seed
         Seed of the bootstraps.
     """
+    # half of SciPy, which those who only read scores need not wait for
+    from cpunet.electronics.baseline_methods import most_frequent
+
     finite = {method: values[np.isfinite(values)] for method, values in dep_ae.items()}
     if not all(values.size >= MIN_EVENTS for values in finite.values()):
         return {}

@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
-from iminuit import Minuit
 from pydantic import Field
 from scipy.special import expit, log_ndtr, ndtr
 
@@ -190,6 +188,8 @@ def site_fit(
         Mean and its error, sigma and its error, and the number of fitted events; None if
         there are too few events or no peak.
     """
+    from iminuit import Minuit
+
     values = np.sort(amplitude[np.isfinite(amplitude)])
     about = _seen(values) if about is None else about
     if about is None:
@@ -232,6 +232,8 @@ def _points(
 
 def _course(points: list[SiteFit]) -> Course:
     """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
+    from scipy.optimize import nnls
+
     energy, mean, error, sigma, sigma_error = columns(points)
     design = np.stack([energy - REFERENCE_KEV, np.ones(len(energy))], axis=1) / error[:, None]
     slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
@@ -255,7 +257,7 @@ def _course(points: list[SiteFit]) -> Course:
     for _ in range(3):
         # errors are scaled to the fitted widths; otherwise widths that fluctuate low weigh most
         weight = relative / (2 * squares * spread)
-        constant, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
+        constant, b2 = nnls(terms * weight[:, None], relative**2 * weight)[0]
         squares = terms @ np.array([constant, b2])
     at_reference = float(100 * np.sqrt(constant + b2 * 1e6 / REFERENCE_KEV**2))
     law = WidthLaw(float(constant), float(1e3 * np.sqrt(b2)), 2.0, at_reference)

@@ -163,6 +163,7 @@ def evaluate(
         lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
         seed,
     )
+    tails = None if run.fit is None else run.fit.tails
     metrics = Metrics(
         compared=_compared(run, sim_set, data_set),
         peaks=peaks,
@@ -180,7 +181,7 @@ def evaluate(
         },
         training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
-        tails=None if run.fit is None else run.fit.tails,
+        tails=None if tails is None else tails.model_dump(exclude_unset=True),
         rejections={
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,

@@ -19,7 +19,6 @@ from typing import Any
 from pydantic import Field
 from scipy.special import ndtr, ndtri, stdtr
 
-from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.plotting import label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import A_OVER_E, LABELLED
@@ -192,7 +191,7 @@ class Metrics(Result):
     ae_energy: AgainstEnergy = Field(default_factory=AgainstEnergy)
     a_over_e_scale: dict[str, tuple[float, float]] = Field(default_factory=dict)
     baseline_methods: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    tails: TailsInfo | None = None
+    tails: dict[str, Any] | None = None
 
     @property
     def survival(self) -> dict[str, SurvivalRow]:

@@ -16,7 +16,6 @@ from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, used_run
 from cpunet.validation.compare import compared
-from cpunet.validation.metrics import Metrics
 from cpunet.validation.report import REPORT, Report
 
 log = logging.getLogger(__name__)
@@ -130,7 +129,7 @@ def _validated(
         # nor is matplotlib while the pulses take most memory
         from cpunet.validation.drawings import drawings
 
-        notes = _notes(run, evaluation.metrics, truth)
+        notes = _notes(run, truth)
         drawn = drawings(evaluation)
         report = Report(evaluation.metrics, evaluation.values, out, drawn, notes)
         del evaluation  # all pulses
@@ -148,14 +147,14 @@ def _of_channel(
     return folder
 
 
-def _notes(run: Run, metrics: Metrics, truth: Path | None) -> list[str]:
+def _notes(run: Run, truth: Path | None) -> list[str]:
     notes = [
         f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
         "distribution do not reach 100 at finite size: data vs data is what two samples of the "
         "measured distribution have at these sizes.",
     ]
-    tails = metrics.tails
+    tails = None if run.fit is None else run.fit.tails
     if tails is not None and tails.rate_khz:
         shares = ", ".join(
             f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
