@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import kstest
 
 import cpunet
-from cpunet.validation.verdicts import method_verdicts
+from cpunet.validation.metrics import Metrics
 
 STANDS, EVENTS = 40, "FEP=1000,SEP=400,DEP=400"
 ALARM = 0.0027
@@ -38,11 +38,11 @@ def p_values(folder: Path, stands: int) -> dict[str, dict[str, list[float]]]:
                 run, stand.sim, stand.data, truth=stand.truth, baselines=False, seed=seed
             )
             assert isinstance(report, cpunet.Report)
-            file.write_text(json.dumps(report.metrics))
-        metrics = json.loads(file.read_text())
+            file.write_text(json.dumps(report.to_dict()))
+        metrics = Metrics.model_validate_json(file.read_text())
         for method in ("truth", "ren"):
-            for peak in metrics["peaks"]:
-                for name, verdict in method_verdicts(metrics, peak, method).items():
+            for peak in metrics.peaks:
+                for name, verdict in metrics.judge(peak, method).items():
                     if verdict.p is not None:
                         of_peak = f"{peak} {name.replace('_', ' ')}"
                         collected.setdefault(method, {}).setdefault(of_peak, []).append(

@@ -26,7 +26,9 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
 from cpunet.training.train import train
+from cpunet.validation.comparisons import Missing
 from cpunet.validation.evaluation import evaluate
+from cpunet.validation.metrics import Metrics
 
 FAILED = 0.9
 FAR = 1000  # between the seeds of draws of noise
@@ -58,23 +60,23 @@ def one_seed(
     return about | {"seconds": run.seconds, "cpu": cpu} | means
 
 
-def numbers(metrics: dict[str, Any]) -> dict[str, float]:
+def numbers(metrics: Metrics) -> dict[str, float]:
     """Scores by peak and name."""
-    values = {}
+    values: dict[str, float | None] = {}
     for peak in PEAKS:
-        scores = metrics["peaks"][peak]
-        for name, compared in scores["parameters"].items():
-            iou = compared["iou"]
+        scores = metrics.peaks[peak]
+        for name, compared in scores.parameters.items():
+            iou = compared.iou
             values[f"{peak} {name}"] = iou["ren"]
-            values |= {
-                f"{peak} {name} / ceiling{of}": iou[method] / iou["ceiling"]
-                for method, of in (("ren", ""), ("truth", " of truth"))
-                if method in iou
-            }
-        values[f"{peak} AUC"] = scores["two_sample"]["ren"]["auc"]
-        if "paired" in scores:
-            values[f"{peak} edge RMSE"] = scores["paired"]["ren"]["edge_rmse"]
-    return values
+            ceiling = iou["ceiling"] or np.nan
+            for method, of in (("ren", ""), ("truth", " of truth")):
+                if method in iou:
+                    values[f"{peak} {name} / ceiling{of}"] = (iou[method] or 0.0) / ceiling
+        tested = scores.two_sample["ren"]
+        values[f"{peak} AUC"] = None if isinstance(tested, Missing) else tested.auc
+        if scores.paired:
+            values[f"{peak} edge RMSE"] = scores.paired["ren"].edge_rmse
+    return {name: np.nan if value is None else value for name, value in values.items()}
 
 
 def summary(runs: list[dict[str, Any]]) -> str:

@@ -9,6 +9,7 @@ training can tell it more.  Escape peaks are only scored, with noise from the ba
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from cpunet.training.adversarial import weighted_l1, window_weights
 from cpunet.training.network_runs import generators, settle
 from cpunet.training.run import Run, versions
 from cpunet.training.sides import Side
+from cpunet.validation.comparisons import Missing
 from cpunet.validation.evaluation import evaluate
 from cpunet.validation.methods import true_responses
 
@@ -95,12 +97,13 @@ def main() -> None:
     run = taught(sim, data, truth, recipe, given)
     metrics = evaluate(run, *files, truth=truth, baselines=False).metrics
     print(f"width {given.width}, dropout {given.dropout}, {given.steps} steps")
-    for name, scores in metrics["peaks"].items():
+    for name, scores in metrics.peaks.items():
         overlaps = [
-            f"{parameter} {compared['iou']['ren']:.1f}"
-            for parameter, compared in scores["parameters"].items()
+            f"{parameter} {compared.iou['ren']:.1f}"
+            for parameter, compared in scores.parameters.items()
         ]
-        auc, edge = scores["two_sample"]["ren"]["auc"], scores["paired"]["ren"]["edge_rmse"]
+        tested, edge = scores.two_sample["ren"], scores.paired["ren"].edge_rmse or math.nan
+        auc = math.nan if isinstance(tested, Missing) else tested.auc
         print(f"{name}: {', '.join(overlaps)}, AUC {auc:.2f}, edge RMSE {1e3 * edge:.2f}e-3")
 
 

@@ -39,13 +39,9 @@ from cpunet.pulses.writing import Columns, PulseWriter
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.adversarial import Game
 from cpunet.training.run import Run
-from cpunet.validation.methods import (
-    PairedScores,
-    pair_squares,
-    scores_of_squares,
-    true_responses,
-)
-from cpunet.validation.report import Report, as_stored
+from cpunet.validation.methods import pair_squares, scores_of_squares, true_responses
+from cpunet.validation.metrics import Metrics, PairedScores
+from cpunet.validation.report import Report
 
 Values = npt.NDArray[np.float64]
 DT_NS = 16.0
@@ -394,7 +390,7 @@ def write_report(
 ) -> None:
     """Write a report of these metrics and figures into a folder."""
     drawn = {name: partial(lambda one: one, one) for name, one in (figures or {}).items()}
-    Report(as_stored(metrics), {}, None, drawn, notes).write(folder)
+    Report(Metrics(**{"peaks": {}} | metrics), {}, None, drawn, notes).write(folder)
 
 
 def mean_kev(law: TailsLaw) -> float:

@@ -400,14 +400,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> cpunet.Report:
 @pytest.mark.thorough
 def test_every_method_and_the_truth_stand_beside_the_ren(whole: cpunet.Report) -> None:
     metrics = whole.metrics
-    assert metrics["baseline_methods"]["missing"] == {}
-    assert set(metrics["baseline_methods"]["fits"]) == set(BASELINE_METHODS)
-    for peak in PEAKS:
-        scores = metrics["peaks"][peak]
-        iou = scores["parameters"]["current_amplitude"]["iou"]
-        assert {*BASELINE_METHODS, "truth"} <= set(iou)
+    assert metrics.baseline_methods["missing"] == {}
+    assert set(metrics.baseline_methods["fits"]) == set(BASELINE_METHODS)
+    for scores in metrics.peaks.values():
+        assert {*BASELINE_METHODS, "truth"} <= set(scores.parameters["current_amplitude"].iou)
         # a response fitted to the data comes nearer to the truth than none
-        edges = {method: paired["edge_rmse"] for method, paired in scores["paired"].items()}
+        edges = {method: paired.edge_rmse for method, paired in scores.paired.items()}
         assert max(edges[method] for method in BASELINE_METHODS) < edges["raw"] / 3
         assert edges["ren"] < edges["raw"] / 3
 

@@ -196,7 +196,6 @@ WRONG = {
         ("generator.slow_ns=[100, 100.0]", "times must differ"),
         ("training.level_ns=9000", "level_ns must be less than after_ns"),
         ("preparation.align_at=0.999", "align_at must be half_height"),
-        ("search={a: {low: 1, choices: [1, 2]}}", "give either low and high, or choices"),
         ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),
     ],
 }

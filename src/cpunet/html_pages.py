@@ -51,8 +51,8 @@ def part(name: str, *values: Any, **named: Any) -> Markup:
 
     Examples
     --------
-    >>> part("gap", "1 < 2")
-    Markup('<p class="gap">None recorded: 1 &lt; 2.</p>')
+    >>> part("object", "1 < 2").strip()
+    Markup('<strong>1 &lt; 2</strong>')
     """
     macro = getattr(_environment().get_template("parts.html").module, name)
     return Markup(macro(*values, **named))

@@ -147,7 +147,6 @@ def test_raw_simulations_score_what_is_known_of_them(
         assert set(scores["parameters"]) == PARAMETERS
         tail = scores["parameters"]["tail_slope"]
         assert tail["iou"]["raw"] == 0
-        assert tail["ks"]["raw"] == 1
         assert tail["wasserstein"]["raw"] == pytest.approx(1e3 / 55, rel=0.03)
         assert scores["paired"]["raw"]["edge_rmse"] > 0.01
 

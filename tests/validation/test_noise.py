@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
-from cpunet.validation.noise import baseline_spectra, spectrum_of_noise
+from cpunet.validation.noise import baseline_spectra
+from cpunet.validation.run_figures import spectrum_of_noise
 
 SAMPLES, DT_NS = 200, 16.0
 
@@ -29,18 +28,18 @@ def test_bands_add_up_to_the_mean_square_of_white_noise():
     windows = {"data": noise(np.random.default_rng(1), 3e-3)}
     found = spectra(windows)["data"]
     # the window's leakage takes the part of the lowest bins that the mean had
-    assert sum(found["power"]) == pytest.approx(9e-6, rel=0.01)
-    assert found["rms"] == pytest.approx(3e-3, rel=0.005)
+    assert sum(found.power) == pytest.approx(9e-6, rel=0.01)
+    assert found.rms == pytest.approx(3e-3, rel=0.005)
 
 
 def test_a_sine_is_in_its_band():
     time_us = np.arange(800) * DT_NS * 1e-3
     phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 50)
     windows = {"data": 1e-2 * np.sin(2 * np.pi * 5.0 * time_us + phases[:, None])}
-    found = spectra(windows)
-    strongest = int(np.argmax(found["data"]["power"]))
-    assert found["frequency_mhz"][strongest] == pytest.approx(5.0, rel=0.25)
-    assert found["data"]["rms"] == pytest.approx(1e-2 / np.sqrt(2), rel=0.01)
+    found = spectra(windows)["data"]
+    strongest = int(np.argmax(found.power))
+    assert found.frequency_mhz[strongest] == pytest.approx(5.0, rel=0.25)
+    assert found.rms == pytest.approx(1e-2 / np.sqrt(2), rel=0.01)
 
 
 def test_equal_noise_agrees_as_often_as_errors_say():
@@ -48,10 +47,10 @@ def test_equal_noise_agrees_as_often_as_errors_say():
     sigmas = [
         spectra({m: noise(rng, 1.0, 60) for m in ("data", "ren")})["ren"] for _ in range(150)
     ]
-    assert np.std([of["sigma"] for of in sigmas]) == pytest.approx(1.0, abs=0.15)
+    assert np.std([of.sigma for of in sigmas]) == pytest.approx(1.0, abs=0.15)
     # the worst of many bands is no reason to worry either
-    worst = np.array([of["spectrum_sigma"] for of in sigmas])
-    assert np.mean([of["worst_band_sigma"] > 2 for of in sigmas]) > 0.2
+    worst = np.array([of.spectrum_sigma for of in sigmas])
+    assert np.mean([of.worst_band_sigma > 2 for of in sigmas]) > 0.2
     assert np.mean(worst > 2) < 0.06
     assert np.median(worst) == pytest.approx(0, abs=0.4)
 
@@ -70,15 +69,15 @@ def test_pulses_that_begin_early_are_no_noise():
     begins["data"][:60] = rng.uniform(90, 160, 60)
     windows = {method: with_edges(rng, of, 1e-3) for method, of in begins.items()}
     found = baseline_spectra(windows, begins, SAMPLES, DT_NS)
-    assert found["data"]["rms"] == pytest.approx(1e-3, rel=0.02)
-    assert abs(found["ren"]["sigma"]) < 3
-    assert found["ren"]["spectrum_sigma"] < 3
-    assert 90 < found["data"]["samples"] == found["ren"]["samples"] < 120
+    assert found["data"].rms == pytest.approx(1e-3, rel=0.02)
+    assert abs(found["ren"].sigma) < 3
+    assert found["ren"].spectrum_sigma < 3
+    assert 90 < found["data"].samples == found["ren"].samples < 120
     # nine of ten, but for those of the stretch's last sample
-    assert 720 <= found["data"]["n"] < 740
+    assert 720 <= found["data"].n < 740
     begins["ren"][::2] = np.nan  # nothing is known of these
     again = baseline_spectra(windows, begins, SAMPLES, DT_NS)
-    assert (found["ren"]["n"], again["ren"]["n"]) == (800, 400)
+    assert (found["ren"].n, again["ren"].n) == (800, 400)
 
 
 def test_pulses_that_all_begin_early_have_no_baseline():
@@ -86,7 +85,7 @@ def test_pulses_that_all_begin_early_have_no_baseline():
     begins = {"data": np.full(50, 85.0), "ren": np.full(50, LATE)}
     found = baseline_spectra(windows, begins, SAMPLES, DT_NS)
     words = "25 samples before measured pulses begin; 32 are needed"
-    assert [found[m]["missing"] for m in ("data", "ren")] == [words, words]
+    assert [found[m].missing for m in ("data", "ren")] == [words, words]
 
 
 def test_noise_of_another_colour_is_seen():
@@ -95,18 +94,17 @@ def test_noise_of_another_colour_is_seen():
     averaged = white + np.roll(white, 1, axis=1)
     slow = averaged / averaged.std()
     found = spectra({"data": noise(rng, 1.0, 400), "ren": slow})["ren"]
-    assert found["rms_ratio"] == pytest.approx(1, abs=0.01)
-    assert found["spectrum_sigma"] > 10
+    assert found.rms_ratio == pytest.approx(1, abs=0.01)
+    assert found.spectrum_sigma > 10
 
 
 def test_equal_noise_and_none_at_all_are_numbers_and_drawn():
     some, none = noise(np.random.default_rng(10), 1e-3, 50), np.zeros((50, 800), np.float32)
     equal = spectra({"data": some, "ren": some})
-    assert (equal["ren"]["sigma"], equal["ren"]["spectrum_sigma"]) == (0, None)
+    assert (equal["ren"].sigma, equal["ren"].spectrum_sigma) == (0, None)
     silent = spectra({"data": none, "ren": some})
-    assert silent["ren"]["rms_ratio"] is None
+    assert silent["ren"].rms_ratio is None
     for found in (equal, silent, spectra({"data": none, "ren": none})):
-        json.dumps(found, allow_nan=False)
         spectrum_of_noise(found, "SEP").canvas.draw()
 
 
@@ -115,8 +113,8 @@ def test_too_few_and_unusable_baselines_are_named():
     broken = noise(rng, 1.0, 12)
     broken[:5] = np.nan
     found = spectra({"data": noise(rng, 1.0), "ren": broken})
-    assert found["ren"]["missing"] == "7 baselines; 10 are needed"
+    assert found["ren"].missing == "7 baselines; 10 are needed"
     empty = np.empty((0, 800), np.float32)
     found = spectra({"data": empty, "ren": noise(rng, 1.0)})
-    assert "missing" in found["data"]
-    assert "rms_ratio" not in found["ren"]
+    assert found["data"].missing
+    assert found["ren"].rms_ratio is None

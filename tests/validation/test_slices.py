@@ -12,13 +12,7 @@ from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
 from cpunet.validation.methods import true_responses
-from cpunet.validation.peaks import (
-    BEFORE_NS,
-    Slices,
-    around_half,
-    slice_edges,
-    sliced,
-)
+from cpunet.validation.peaks import BEFORE_NS, around_half, sliced
 from cpunet.validation.run_figures import shape_figure
 from synthetic import paired_scores, require_drawn
 
@@ -34,28 +28,24 @@ def pulses(rng, n, width=5.0, noise=0.002):
     return windows.astype(np.float32), drift[:, 0] * DT
 
 
-def superpulses(windows, times, edges) -> Slices:
-    return sliced(around_half(windows, 16.0), times, edges)
-
-
-def test_edges_hold_equally_many_and_ignore_what_is_not_finite():
-    times = np.append(np.random.default_rng(0).exponential(300, 4000), [np.nan, np.inf])
-    edges = slice_edges(times, slices=5)
-    counts = np.histogram(times[:-2], edges)[0]
-    assert counts.tolist() == [800] * 5
+def superpulses(slices=4, **sets):
+    """Superpulses of sets of pulses and times, by name."""
+    windows = {name: pulses for name, (pulses, _) in sets.items()}
+    times = {name: times for name, (_, times) in sets.items()}
+    return sliced(windows.__getitem__, times, DT, slices)
 
 
 def test_superpulses_are_those_of_a_plain_loop():
-    rng = np.random.default_rng(1)
-    windows, times = pulses(rng, 90)
-    edges = np.array([400.0, 900.0, 1500.0])
-    times[:3] = [np.nan, 399.0, 1501.0]
-    times[3] = 1500.0  # the last edge is included
-    windows[4], times[4] = 0.0, 600.0
-    found = superpulses(windows, times, edges)
-    for pulse, (low, high) in zip(found.pulses, ((400, 900), (900, 1500.01)), strict=True):
-        rows = [i for i in range(90) if low <= times[i] < high and i != 4]
-        aligned = around_half(windows[rows], 16.0).astype(float)
+    windows, times = pulses(np.random.default_rng(1), 90)
+    times[:2] = np.nan, np.inf
+    windows[4] = 0.0
+    found = superpulses(3, data=(windows, times))["data"]
+    edges = np.quantile(np.delete(times, [0, 1]), [0, 1 / 3, 2 / 3, 1])
+    np.testing.assert_allclose(found.edges, edges)
+    edges[-1] += 0.01  # the last edge is included
+    for i, pulse in enumerate(found.pulses):
+        rows = [r for r in range(90) if edges[i] <= times[r] < edges[i + 1] and r != 4]
+        aligned = around_half(windows[rows], DT).astype(float)
         assert pulse.n == len(rows)
         np.testing.assert_allclose(pulse.mean, aligned.mean(axis=0), atol=1e-6)
         expected = aligned.std(axis=0, ddof=1) / np.sqrt(len(rows))
@@ -64,17 +54,12 @@ def test_superpulses_are_those_of_a_plain_loop():
 
 def test_a_known_difference_is_found_where_it_is():
     windows, times = pulses(np.random.default_rng(3), 400, noise=1e-5)
-    edges = slice_edges(times, 4)
-    data = superpulses(windows, times, edges)
     other = windows.copy()
-    long = times >= edges[3]
     # a step of 1 % of the height after the edge, in the slowest slice only
-    other[long, 180:] += 0.01
-    found = superpulses(other, times, edges)
-    *same, off = (
-        own.mean - measured.mean
-        for own, measured in zip(found.pulses, data.pulses, strict=True)
-    )
+    other[times >= np.quantile(times, 0.75), 180:] += 0.01
+    found = superpulses(data=(windows, times), raw=(other, times))
+    pairs = zip(found["raw"].pulses, found["data"].pulses, strict=True)
+    *same, off = (own.mean - measured.mean for own, measured in pairs)
     assert np.nanmax(np.abs(same)) == 0
     # the crossing lies at sample 150-152, and the higher maximum moves it a little
     assert np.nanmax(off) == pytest.approx(0.01, rel=0.15)
@@ -83,11 +68,9 @@ def test_a_known_difference_is_found_where_it_is():
 
 def test_nothing_in_a_slice_is_no_failure():
     windows, times = pulses(np.random.default_rng(5), 40)
-    edges = slice_edges(times, 2)
-    data = superpulses(windows, times, edges)
-    none = superpulses(windows, times + 1e6, edges)
-    assert all(pulse.n == 0 for pulse in none.pulses)
-    slices = zip(data.pulses, none.pulses, strict=True)
+    found = superpulses(2, data=(windows, times), raw=(windows, times + 1e6))
+    assert all(pulse.n == 0 for pulse in found["raw"].pulses)
+    slices = zip(found["data"].pulses, found["raw"].pulses, strict=True)
     columns = {str(i): {"data": one, "raw": other} for i, (one, other) in enumerate(slices)}
     require_drawn(shape_figure(columns, DT, "SEP"))
 
@@ -106,8 +89,8 @@ def test_a_shift_is_no_difference(shift, sigma):
     truth = edge(TIME - 350, sigma)[np.newaxis].astype(np.float32)
     moved = edge(TIME - 350 - shift, sigma)[np.newaxis].astype(np.float32)
     scores = paired_scores(moved, truth, 100)
-    assert scores["rmse"] < 3e-5
-    assert scores["edge_rmse"] < 6e-5
+    assert scores.rmse < 3e-5
+    assert scores.edge_rmse < 6e-5
 
 
 def test_noise_scores_its_own_size():
@@ -115,7 +98,7 @@ def test_noise_scores_its_own_size():
     truth = np.repeat(edge(TIME - 350, 30.0)[np.newaxis], 300, axis=0)
     noisy = (truth + rng.normal(0, 1e-3, truth.shape)).astype(np.float32)
     # interpolation between samples smooths white noise a little
-    assert paired_scores(noisy, truth.astype(np.float32), 100)["rmse"] == pytest.approx(
+    assert paired_scores(noisy, truth.astype(np.float32), 100).rmse == pytest.approx(
         1e-3, rel=0.2
     )
 
@@ -125,11 +108,11 @@ def test_windows_of_the_two_scores():
     other = truth.copy()
     other[0, 520] -= 0.1  # beyond the edge's window, and not its maximum
     scores = paired_scores(other, truth, 100)
-    assert scores["edge_rmse"] < 1e-6
-    assert scores["rmse"] == pytest.approx(0.1 / np.sqrt(2 * 800), rel=0.01)
+    assert scores.edge_rmse < 1e-6
+    assert scores.rmse == pytest.approx(0.1 / np.sqrt(2 * 800), rel=0.01)
     other[0, 490] -= 0.1
     expected = 0.1 / np.sqrt(2 * 201)
-    assert paired_scores(other, truth, 100)["edge_rmse"] == pytest.approx(expected, rel=0.01)
+    assert paired_scores(other, truth, 100).edge_rmse == pytest.approx(expected, rel=0.01)
 
 
 def test_pairs_that_cannot_be_aligned_are_counted():
@@ -137,10 +120,10 @@ def test_pairs_that_cannot_be_aligned_are_counted():
     broken = truth.copy()
     broken[1] = 0
     broken[3, 5] = np.nan
-    assert paired_scores(broken, truth, 100)["unaligned"] == 2
+    assert paired_scores(broken, truth, 100).unaligned == 2
     nothing = paired_scores(broken[[1]], truth[[1]], 100)
-    assert np.isnan(nothing["rmse"])
-    assert nothing["unaligned"] == 1
+    assert nothing.rmse is None
+    assert nothing.unaligned == 1
 
 
 def prepared(index, n_read):
@@ -159,9 +142,8 @@ def test_responses_are_those_of_the_pulses_in_use(tmp_path, dtype):
     np.testing.assert_array_equal(found, response[used])
 
 
-@pytest.mark.parametrize("nothing", [np.nan, np.inf])
-def test_responses_none_of_which_is_finite_are_refused(tmp_path, nothing):
-    np.savez(tmp_path / "truth.npz", response=np.full((20, 2), nothing))
+def test_responses_none_of_which_is_finite_are_refused(tmp_path):
+    np.savez(tmp_path / "truth.npz", response=np.full((20, 2), np.inf))
     with pytest.raises(CpunetError, match=r"truth.npz: no response is finite"):
         true_responses(tmp_path / "truth.npz", prepared(np.arange(20), 20))
 

@@ -14,27 +14,15 @@ from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.pulses.loading import load_pulses
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
-from cpunet.settings import flat
 from cpunet.translation.translator import REN
-from cpunet.validation.tune import (
-    UNCHANGED,
-    HeldOut,
-    search_space,
-    tune,
-    with_values,
-)
+from cpunet.validation.tune import HeldOut, own_values, tune
 from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files
 
-SPACE = (
-    "search={generator.width: {choices: [2, 4]}, "
-    "training.rate_generators: {low: 1.0e-4, high: 1.0e-2, log: true}}"
-)
 TINY = [
     *SMALL_NETWORK,
     "discriminator.samples_per_step=80",
     "training.iterations=4",
     "scores.bootstraps=10",
-    SPACE,
 ]
 
 
@@ -97,42 +85,27 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
         parts.score(Giving(lost, recipe))
 
 
+optuna = pytest.importorskip("optuna")
+Choice, Real = (
+    optuna.distributions.CategoricalDistribution,
+    optuna.distributions.FloatDistribution,
+)
+
+
 @pytest.mark.parametrize(
     ("space", "words"),
     [
-        ("{training.rigde: {low: 0.1, high: 0.2}}", "search.training.rigde: there is no such"),
-        ("{training: {low: 0.1, high: 0.2}}", "training"),
-        ("{peaks.FEP.energy_kev: {low: 1, high: 2}}", "search.peaks.FEP.energy_kev: only"),
-        (
-            "{training.before_ns: {low: -1, high: 2}}",
-            "search.training.before_ns: settings: training.before_ns: Input",
-        ),
-        (
-            "{training.steps: {choices: [10, many]}}",
-            "search.training.steps: settings: training.steps: Input",
-        ),
-        ("{training.level_ns: {low: 0.1}}", "search.training.level_ns: "),
-        ("{training.level_ns: {low: 0.2, high: 0.1}}", "search.training.level_ns: "),
-        ("{training.level_ns: {low: 0, high: 0.1, log: true}}", "search.training.level_ns: "),
-        ("{training.level_ns: {choices: [0.1]}}", "search.training.level_ns"),
-        ("{training.level_ns: {from: 0.1, to: 1}}", "search.training.level_ns"),
-        ("null", "has no search space; add one"),
+        ({"training.rigde": Real(0.1, 0.2)}, "space: training.rigde: there is no such"),
+        ({"training": Real(0.1, 0.2)}, "space: training: there is no such"),
+        ({"peaks.FEP.energy_kev": Real(1, 2)}, "space: peaks.FEP.energy_kev: only"),
+        ({"training.before_ns": Real(-1, 2)}, "space: settings: training.before_ns: Input"),
+        ({"training.steps": Choice([10, "many"])}, "space: settings: training.steps: Input"),
+        ({}, "the search space is empty"),
     ],
 )
-def test_what_cannot_be_searched_is_told_by_its_key(space, words):
+def test_what_cannot_be_searched_is_named(space, words):
     with pytest.raises(CpunetError, match=re.escape(words)):
-        search_space(load_recipe("fast", [f"search={space}"]))
-
-
-@pytest.mark.parametrize("name", ["fast", "paper"])
-def test_the_recipes_own_spaces_can_be_searched(name):
-    recipe = load_recipe(name)
-    space = search_space(recipe)
-    for key, config in space.items():
-        for value in config.choices or (config.low, config.high):
-            changed = with_values(recipe, {key: value})
-            assert changed.search is None
-            assert dict(flat(changed.model_dump(mode="json")))[key] == value
+        own_values(load_recipe("fast"), space)
 
 
 class Scored:
@@ -148,13 +121,14 @@ class Scored:
         return 1 + abs(recipe.training.level_ns - 1000)
 
 
-LEVEL = "training.level_ns: {low: 100, high: 2000, log: true}"
-FIT = f"search={{{LEVEL}, training.before_ns: {{choices: [2048, 2000]}}}}"
+FIT = {
+    "training.level_ns": Real(100, 2000, log=True),
+    "training.before_ns": Choice([2048.0, 2000.0]),
+}
 
 
 @pytest.fixture
 def scored(monkeypatch) -> Scored:
-    pytest.importorskip("optuna")
     return Scored(monkeypatch)
 
 
@@ -165,42 +139,40 @@ def states(study: Any) -> list[str]:
 def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
     files, scored, tmp_path
 ):
-    recipe = load_recipe("fast", [FIT, "training.before_ns=2000"])
-    study = tune(*files, tmp_path / "tune", recipe=recipe, trials=2)
-    assert study.trials[0].user_attrs == {UNCHANGED: True}
-    own = {"training.level_ns": recipe.training.level_ns, "training.before_ns": "2000"}
+    recipe, out = load_recipe("fast", ["training.before_ns=2000"]), tmp_path / "tune"
+    study = tune(*files, out, FIT, recipe=recipe, trials=2)
+    own = {"training.level_ns": recipe.training.level_ns, "training.before_ns": 2000}
     assert study.trials[0].params == own
-    tune(*files, tmp_path / "tune", recipe=recipe, trials=10)
+    tune(*files, out, FIT, recipe=recipe, trials=10)
     assert len(scored.tried) == 10
-    again = tune(*files, tmp_path / "tune", recipe=recipe, trials=10)
+    again = tune(*files, out, FIT, recipe=recipe, trials=10)
     assert len(scored.tried) == 10
     assert states(again) == ["COMPLETE"] * 10
-    tune(*files, tmp_path / "other", recipe=recipe, trials=4)
+    tune(*files, tmp_path / "other", FIT, recipe=recipe, trials=4)
     assert scored.tried[10:] == scored.tried[:4]
 
-    with (tmp_path / "tune" / "trials.csv").open() as stream:
+    with (out / "trials.csv").open() as stream:
         rows = [*csv.DictReader(stream)]
     best = min(rows, key=lambda row: float(row["value"]))
-    tuned = load_recipe(str(tmp_path / "tune" / "best.yaml"))
-    assert tuned.search is None
+    tuned = load_recipe(str(out / "best.yaml"))
     assert tuned.training.level_ns == float(best["params_training.level_ns"])
     assert tuned.training.before_ns == float(best["params_training.before_ns"])
     assert tuned.scores == recipe.scores
 
     with pytest.raises(CpunetError, match="begun with other settings or pulses: "):
-        tune(*files, tmp_path / "tune", recipe=recipe, trials=12, seed=1)
+        tune(*files, out, FIT, recipe=recipe, trials=12, seed=1)
 
 
 def test_two_processes_share_a_search(files, scored, monkeypatch, tmp_path):
-    recipe, out, score = load_recipe("fast", [FIT]), tmp_path / "tune", scored.score
+    recipe, out, score = load_recipe("fast"), tmp_path / "tune", scored.score
 
     def joined(changed: Any) -> float:
         monkeypatch.setattr(scored, "score", score)
-        tune(*files, out, recipe=recipe, trials=3)  # while the first trial of another runs
+        tune(*files, out, FIT, recipe=recipe, trials=3)  # while the first trial of another runs
         return score(changed)
 
     monkeypatch.setattr(scored, "score", joined)
-    study = tune(*files, out, recipe=recipe, trials=3)
+    study = tune(*files, out, FIT, recipe=recipe, trials=3)
     assert states(study) == ["COMPLETE"] * 4
     assert len(set(scored.tried)) == 4
 
@@ -209,7 +181,7 @@ def test_two_processes_share_a_search(files, scored, monkeypatch, tmp_path):
 def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
     files, scored, monkeypatch, tmp_path, error
 ):
-    recipe, out = load_recipe("fast", [FIT]), tmp_path / "tune"
+    recipe, out = load_recipe("fast"), tmp_path / "tune"
 
     def fail(*_: Any) -> float:
         raise error
@@ -217,8 +189,8 @@ def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
     with monkeypatch.context() as patch:
         patch.setattr(scored, "score", fail)
         with pytest.raises(type(error), match=r"no trial has a score; the first: the|130"):
-            tune(*files, out, recipe=recipe, trials=1)
-    study = tune(*files, out, recipe=recipe, trials=2)
+            tune(*files, out, FIT, recipe=recipe, trials=1)
+    study = tune(*files, out, FIT, recipe=recipe, trials=2)
     assert states(study) == (
         ["FAIL", "COMPLETE"]
         if isinstance(error, CpunetError)
@@ -229,13 +201,13 @@ def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
 
 @pytest.mark.thorough
 def test_networks_are_searched(files, tmp_path, monkeypatch):
-    pytest.importorskip("optuna")
     forward = PositionalUNet.forward
 
     def near_the_input(network, pulses, **options):  # or no trial has a tail slope
         return pulses + 0.01 * forward(network, pulses, **options)
 
     monkeypatch.setattr(PositionalUNet, "forward", near_the_input)
-    study = tune(*files, tmp_path / "tune", recipe="published", settings=TINY, trials=2)
+    space = {"generator.width": Choice([2, 4]), "training.rate_generators": Real(1e-4, 1e-2)}
+    study = tune(*files, tmp_path / "tune", space, recipe=tiny(), trials=2)
     assert states(study) == ["COMPLETE"] * 2
     assert (tmp_path / "tune" / "best.yaml").is_file()

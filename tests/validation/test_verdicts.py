@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,10 @@ import pytest
 from scipy.stats import kstest, norm
 
 import cpunet
-from cpunet.validation.comparisons import compare, two_sample_test
-from cpunet.validation.verdicts import (
-    ALARM,
-    Verdict,
-    method_verdicts,
-    summary,
-    verdict_table,
-)
+from cpunet.pulses.two_sample import TwoSample
+from cpunet.validation.comparisons import Missing, compare, two_sample_test
+from cpunet.validation.metrics import ALARM, Metrics, Verdict
+from cpunet.validation.noise import Spectrum
 from synthetic import load_recipe
 
 STANDS = 12
@@ -36,23 +32,22 @@ def one(p: float, shift: float = 5.0) -> dict[str, Any]:
     }
 
 
-def metrics() -> dict[str, Any]:
-    auc = {"auc": 0.51, "auc_std": 0.02, "null_mean": 0.5, "null_std": 0.02}
+def metrics() -> Metrics:
+    auc = TwoSample(0.51, 0.02, 0.5, 0.02, 500, 500, 0, 0)
     survival = {"difference": {"ren": -9.5}, "difference_std": {"ren": 5.0}}
-    return {
-        "peaks": {
-            "SEP": {
-                "parameters": {
-                    "current_amplitude": one(0.5),
-                    "drift_time": one(1e-4),
-                    "tail_slope": one(0.9),
-                },
-                "two_sample": {"ren": auc},
+    peaks = {
+        "SEP": {
+            "parameters": {
+                "current_amplitude": one(0.5),
+                "drift_time": one(1e-4),
+                "tail_slope": one(0.9),
             },
-            "DEP": {"parameters": {}, "missing": "3 measured pulses"},
+            "two_sample": {"ren": auc},
         },
-        "ae_survival": {"DEP": {"cut": {"ren": 0.07}}, "SEP": survival},
+        "DEP": {"parameters": {}, "missing": "3 measured pulses"},
     }
+    rows = {"DEP": {"cut": {"ren": 0.07}}, "SEP": survival}
+    return Metrics(peaks=peaks, ae_survival=rows)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 2.9, 3.1, 20.0, 60.0])
@@ -72,8 +67,9 @@ def test_too_good_to_be_chance_asks_for_the_same_events():
 
 
 def test_the_table_holds_every_quantity_and_is_json():
-    table = verdict_table(metrics())
-    assert json.loads(json.dumps(table, allow_nan=False)) == table
+    content = metrics().to_dict()
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    table = content["verdicts"]["table"]
     assert table["DEP"] == {}
     sep = table["SEP"]["ren"]
     assert list(table["SEP"]) == ["ren"]  # and not the data
@@ -86,7 +82,7 @@ def test_the_table_holds_every_quantity_and_is_json():
 
 
 def test_an_agreement_is_quoted_with_its_sensitivity():
-    assert summary(metrics(), "SEP", "ren") == (
+    assert metrics().summary("SEP") == (
         "REN, SEP: drift time off by 3.9 sigma (+5.0 ± 2.0 ns, p = 0.0001); agreement in "
         "current amplitude (+1.00 ± 0.40 %, p = 0.5), tail slope (+5.0 ± 2.0 1/ms, p = 0.9), "
         "classifier (AUC 0.510 ± 0.020, 0.50 expected, p = 0.31), A/E survival (-9.5 ± 5.0 "
@@ -94,42 +90,43 @@ def test_an_agreement_is_quoted_with_its_sensitivity():
     )
 
 
-def noise_of(ratio: float, worst: float = 0.3) -> dict[str, Any]:
+def noise_of(ratio: float, worst: float = 0.3) -> dict[str, Spectrum]:
     """Noise of 1.95 ± 0.03 on the data's side, and that times a ratio on the other."""
-    ren = {"rms": 1.95 * ratio, "rms_std": 0.04, "rms_ratio": ratio, "spectrum_sigma": worst}
-    return {"frequency_mhz": [1.0], "data": {"rms": 1.95, "rms_std": 0.03}, "ren": ren}
+    ren = Spectrum(rms=1.95 * ratio, rms_std=0.04, spectrum_sigma=worst)
+    return {"data": Spectrum(rms=1.95, rms_std=0.03), "ren": ren}
 
 
 def test_noise_that_differs_is_said():
     changed = metrics()
-    sep = changed["peaks"]["SEP"]
+    sep = changed.peaks["SEP"]
     for ratio in (1.11, 0.89):  # too little of it is as wrong
-        sep["noise"] = noise_of(ratio)
-        line = summary(changed, "SEP", "ren")
+        sep.noise = noise_of(ratio)
+        line = changed.summary("SEP")
         assert f"noise off by 4.3 sigma (RMS {ratio:.3f} ± 0.026 of the data's" in line
-    sep["noise"] = noise_of(1.01)
-    assert "off" not in summary(changed, "SEP", "ren").partition("noise")[2]
-    sep["noise"] = noise_of(1.01, worst=5.5)
-    assert "noise spectrum off by 5.6 sigma (worst band" in summary(changed, "SEP", "ren")
-    sep["noise"] = {m: {"missing": "7 baselines; 10 are needed"} for m in ("data", "ren")}
-    assert "noise not judged (7 baselines; 10 are needed)" in summary(changed, "SEP", "ren")
+    sep.noise = noise_of(1.01)
+    assert "off" not in changed.summary("SEP").partition("noise")[2]
+    sep.noise = noise_of(1.01, worst=5.5)
+    assert "noise spectrum off by 5.6 sigma (worst band" in changed.summary("SEP")
+    missing = Spectrum(missing="7 baselines; 10 are needed")
+    sep.noise = dict.fromkeys(("data", "ren"), missing)
+    assert "noise not judged (7 baselines; 10 are needed)" in changed.summary("SEP")
 
 
 def test_the_summary_quotes_the_worst_first():
     changed = metrics()
-    sep = changed["peaks"]["SEP"]
-    sep["two_sample"]["ren"]["auc"] = 0.7
-    line = summary(changed, "SEP", "ren")
+    tested = changed.peaks["SEP"].two_sample
+    tested["ren"] = replace(tested["ren"], auc=0.7)
+    line = changed.summary("SEP")
     assert line.index("classifier off") < line.index("drift time off") < line.index("agreement")
 
 
 def test_what_is_not_scored_says_why():
     changed = metrics()
-    sep = changed["peaks"]["SEP"]
-    sep["two_sample"]["ren"] = {"missing": "12 measured pulses are usable"}
-    sep["parameters"]["drift_time"]["p"]["ren"] = None
-    changed["ae_survival"]["SEP"]["difference"]["ren"] = None
-    line = summary(changed, "SEP", "ren")
+    sep = changed.peaks["SEP"]
+    sep.two_sample["ren"] = Missing(missing="12 measured pulses are usable")
+    sep.parameters["drift_time"].p = {"ren": None}
+    changed.survival["SEP"].difference = {"ren": None}
+    line = changed.summary("SEP")
     assert "drift time not judged (too few pulses)" in line
     assert "classifier not judged (12 measured pulses are usable)" in line
     assert "A/E survival not judged (too few events" in line
@@ -141,13 +138,13 @@ def test_p_is_uniform_for_one_distribution_and_small_for_two():
     data, ren = ({name: rng.normal(size=n) for name in names} for n in (400, 300))
     for values in (data["p0"], ren["p0"]):
         values[:40] = np.nan  # a bin of its own
-    shifted = {name: values + 0.8 for name, values in copy.deepcopy(ren).items()}
+    shifted = {name: values + 0.8 for name, values in ren.items()}
     few = {"bootstraps": 2}
     found = compare(data, {"ren": ren, "shifted": shifted}, SCORES.model_copy(update=few), 1)
-    p = np.array([found[name]["p"]["ren"] for name in names])
+    p = np.array([found[name].p["ren"] for name in names])
     assert kstest(p, "uniform").pvalue > 0.01
     assert (p < ALARM).mean() <= 0.01
-    assert max(found[name]["p"]["shifted"] for name in names) < 0.01
+    assert max(found[name].p["shifted"] for name in names) < 0.01
 
 
 @pytest.mark.slow
@@ -162,7 +159,7 @@ def test_p_of_the_truth_is_uniform_over_stands(tmp_path):
         stand = cpunet.make_stand(tmp_path / f"stand{seed}", seed=seed, **few)
         run = run or cpunet.train(stand.sim, stand.data)
         report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth, baselines=False)
-        truth, raw = (method_verdicts(report.metrics, "SEP", m) for m in ("truth", "raw"))
+        truth, raw = (report.metrics.judge("SEP", m) for m in ("truth", "raw"))
         assert not raw["lq"].agrees
         assert not raw["rise_time"].agrees
         for name in names:
@@ -180,7 +177,7 @@ def test_errors_of_a_fit_are_in_p_and_in_the_error_of_the_mean():
         data, ren = rng.normal(size=400), rng.normal(size=400) + error * rng.normal()
         moved = np.array([[ren + error, ren - error]])
         found = compare({"a": data}, {"ren": {"a": ren}}, SCORES, 1, {"ren": {"a": moved}})["a"]
-        p.append(found["p"]["ren"])
-        pulls.append(found["shift"]["ren"] / found["shift_std"]["ren"])
+        p.append(found.p["ren"])
+        pulls.append(found.shift["ren"] / found.shift_std["ren"])
     assert kstest(p, "uniform").pvalue > 0.01
     assert np.std(pulls) == pytest.approx(1, abs=0.15)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import hist
 import numpy as np
-from scipy.signal import fftconvolve
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
@@ -68,6 +67,8 @@ def legend_parameters(
     aligned
         Sample from which times count.
     """
+    from scipy.signal import fftconvolve  # half of SciPy
+
     pole_zero, _, trap_norm, trap_pickoff = processors()
     corrected = np.asarray(waveforms, float)
     if np.isfinite(decay_ns):

@@ -8,7 +8,7 @@ period; `Recipe.at` makes numbers of samples of them.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
 
@@ -356,31 +356,6 @@ class ScoreConfig(Timed):
         return self.samples(self.edge_ns)
 
 
-class SearchConfig(Config):
-    """Values of a setting that `cpunet.tune` tries.
-
-    Either a range from ``low`` to ``high``, on a logarithmic scale if ``log``, or any of
-    ``choices``.  Values are integers if ``low``, ``high`` and the setting are.
-    """
-
-    low: int | float | None = None
-    high: int | float | None = None
-    log: bool = False
-    choices: Annotated[tuple[Any, ...], Field(min_length=2)] | None = None
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> SearchConfig:
-        ends = [end for end in (self.low, self.high) if end is not None]
-        if len(ends) != (2 if self.choices is None else 0):
-            raise ValueError("give either low and high, or choices")
-        if self.low is not None and self.high is not None:
-            if not self.low < self.high:
-                raise ValueError("low must be less than high")
-            if self.log and self.low <= 0:
-                raise ValueError("log needs low above 0")
-        return self
-
-
 Critics = Annotated[GruConfig | ConvolutionalConfig, Field(discriminator="name")]
 
 
@@ -412,7 +387,6 @@ class Recipe(Timed):
     residual: CycleGanConfig | None = None
     training: Annotated[TrainingConfig | MatchingConfig, Field(discriminator="method")]
     scores: ScoreConfig
-    search: dict[str, SearchConfig] | None = None
 
     def at(self, dt_ns: float) -> Self:
         """The same recipe for pulses with a sampling period in ns.

@@ -18,20 +18,23 @@ estimated from sidebands and subtracted.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
+from pydantic import Field
 
-from cpunet.electronics.baseline_methods import most_frequent
 from cpunet.pulses.parameters import Values
-from cpunet.validation.comparisons import Missing, resampled_quantiles
+from cpunet.validation.comparisons import (
+    ByMethod,
+    Missing,
+    Number,
+    Result,
+    resampled_quantiles,
+)
 
 Range = tuple[float, float]
 Spread = tuple[float, float]  # a number and its error
 ByPeak = Mapping[str, Mapping[str, Values]]
-ByMethod = dict[str, float]
 
 ACCEPTANCE = 0.9  # fraction of the DEP that survives
 MIN_EVENTS = 20  # events of the DEP: two below the cut
@@ -41,9 +44,8 @@ SCALES = 100  # bootstraps of the position of the single-site peak
 NULLS = 200  # draws of a difference without one
 
 
-@dataclass(frozen=True)
-class SurvivalRow:
-    """Survival of one peak, by method and for the ``data``; NaN where there is none.
+class SurvivalRow(Result):
+    """Survival of one peak, by method and for the ``data``.
 
     Attributes
     ----------
@@ -59,20 +61,31 @@ class SurvivalRow:
         Part of the error of the REN that is due to those of its fit.
     """
 
-    events: dict[str, int]
-    missing: dict[str, int]
-    cut: ByMethod | None = None
-    cut_std: ByMethod | None = None
-    survival: ByMethod | None = None
-    survival_std: ByMethod | None = None
-    difference: ByMethod | None = None
-    difference_std: ByMethod | None = None
-    sigma: ByMethod | None = None
-    of_fit: float | None = None
+    events: dict[str, int] = Field(default_factory=dict)
+    missing: dict[str, int] = Field(default_factory=dict)
+    cut: ByMethod = Field(default_factory=dict)
+    cut_std: ByMethod = Field(default_factory=dict)
+    survival: ByMethod = Field(default_factory=dict)
+    survival_std: ByMethod = Field(default_factory=dict)
+    difference: ByMethod = Field(default_factory=dict)
+    difference_std: ByMethod = Field(default_factory=dict)
+    sigma: ByMethod = Field(default_factory=dict)
+    of_fit: Number = None
+
+    def compare(self, estimates: Mapping[str, Spread], spread: Mapping[str, float]) -> None:
+        """Set differences from the data, with errors as given or those of both."""
+        data, data_std = estimates["data"]
+        self.survival = {method: survival for method, (survival, _) in estimates.items()}
+        self.survival_std = {method: error for method, (_, error) in estimates.items()}
+        others = {m: estimate for m, estimate in estimates.items() if m != "data"}
+        off = {method: survival - data for method, (survival, _) in others.items()}
+        std = {m: float(np.hypot(error, data_std)) for m, (_, error) in others.items()}
+        std.update(spread)
+        self.difference, self.difference_std = off, std
+        self.sigma = {method: off[method] / std[method] for method in others}
 
 
-@dataclass(frozen=True)
-class RangeSurvival:
+class RangeSurvival(Result):
     """Survival of a gamma line or of a range of energies.
 
     Attributes
@@ -89,12 +102,12 @@ class RangeSurvival:
         Reason why there is none.
     """
 
-    peak: int
-    peak_pass: int
-    sideband: int
-    sideband_pass: int
-    scale: float
-    undefined: int
+    peak: int = 0
+    peak_pass: int = 0
+    sideband: int = 0
+    sideband_pass: int = 0
+    scale: float = 0.0
+    undefined: int = 0
     survival: float | None = None
     survival_std: float | None = None
     missing: str | None = None
@@ -154,7 +167,15 @@ def ae_survival(
     # for this quantile the acceptance of new events is exact on average for any sample size
     cut = float(np.quantile(dep, 1 - ACCEPTANCE, method="weibull"))
     cuts = resampled_quantiles(dep, 1 - ACCEPTANCE, bootstraps, rng)
-    peaks = {name: _peak_survival(values, cut, cuts) for name, values in others.items()}
+    peaks: dict[str, Spread] = {}
+    for name, values in others.items():
+        finite = np.sort(values[np.isfinite(values)])
+        n, peaks[name] = finite.size, (np.nan, np.nan)
+        if n:
+            passing = n - int(np.searchsorted(finite, cut))
+            of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
+            error = float(100 * np.hypot(survival_error(passing, n), of_cut))
+            peaks[name] = 100 * passing / n, error
     return cut, float(cuts.std(ddof=1)), peaks
 
 
@@ -177,7 +198,7 @@ def survival_table(
         Seed of the bootstraps for the errors of the cuts.
     """
     if DEP not in ae:
-        return Missing(f"the data lack peak {DEP}; the A/E cut needs it")
+        return Missing(missing=f"the data lack peak {DEP}; the A/E cut needs it")
     rng = np.random.default_rng(seed)
     methods = [
         m for m in next(iter(ae.values())) if all(m in of_peak for of_peak in ae.values())
@@ -194,37 +215,36 @@ def survival_table(
     table = {}
     for name, of_peak in ae.items():
         events = {m: int(np.isfinite(of_peak[m]).sum()) for m in methods}
-        row = SurvivalRow(events, {m: len(of_peak[m]) - events[m] for m in methods})
+        missing = {m: len(of_peak[m]) - events[m] for m in methods}
+        row = table[name] = SurvivalRow(events=events, missing=missing)
         if name == DEP:
-            cuts = {m: cut for m, (cut, _, _) in estimates.items()}
-            errors = {m: std for m, (_, std, _) in estimates.items()}
-            table[name] = replace(row, cut=cuts, cut_std=errors)
-        else:
-            survival = {m: s[2][name] for m, s in estimates.items()}
-            of_fit = _of_fit(moved[DEP], moved[name]) if {DEP, name} <= moved.keys() else 0.0
-            if "ren" in survival:
-                passed, error = survival["ren"]
-                survival["ren"] = passed, float(np.hypot(error, of_fit))
-            spread = {
-                m: null_spread(
-                    (ae[DEP]["data"], ae[DEP][m]), (of_peak["data"], of_peak[m]), rng
-                )
-                for m in methods
-                if m != "data"
-            }
-            if "ren" in spread:
-                spread["ren"] = float(np.hypot(spread["ren"], of_fit))
-            table[name] = _against_data(replace(row, of_fit=of_fit), survival, spread)
+            row.cut = {m: cut for m, (cut, _, _) in estimates.items()}
+            row.cut_std = {m: std for m, (_, std, _) in estimates.items()}
+            continue
+        survival = {m: s[2][name] for m, s in estimates.items()}
+        spread = {
+            m: null_spread((ae[DEP]["data"], ae[DEP][m]), (of_peak["data"], of_peak[m]), rng)
+            for m in methods
+            if m != "data"
+        }
+        row.of_fit = of_fit = (
+            _of_fit(moved[DEP], moved[name]) if {DEP, name} <= moved.keys() else 0.0
+        )
+        if "ren" in survival:
+            passed, error = survival["ren"]
+            survival["ren"] = passed, float(np.hypot(error, of_fit))
+            spread["ren"] = float(np.hypot(spread["ren"], of_fit))
+        row.compare(survival, spread)
     return table
 
 
 def peak_survival(
     amplitude: Values,
     energy_kev: Values,
-    cut: float,
+    cut: float | None,
     peak: Range,
     sidebands: Sequence[Range] = (),
-    cut_std: float = 0.0,
+    cut_std: float | None = 0.0,
 ) -> RangeSurvival:
     """Survival of a gamma line after a low-A/E cut, with its background subtracted.
 
@@ -235,7 +255,7 @@ def peak_survival(
     amplitude, energy_kev
         Current amplitude and energy in keV of each event, shape ``(n,)``.
     cut
-        Lowest amplitude that survives.
+        Lowest amplitude that survives, if any.
     peak
         Range of the line in keV: lower end (included) and upper end (excluded).
     sidebands
@@ -244,31 +264,45 @@ def peak_survival(
         Error of the cut.
     """
     finite = np.isfinite(amplitude)
-    in_peak, aside = _within(energy_kev, [peak]), _within(energy_kev, sidebands)
-    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, aside))
-    survives = finite & (amplitude >= cut)
-    passing, side_pass = (int((survives & inside).sum()) for inside in (in_peak, aside))
+    in_peak, aside = (
+        np.any([(energy_kev >= low) & (energy_kev < high) for low, high in ranges], axis=0)
+        if ranges
+        else np.zeros(len(energy_kev), bool)
+        for ranges in ([peak], sidebands)
+    )
     width = sum(high - low for low, high in sidebands)
     scale = (peak[1] - peak[0]) / width if width else 0.0
-    undefined = int((~finite & (in_peak | aside)).sum())
-    result = RangeSurvival(n, passing, n_side, side_pass, scale, undefined)
+    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, aside))
+
+    def at(lowest: float) -> tuple[int, int, Spread]:
+        survives = finite & (amplitude >= lowest)
+        passing, side_pass = (int((survives & inside).sum()) for inside in (in_peak, aside))
+        return passing, side_pass, sideband_survival(passing, n, side_pass, n_side, scale)
+
+    passing, side_pass, (survival, std) = at(np.nan if cut is None else cut)
+    result = RangeSurvival(
+        peak=n,
+        peak_pass=passing,
+        sideband=n_side,
+        sideband_pass=side_pass,
+        scale=scale,
+        undefined=int((~finite & (in_peak | aside)).sum()),
+    )
     span = f"from {peak[0]:g} to {peak[1]:g} keV"
-    if not np.isfinite(cut):
-        missing = "there is no cut: too few events of the double-escape peak"
-        return replace(result, missing=missing)
-    if not n:
-        return replace(result, missing=f"no events {span}")
-    survival, std = sideband_survival(passing, n, side_pass, n_side, scale)
-    if not np.isfinite(survival):
-        return replace(result, missing=f"the sidebands leave no events of {n} {span}")
-    if not scale or not std:
-        std = 100 * survival_error(passing, n)
-    if cut_std:
-        ends = (cut - cut_std, cut + cut_std)
-        at_ends = [peak_survival(amplitude, energy_kev, end, peak, sidebands) for end in ends]
-        low, high = (moved.survival or 0.0 for moved in at_ends)
-        std = float(np.hypot(std, 0.5 * (low - high)))
-    return replace(result, survival=survival, survival_std=std)
+    if cut is None or not np.isfinite(cut):
+        result.missing = "there is no cut: too few events of the double-escape peak"
+    elif not n:
+        result.missing = f"no events {span}"
+    elif not np.isfinite(survival):
+        result.missing = f"the sidebands leave no events of {n} {span}"
+    else:
+        if not scale or not std:
+            std = 100 * survival_error(passing, n)
+        if cut_std:
+            low, high = at(cut - cut_std)[2][0], at(cut + cut_std)[2][0]
+            std = float(np.hypot(std, 0.5 * (low - high)))
+        result.survival, result.survival_std = survival, std
+    return result
 
 
 def sideband_survival(
@@ -326,33 +360,29 @@ def survival_error(passing: int, n: int) -> float:
     return float(np.sqrt(p * (1 - p) / (n + 3)))
 
 
-def _peak_survival(values: Values, cut: float, cuts: Values) -> Spread:
-    finite = np.sort(values[np.isfinite(values)])
-    n = finite.size
-    if not n:
-        return np.nan, np.nan
-    passing = n - int(np.searchsorted(finite, cut))
-    of_cut = (1 - np.searchsorted(finite, cuts) / n).std(ddof=1)
-    error = float(100 * np.hypot(survival_error(passing, n), of_cut))
-    return 100 * passing / n, error
-
-
-def dep_scale(dep_ae: Values, seed: int = 0) -> Spread:
+def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, Spread]:
     """Position of the single-site peak of A/E in the double-escape peak, and its error.
 
     Parameters
     ----------
     dep_ae
-        A/E of the events of the peak; values that are not finite are left out.
+        A/E of the events of the peak by method; values that are not finite are left out.
+        Nothing is returned if a method has too few others.
     seed
         Seed of the bootstraps.
     """
-    finite_ae = dep_ae[np.isfinite(dep_ae)]
-    if finite_ae.size < MIN_EVENTS:
-        return np.nan, np.nan
-    rng = np.random.default_rng(seed)
-    drawn = [most_frequent(rng.choice(finite_ae, finite_ae.size)) for _ in range(SCALES)]
-    return most_frequent(finite_ae), float(np.std(drawn, ddof=1))
+    # half of SciPy, which those who only read scores need not wait for
+    from cpunet.electronics.baseline_methods import most_frequent
+
+    finite = {method: values[np.isfinite(values)] for method, values in dep_ae.items()}
+    if not all(values.size >= MIN_EVENTS for values in finite.values()):
+        return {}
+    scales = {}
+    for method, values in finite.items():
+        rng = np.random.default_rng(seed)
+        drawn = [most_frequent(rng.choice(values, values.size)) for _ in range(SCALES)]
+        scales[method] = most_frequent(values), float(np.std(drawn, ddof=1))
+    return scales
 
 
 def subtracted(
@@ -370,27 +400,29 @@ def subtracted(
     rows = dict(table)
     for name, methods in ranges.items():
         shares = {
-            method: (survival_of.survival, survival_of.survival_std)
-            for method, survival_of in methods.items()
-            if survival_of.survival is not None and survival_of.survival_std is not None
+            method: (of.survival, of.survival_std)
+            for method, of in methods.items()
+            if of.survival is not None and of.survival_std is not None
         }
         if "data" not in shares:
             continue
-        spread = None
-        if name in table and (plain := table[name].difference_std) is not None:
+        spread = {}
+        if name in table:
             # the subtraction adds the sampling of events below the line
-            own = table[name].survival_std or {}
-            more = {m: max(e**2 - own.get(m, 0.0) ** 2, 0.0) for m, (_, e) in shares.items()}
+            own = table[name].survival_std
+            more = {
+                m: max(e**2 - (own.get(m) or 0.0) ** 2, 0.0) for m, (_, e) in shares.items()
+            }
             spread = {
                 m: float(np.sqrt(std**2 + more[m] + more["data"]))
-                for m, std in plain.items()
-                if m in shares
+                for m, std in table[name].difference_std.items()
+                if m in shares and std is not None
             }
-        row = SurvivalRow(
-            {method: survival_of.peak for method, survival_of in methods.items()},
-            {method: survival_of.undefined for method, survival_of in methods.items()},
+        row = rows[name] = SurvivalRow(
+            events={method: of.peak for method, of in methods.items()},
+            missing={method: of.undefined for method, of in methods.items()},
         )
-        rows[name] = _against_data(row, shares, spread)
+        row.compare(shares, spread)
     return rows
 
 
@@ -439,32 +471,3 @@ def null_spread(
         cut = np.quantile(single, 1 - ACCEPTANCE, axis=1, keepdims=True, method="weibull")
         survival.append(100 * (some >= cut).mean(axis=1))
     return float((survival[1] - survival[0]).std(ddof=1))
-
-
-def _against_data(
-    row: SurvivalRow, estimates: Mapping[str, Spread], spread: Mapping[str, float] | None = None
-) -> SurvivalRow:
-    """Differences from the data, with errors as given or those of both in quadrature."""
-    (data, data_std), difference, std, sigma = estimates["data"], {}, {}, {}
-    for method, (survival, error) in estimates.items():
-        if method != "data":
-            difference[method] = survival - data
-            std[method] = float(np.hypot(error, data_std))
-            if spread is not None:
-                std[method] = spread[method]
-            sigma[method] = difference[method] / std[method]
-    return replace(
-        row,
-        survival={m: survival for m, (survival, _) in estimates.items()},
-        survival_std={m: error for m, (_, error) in estimates.items()},
-        difference=difference,
-        difference_std=std,
-        sigma=sigma,
-    )
-
-
-def _within(energy_kev: Values, ranges: Sequence[Range]) -> npt.NDArray[np.bool_]:
-    inside = np.zeros(len(energy_kev), bool)
-    for low, high in ranges:
-        inside |= (energy_kev >= low) & (energy_kev < high)
-    return inside

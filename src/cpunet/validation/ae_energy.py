@@ -11,14 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
-from iminuit import Minuit
-from matplotlib.figure import Figure
+from pydantic import Field
 from scipy.special import expit, log_ndtr, ndtr
 
-from cpunet.plotting import COLOURS, GROUP, STACKED, group, label, panels, styled
 from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP, Range
+from cpunet.validation.comparisons import Result
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
@@ -110,8 +108,7 @@ class Course:
     resolution: WidthLaw
 
 
-@dataclass(frozen=True)
-class AgainstEnergy:
+class AgainstEnergy(Result):
     """A/E against energy.
 
     Attributes
@@ -125,7 +122,7 @@ class AgainstEnergy:
     """
 
     multi_site: bool | None = None
-    methods: dict[str, Course] | None = None
+    methods: dict[str, Course] = Field(default_factory=dict)
     missing: str | None = None
 
 
@@ -168,7 +165,7 @@ def against_energy(
         method: _course([p for p in site_fits if (p.low_kev, p.high_kev) in common])
         for method, site_fits in points.items()
     }
-    return AgainstEnergy(bands is all_bands, methods)
+    return AgainstEnergy(multi_site=bands is all_bands, methods=methods)
 
 
 def site_fit(
@@ -191,6 +188,8 @@ def site_fit(
         Mean and its error, sigma and its error, and the number of fitted events; None if
         there are too few events or no peak.
     """
+    from iminuit import Minuit
+
     values = np.sort(amplitude[np.isfinite(amplitude)])
     about = _seen(values) if about is None else about
     if about is None:
@@ -209,37 +208,6 @@ def site_fit(
     (mean, log_sigma, *_), (error, log_error, *_) = fit.values, fit.errors
     sigma = width * float(np.exp(log_sigma))
     return centre + width * mean, width * error, sigma, sigma * log_error, len(x)
-
-
-@styled
-def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
-    """Relative shift and relative width of the single-site peak of A/E against energy.
-
-    Parameters
-    ----------
-    methods
-        ``methods`` of `against_energy`.
-    """
-    figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
-    for method, course in methods.items():
-        colour, line = COLOURS[method], course.mean
-        energy, mean, error, sigma, sigma_error = _columns(course.points)
-        look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
-        for axes, value, spread in (
-            (above, mean / course.scale - 1, error / course.scale),
-            (below, sigma / mean, sigma_error / mean),
-        ):
-            group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
-        along = np.linspace(energy.min(), energy.max(), 100)
-        text = f"{label(method)}: {line.per_mev_percent:+.3f} ± "
-        text += f"{line.per_mev_error_percent:.3f} % per MeV"
-        fit = {"color": colour, "gid": GROUP + method}
-        above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
-        below.plot(along, 100 * course.resolution.of(along), **fit)
-    above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
-    below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
-    above.legend()
-    return figure
 
 
 def _points(
@@ -264,7 +232,9 @@ def _points(
 
 def _course(points: list[SiteFit]) -> Course:
     """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
-    energy, mean, error, sigma, sigma_error = _columns(points)
+    from scipy.optimize import nnls
+
+    energy, mean, error, sigma, sigma_error = columns(points)
     design = np.stack([energy - REFERENCE_KEV, np.ones(len(energy))], axis=1) / error[:, None]
     slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
     covariance = np.linalg.inv(design.T @ design) / scale**2
@@ -287,7 +257,7 @@ def _course(points: list[SiteFit]) -> Course:
     for _ in range(3):
         # errors are scaled to the fitted widths; otherwise widths that fluctuate low weigh most
         weight = relative / (2 * squares * spread)
-        constant, b2 = scipy.optimize.nnls(terms * weight[:, None], relative**2 * weight)[0]
+        constant, b2 = nnls(terms * weight[:, None], relative**2 * weight)[0]
         squares = terms @ np.array([constant, b2])
     at_reference = float(100 * np.sqrt(constant + b2 * 1e6 / REFERENCE_KEV**2))
     law = WidthLaw(float(constant), float(1e3 * np.sqrt(b2)), 2.0, at_reference)
@@ -295,7 +265,7 @@ def _course(points: list[SiteFit]) -> Course:
     return Course(points, float(scale), scale_error, line, law)
 
 
-def _columns(points: Sequence[SiteFit]) -> Values:
+def columns(points: Sequence[SiteFit]) -> Values:
     """Fitted values of the points, as rows of an array."""
     return np.array([[getattr(point, name) for point in points] for name in FITTED])
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,59 +13,30 @@ from urllib.parse import quote
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import refuse_existing, written_aside
+from cpunet.outputs import refuse_existing, refuse_inputs, written_aside
 from cpunet.plotting import label
 from cpunet.pulses.shape_parameters import LABELLED
-from cpunet.tables import NO_VALUE, text_table
+from cpunet.pulses.two_sample import TwoSample
+from cpunet.tables import NO_VALUE, text_table, with_std
 from cpunet.training.response import Response, response
 from cpunet.training.response_tables import FAR, outliers
 from cpunet.training.run import Run, RunLike
+from cpunet.validation.metrics import MAIN, QUANTITIES, Metrics, PeakScores, signed
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
-from cpunet.validation.verdicts import (
-    MAIN,
-    QUANTITIES,
-    Metrics,
-    judged_parameters,
-    judged_scores,
-    methods_of,
-    number,
-    part,
-    summary,
-)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 FEW = 8  # runs whose scores are printed side by side; of more, the page has them
-OVER = "median ± std"  # name of the column over runs that differ in their seed only
-
-# what runs have in common that differ in their seed only
-ORIGIN = (
-    ("training", "recipe"),
-    ("training", "peak"),
-    ("compared", "simulation"),
-    ("compared", "data"),
-)
 
 
 class Cell(NamedTuple):
-    """A score with its error, its format and text, and its distance from the best possible."""
+    """A score with its error, its text, and its distance from the best possible."""
 
-    value: float | None = None
-    error: float | None = None
-    digits: str = ""
-    text: str = NO_VALUE
-    off: float = math.inf
-
-    @classmethod
-    def of(
-        cls, value: float | None, error: float | None, digits: str, best: float, more: str = ""
-    ) -> Cell:
-        """A score with its error, if there are any, and the text that follows them."""
-        if value is None:
-            return cls()
-        spread = "" if error is None else f" ± {error:{digits.lstrip('+')}}"
-        return cls(value, error, digits, f"{value:{digits}}{spread}{more}", abs(value - best))
+    value: float
+    error: float | None
+    text: str
+    off: float
 
 
 class Row(NamedTuple):
@@ -77,41 +47,37 @@ class Row(NamedTuple):
     peak, score
         Name of the peak and of the score.
     cells
-        Scores in the order of the runs.
+        Scores in the order of the runs; None of a run without.
     """
 
     peak: str
     score: str
-    cells: list[Cell]
+    cells: list[Cell | None]
 
     @property
     def best(self) -> set[int]:
         """Indices of the runs with the best score; empty if fewer than two have one."""
-        present = [cell.off for cell in self.cells if cell.value is not None]
-        return {
-            i for i, c in enumerate(self.cells) if len(present) > 1 and c.off == min(present)
-        }
+        off = {i: cell.off for i, cell in enumerate(self.cells) if cell is not None}
+        return {i for i in off if len(off) > 1 and off[i] == min(off.values())}
 
     @property
     def texts(self) -> list[str]:
         """Scores as displayed; the best are marked."""
-        best = self.best
-        return [f"{cell.text}{'*' * (i in best)}" for i, cell in enumerate(self.cells)]
+        shown = [NO_VALUE if cell is None else cell.text for cell in self.cells]
+        return [f"{text}{'*' * (i in self.best)}" for i, text in enumerate(shown)]
 
     @property
     def far(self) -> list[bool]:
         """Which runs are far from the median of all, beyond the scatter and the own error."""
-        return outliers([c.value for c in self.cells], [c.error for c in self.cells])
+        return outliers(
+            [c and c.value for c in self.cells], [c and c.error for c in self.cells]
+        )
 
     @property
     def over(self) -> str:
         """Median and standard deviation over the runs."""
-        present = [cell for cell in self.cells if cell.value is not None]
-        if len(present) < 2:
-            return NO_VALUE
-        values, digits = np.array([cell.value for cell in present], float), present[0].digits
-        spread = f"{np.std(values, ddof=1):{digits.lstrip('+')}}"
-        return f"{np.median(values):{digits}} ± {spread}"
+        values = [cell.value for cell in self.cells if cell is not None]
+        return with_std(np.median(values), np.std(values, ddof=1)) if values[1:] else NO_VALUE
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +92,7 @@ class Comparison:
     method
         Method that is scored.
     metrics
-        Content of ``metrics.json`` by run.  Runs have the names of their folders, made unique,
+        Scores by run.  Runs have the names of their folders, made unique,
         such as ``DETECTOR/PERIOD``.
     folders
         Folder of each report; None for those in memory.
@@ -138,15 +104,16 @@ class Comparison:
     Examples
     --------
     >>> iou = lambda value: {"iou": {"ren": value, "ceiling": 90.0}}
-    >>> metrics = lambda v: {"peaks": {"SEP": {"parameters": {"drift_time": iou(v)}}}}
-    >>> made = Comparison("ren", {"old": metrics(80.0), "new": metrics(85.0)})
+    >>> scores = lambda v: {"peaks": {"SEP": {"parameters": {"drift_time": iou(v)}}}}
+    >>> metrics = {name: Metrics(**scores(v)) for name, v in (("old", 80.0), ("new", 85.0))}
+    >>> made = Comparison("ren", metrics)
     >>> made.rows[0].texts
-    ['80.0 (90.0)', '85.0 (90.0)*']
+    ['80 (90.0)', '85 (90.0)*']
     """
 
     method: str
     metrics: Mapping[str, Metrics]
-    folders: Mapping[str, Path | None] | None = None
+    folders: Mapping[str, Path | None] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
     path: Path | None = None
 
@@ -154,14 +121,12 @@ class Comparison:
     def rows(self) -> list[Row]:
         """Scores that any run has, ordered by peak."""
         rows = []
-        for peak in _union(part(metrics, "peaks") for metrics in self.metrics.values()):
-            collected = [
-                _scores(metrics, peak, self.method) for metrics in self.metrics.values()
+        for peak in _union(metrics.peaks for metrics in self.metrics.values()):
+            collected = [_scores(of_run, peak, self.method) for of_run in self.metrics.values()]
+            rows += [
+                Row(peak, score, [cells.get(score) for cells in collected])
+                for score in _union(collected)
             ]
-            for score in _union(collected):
-                cells = [of_run.get(score, Cell()) for of_run in collected]
-                if any(cell.value is not None for cell in cells):
-                    rows.append(Row(peak, score, cells))
         return rows
 
     @property
@@ -170,7 +135,7 @@ class Comparison:
         from pandas import DataFrame, MultiIndex
 
         index = MultiIndex.from_tuples([row[:2] for row in self.rows], names=["peak", "score"])
-        values = [[cell.value for cell in row.cells] for row in self.rows]
+        values = [[cell and cell.value for cell in row.cells] for row in self.rows]
         return DataFrame(values, index, list(self.metrics), dtype=float)
 
     @property
@@ -187,16 +152,6 @@ class Comparison:
         text = f"other pulses than those of {first} ({words}), so scores differ for that, too"
         return f"{names}: {text}" if names else ""
 
-    @property
-    def of_seeds(self) -> bool:
-        """Whether the runs differ in their seed only: of one recipe, on the same files."""
-        origins = {
-            tuple(part(metrics, section).get(key) for section, key in ORIGIN)
-            for metrics in self.metrics.values()
-            if part(metrics, "training")
-        }
-        return len(self.metrics) > 1 and len(origins) == 1
-
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write the comparison as an HTML page, with links to the reports.
 
@@ -207,45 +162,35 @@ class Comparison:
         """
         from cpunet.html_pages import rendered
 
-        path, folders = Path(path), self.folders or {}
-        _refuse(path, folders.values(), force=force)
+        path = Path(path)
+        if path.is_dir():
+            raise CpunetError(
+                f"{path}: is a folder", "give the name of a page, as compare.html"
+            )
+        refuse_existing(path, *self.folders.values(), force=force)
         links = {
             name: quote(os.path.relpath(folder / PAGE, path.parent))
-            for name, folder in folders.items()
+            for name, folder in self.folders.items()
             if folder is not None and (folder / PAGE).is_file()
         }
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
         title = f"{label(self.method)}: {len(self.metrics)} runs compared"
-        runs = []
-        for name, metrics in self.metrics.items():
-            off, judged = judged_scores(metrics, self.method)
-            text = f"{off} of {judged} off" if judged else "not judged"
-            marked = off > 2 and off > 0.2 * judged  # one or two of many may be off
-            if part(metrics, "training").get("ok") is False:
-                text, marked = f"{text}, a bad fit", True
-            lines = [summary(metrics, peak, self.method) for peak in part(metrics, "peaks")]
-            about = "; ".join(f"{key}: {of}" for key, of in part(metrics, "compared").items())
-            runs.append(
-                {"name": name, "text": text, "marked": marked, "lines": lines, "about": about}
-            )
-        values = {"title": title, "comparison": self, "runs": runs, "links": links}
-        page = rendered("compare.html", **values, peaks=peaks, over=OVER, far=f"{FAR:g}")
+        values = {"title": title, "comparison": self, "links": links, "peaks": peaks}
         with written_aside(path) as aside:
-            aside.write_text(page, encoding="utf-8")
+            aside.write_text(
+                rendered("compare.html", **values, far=f"{FAR:g}"), encoding="utf-8"
+            )
 
     def __str__(self) -> str:
         lines = []
         if self.path is None or len(self.metrics) <= FEW:
-            seeds = self.of_seeds
+            peaks = [row.peak for row in self.rows]
             rows = [
-                ["" if i and self.rows[i - 1].peak == row.peak else row.peak, row.score]
-                + row.texts
-                + [row.over] * seeds
-                for i, row in enumerate(self.rows)
+                ["" if last == row.peak else row.peak, row.score, *row.texts]
+                for last, row in zip(["", *peaks], self.rows, strict=False)
             ]
-            head = ["peak", "score", *self.metrics, *[OVER] * seeds]
             title = f"Scores of {self.method}, the best with *"
-            lines = [text_table(head, rows, words=2, title=title)]
+            lines = [text_table(["peak", "score", *self.metrics], rows, words=2, title=title)]
             lines += [f"note: {self.note}"] if self.note else []
         lines += [f"no report: {name}" for name in self.missing]
         return "\n".join(lines if self.path is None else [*lines, str(self.path)])
@@ -262,9 +207,8 @@ def compare(
 ) -> Comparison | Response:
     """Compare the scores of several validations, of one detector or of many.
 
-    The page also has links to the reports, and room for many detectors and periods. Of runs
-    that differ in their seed only, it has the median and the standard deviation as well.
-    Reports that are missing are listed.
+    The page also has links to the reports, room for many detectors and periods, and of three
+    or more the median and the standard deviation. Reports that are missing are listed.
 
     Parameters
     ----------
@@ -301,19 +245,12 @@ def compare(
         return response(*runs, out=out, force=force)
     scored = [report for report in reports if not isinstance(report, Run)]
     if out is not None:
-        files = [report for report in scored if not isinstance(report, Report)]
-        _refuse(Path(out), files, force=force)
+        refuse_inputs(Path(out), *(of for of in scored if not isinstance(of, Report)))
     comparison = compared(scored, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)
     return replace(comparison, path=Path(out))
-
-
-def _refuse(out: Path, reports: Iterable[str | Path | None], *, force: bool) -> None:
-    if out.is_dir():
-        raise CpunetError(f"{out}: is a folder", "give the name of a page, as compare.html")
-    refuse_existing(out, *reports, force=force)
 
 
 def compared(
@@ -335,7 +272,7 @@ def compared(
     for report in reports:
         if isinstance(report, Report):
             # one in memory is named by its run
-            place = report.folder or Path(report.metrics["compared"]["run"])
+            place = report.folder or Path(report.metrics.compared["run"])
             collected.append((place, report.metrics, report.folder))
             continue
         path = Path(report)
@@ -354,9 +291,7 @@ def compared(
     missing = tuple(name for name in names if name not in runs)
     made = Comparison(method, runs, folders, missing)
     if not made.rows:
-        methods = _union(
-            methods_of(m, peak) for m in runs.values() for peak in part(m, "peaks")
-        )
+        methods = _union(s.methods for metrics in runs.values() for s in metrics.peaks.values())
         raise CpunetError(
             f"{', '.join(runs)}: no score of the method {method}; "
             + (f"there are {', '.join(methods)}" if methods else "nothing is scored there")
@@ -365,46 +300,47 @@ def compared(
 
 
 def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
-    """Scores of a method at a peak, by name."""
-    scores, survival = part(metrics, "peaks", peak), part(metrics, "ae_survival", peak)
-    collected, of_legend = {}, {}
-    for name, quantity in part(scores, "parameters").items():
-        ceiling = number(quantity, "iou", "ceiling")
-        more = "" if ceiling is None else f" ({ceiling:.1f})"
-        iou, error = (number(quantity, key, method) for key in ("iou", "iou_std"))
-        title = f"{name.replace('_', ' ')}: IoU [%] (data vs data)"
-        collected[title] = Cell.of(iou, error, ".1f", 100.0, more)
-    auc, error, chance = (
-        number(scores, "two_sample", method, key) for key in ("auc", "auc_std", "null_mean")
-    )
-    judged = judged_parameters(scores)
-    for name in (name for name in MAIN if name in judged):
-        shift, spread = (number(judged[name], key, method) for key in ("shift", "shift_std"))
-        unit = LABELLED[name].unit
-        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
-        of_legend[title] = Cell.of(shift, spread, "+.2g", 0.0)
-    edge = number(scores, "paired", method, "edge_rmse")
-    difference, std = (
-        number(survival, key, method) for key in ("difference", "difference_std")
-    )
-    return collected | {
-        "classifier: AUC": Cell.of(auc, error, ".3f", chance or 0.0),
-        "edge RMSE [10⁻³]": Cell.of(None if edge is None else 1e3 * edge, None, "#.3g", 0.0),
-        **of_legend,
-        "A/E survival minus data [points]": Cell.of(difference, std, "+.2f", 0.0),
+    """Scores that a method has at a peak, by name."""
+    scores, cells = metrics.peaks.get(peak, PeakScores()), {}
+    for name, compared in scores.parameters.items():
+        if (iou := compared.iou.get(method)) is not None:
+            error, ceiling = compared.iou_std.get(method), compared.iou.get("ceiling")
+            text = with_std(iou, error) + ("" if ceiling is None else f" ({ceiling:.1f})")
+            title = f"{name.replace('_', ' ')}: IoU [%] (data vs data)"
+            cells[title] = Cell(iou, error, text, 100 - iou)
+    if isinstance(tested := scores.two_sample.get(method), TwoSample):
+        text, off = with_std(tested.auc, tested.auc_std), abs(tested.auc - tested.null_mean)
+        cells["classifier: AUC"] = Cell(tested.auc, tested.auc_std, text, off)
+    if method in scores.paired and (edge := scores.paired[method].edge_rmse) is not None:
+        cells["edge RMSE [10⁻³]"] = Cell(1e3 * edge, None, f"{1e3 * edge:#.3g}", edge)
+    differences = {
+        f"{QUANTITIES[name]} minus data [{LABELLED[name].unit}]".removesuffix(" []"): (
+            scores.judged[name].shift.get(method),
+            scores.judged[name].shift_std.get(method),
+        )
+        for name in MAIN
+        if name in scores.judged
     }
+    if (row := metrics.survival.get(peak)) is not None:
+        title = "A/E survival minus data [points]"
+        differences[title] = row.difference.get(method), row.difference_std.get(method)
+    for title, (difference, std) in differences.items():
+        if difference is not None:
+            cells[title] = Cell(difference, std, signed(difference, std), abs(difference))
+    return cells
 
 
 def _pulses(metrics: Metrics) -> dict[str, Any]:
     """What distinguishes the pulses of a validation from those of another."""
-    peaks, rejections = part(metrics, "peaks"), part(metrics, "rejections")
-    collected: dict[str, Any] = {"detectors": part(metrics, "compared").get("detector")}
-    collected["peaks"] = peaks.keys()
-    for side, called in (("data", "measured"), ("sim", "simulated")):
-        numbers = {peak: part(peaks, peak).get(f"n_{side}") for peak in peaks}
-        collected[f"numbers of {called} pulses"] = numbers
-        collected[f"rejections of {called} pulses"] = rejections.get(side)
-    return collected
+    peaks, rejections = metrics.peaks, metrics.rejections
+    return {
+        "detectors": metrics.compared.get("detector"),
+        "peaks": peaks.keys(),
+        "numbers of measured pulses": {peak: of.n_data for peak, of in peaks.items()},
+        "rejections of measured pulses": rejections.get("data"),
+        "numbers of simulated pulses": {peak: of.n_sim for peak, of in peaks.items()},
+        "rejections of simulated pulses": rejections.get("sim"),
+    }
 
 
 def _union(names: Iterable[Iterable[str]]) -> list[str]:
@@ -421,11 +357,9 @@ def _names(reports: Sequence[Path]) -> list[str]:
     parts = [(path.parent if path.is_file() else path).parts for path in given]
     while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
         parts = [part[:-1] for part in parts]
-    longest = max(map(len, parts), default=1)
-    names: list[str] = []
-    for depth in range(1, longest + 1):
+    for depth in range(1, max(map(len, parts), default=1) + 1):
         names = [str(Path(*part[-depth:])) for part in parts]
         if len(set(names)) == len(names):
             return names
     # names that are still equal refer to the same report
-    return [f"{Path(name).name} ({i})" for i, name in enumerate(names, start=1)]
+    return [f"{part[-1]} ({i})" for i, part in enumerate(parts, start=1)]

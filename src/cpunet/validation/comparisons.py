@@ -1,30 +1,31 @@
-"""Overlap and distances of two distributions of a parameter, and their values by chance.
+"""Overlap and distance of two distributions of a parameter, and their values by chance.
 
 The intersection over union (IoU) of two finite samples of the *same* distribution is
 less than 100 %.  Each score therefore comes with its ceiling: the IoU of the measured
 data with itself, resampled at the sizes of both datasets.
 
-The Wasserstein-1 (W1) and Kolmogorov–Smirnov (KS) distances of two finite samples of the
-*same* distribution are not zero.  Each therefore comes with its null: the distance of two
-samples drawn from the data themselves.
+The Wasserstein-1 distance (W1) of two finite samples of the *same* distribution is not zero.
+It therefore comes with its null: the distance of two samples drawn from the data themselves.
 
 Distances between the datasets are exact.  Those of their bootstraps are computed together
 on a common grid, the quantiles of the pooled values, with each of the outermost values in
 a bin of its own.  The events of a bin are placed at its mean.  With 256 bins and thousands of
-events, W1 is accurate to a twentieth of its null and KS to 0.004.  Datasets with fewer values
-than bins are treated exactly.
+events, W1 is accurate to a twentieth of its null.  Datasets with fewer values than bins are
+treated exactly.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import NamedTuple, Self, TypedDict
+from typing import Annotated, Any, NamedTuple, Self
 
 import hist
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes.schema import ScoreConfig
@@ -32,9 +33,7 @@ from cpunet.recipes.schema import ScoreConfig
 Values = npt.NDArray[np.float64]
 
 NODES = 256  # bins for bootstrapped errors; a finer grid gives the same spread
-# The mean of a null is compared with exact values, and on a grid the KS distance is too
-# small: by about 4 % with 256 bins, by 1 % with this number.
-NULL_NODES = 4096
+NULL_NODES = 4096  # and for a null, whose mean is compared with exact values
 Counts = npt.NDArray[np.float32]
 Bins = npt.NDArray[np.integer]
 Draws = tuple["Resampled", "Resampled"]  # of the two datasets that are compared
@@ -45,6 +44,77 @@ TEST_BINS, EXPECTED = 16, 15
 # Above this number of events, bin counts are drawn directly, in a time independent of the
 # number of events; below it, sums over drawn events are up to ten times faster.
 MAX_EVENTS = 16_384
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+Number = Annotated[float | None, BeforeValidator(_number)]  # None if it does not exist
+ByMethod = Mapping[str, Number]
+
+
+class Result(BaseModel):
+    """What ``metrics.json`` has; a field that is not set is not written."""
+
+    model_config = ConfigDict(
+        validate_assignment=True, validate_by_name=True, validate_by_alias=True
+    )
+
+
+class Missing(Result):
+    """Reason why something is not scored."""
+
+    missing: str
+
+
+class Binning(Result):
+    """Range and number of bins, None if the data have no finite value."""
+
+    low: Number = None
+    high: Number = None
+    bins: int | None = None
+
+
+class Compared(Result):
+    """Comparison of one parameter of the data with that of every method.
+
+    Attributes
+    ----------
+    iou, iou_std
+        IoU and its error in percent, by method and for the ``ceiling``.  The ceiling is
+        computed for the largest of the simulated datasets.
+    wasserstein, wasserstein_std
+        W1 of the finite values and its spread over bootstraps of both datasets, by method, in
+        the parameter's unit.
+    wasserstein_null, wasserstein_null_std
+        Mean and spread of W1 of two samples of the data's own distribution, at the sizes of
+        the data and of the largest of the simulated datasets.
+    mean, shift, shift_std
+        Mean of the data within the bins; that of a method minus that of the data, and its
+        error.
+    chi_square, degrees, p
+        By method, see `two_sample_test`.
+    missing
+        Number of NaN values, by method and for the ``data``.
+    axis
+        Binning.
+    """
+
+    iou: ByMethod = Field(default_factory=dict)
+    iou_std: ByMethod = Field(default_factory=dict)
+    wasserstein: ByMethod = Field(default_factory=dict)
+    wasserstein_std: ByMethod = Field(default_factory=dict)
+    wasserstein_null: Number = None
+    wasserstein_null_std: Number = None
+    mean: Number = None
+    shift: ByMethod = Field(default_factory=dict)
+    shift_std: ByMethod = Field(default_factory=dict)
+    chi_square: ByMethod = Field(default_factory=dict)
+    degrees: dict[str, int] = Field(default_factory=dict)
+    p: ByMethod = Field(default_factory=dict)
+    missing: dict[str, int] = Field(default_factory=dict)
+    axis: Binning = Binning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,15 +233,6 @@ def resampled_quantiles(
     return np.asarray(lower + (rank - below) * (upper - lower))
 
 
-class NullDistances(NamedTuple):
-    """Distances of two samples of one distribution: mean and standard deviation."""
-
-    wasserstein: float
-    wasserstein_std: float
-    ks: float
-    ks_std: float
-
-
 def wasserstein(a: Values, b: Values) -> float:
     r"""Wasserstein-1 distance of the finite values, in the unit of the parameter.
 
@@ -204,78 +265,36 @@ def wasserstein(a: Values, b: Values) -> float:
     return float(wasserstein_distance(a, b)) if a.size and b.size else float("nan")
 
 
-def kolmogorov_smirnov(a: Values, b: Values) -> float:
-    r"""Kolmogorov–Smirnov distance of the finite values, 0 … 1.
+def wasserstein_error(a: Values, b: Values, draws: Draws) -> float:
+    """Standard deviation of W1, in the parameter's unit, under resampling of both datasets.
 
-    .. math:: D = \max_x |F_a(x) - F_b(x)|
-
-    with the cumulative distributions :math:`F`.
-
-    Parameters
-    ----------
-    a, b
-        Values of one parameter in both datasets.
-
-    Returns
-    -------
-    float
-        Distance; NaN if a dataset has no finite values.
-
-    Examples
-    --------
-    Half of the first values are below all of the second:
-
-    >>> import numpy as np
-    >>> kolmogorov_smirnov(np.arange(4.0), np.arange(4.0) + 2)
-    0.5
-    """
-    a, b = np.sort(_finite(a)), np.sort(_finite(b))
-    if not (a.size and b.size):
-        return float("nan")
-    steps = np.concatenate([a, b])
-    below = [np.searchsorted(one, steps, side="right") / one.size for one in (a, b)]
-    return float(np.abs(below[0] - below[1]).max())
-
-
-def distance_errors(a: Values, b: Values, draws: Draws) -> tuple[float, float]:
-    """Standard deviations of W1 and KS under resampling of both datasets.
-
-    Well above the null they agree with the scatter of independent samples within a tenth.
-    Near the null they are a fifth too large, since a bootstrap adds its own scatter; there
-    `null_distances` gives the scale.
+    Well above the null it agrees with the scatter of independent samples within a tenth.
+    Near the null it is a fifth too large, since a bootstrap adds its own scatter; there
+    `null_wasserstein` gives the scale.
 
     Parameters
     ----------
     a, b
-        Values of both datasets; non-finite ones are resampled but ignored.
+        Values of both datasets; non-finite ones are resampled but ignored.  Without finite
+        ones of both there is no error: NaN.
     draws
         Bootstraps of both, each of its own size.
-
-    Returns
-    -------
-    tuple of float
-        Errors of W1 (in the parameter's unit) and of the KS distance; NaN if a dataset has
-        no finite values.
     """
-    finite = np.concatenate([_finite(a), _finite(b)])
     if not (np.isfinite(a).any() and np.isfinite(b).any()):
-        return float("nan"), float("nan")
-    upper, positions = _grid(finite, NODES)
-    drawn = [d.counts(_bins(v, upper), len(upper)) for v, d in zip((a, b), draws, strict=True)]
-    w1, ks = _distances(drawn[0], drawn[1], positions)
-    return float(w1.std()), float(ks.std())
+        return float("nan")
+    grid = _grid(_finite(np.concatenate([a, b])), NODES)
+    return float(_distances((a, b), draws, *grid).std())
 
 
-def null_distances(data: Values, draws: Draws) -> NullDistances:
-    r"""W1 and KS of the data with themselves: the distances of a perfect translation.
+def null_wasserstein(data: Values, draws: Draws) -> tuple[float, float]:
+    r"""W1 of the data with themselves: the distance of a perfect translation, and its spread.
 
-    .. math:: \langle d(D^*_{\mathrm{sim}}, D^*_{\mathrm{data}}) \rangle, \qquad
-        d = W_1 \text{ or } D
+    .. math:: \langle W_1(D^*_{\mathrm{sim}}, D^*_{\mathrm{data}}) \rangle
 
     In each draw, two samples :math:`D^*` are drawn from the data with replacement, one of
-    the size of the simulated dataset and one of the size of the measured one.  Both
-    distances scatter with an upward tail: 4 … 7 % of the draws are more than two standard
-    deviations above the mean.
+    the size of the simulated dataset and one of the size of the measured one.  The distance
+    scatters with an upward tail: 4 … 7 % of the draws are more than two standard deviations
+    above the mean.
 
     Parameters
     ----------
@@ -286,7 +305,7 @@ def null_distances(data: Values, draws: Draws) -> NullDistances:
 
     Returns
     -------
-    NullDistances
+    tuple of float
         NaN if the data have no finite values or a dataset is empty.
 
     Examples
@@ -295,17 +314,14 @@ def null_distances(data: Values, draws: Draws) -> NullDistances:
 
     >>> import numpy as np
     >>> draws = resampled_twice(50, n_sim=50, n_data=20, draws=8, seed=1)
-    >>> null_distances(np.ones(50), draws).wasserstein
-    0.0
+    >>> null_wasserstein(np.ones(50), draws)
+    (0.0, 0.0)
     """
     finite = _finite(data)
     if not (finite.size and all(d.size for d in draws)):
-        return NullDistances(*[float("nan")] * 4)
-    upper, positions = _grid(finite, NULL_NODES)
-    bins = _bins(data, upper)
-    sim, measured = (d.counts(bins, len(upper)) for d in draws)
-    w1, ks = _distances(sim, measured, positions)
-    return NullDistances(*(float(x) for x in (w1.mean(), w1.std(), ks.mean(), ks.std())))
+        return float("nan"), float("nan")
+    w1 = _distances((data, data), draws, *_grid(finite, NULL_NODES))
+    return float(w1.mean()), float(w1.std())
 
 
 def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
@@ -326,63 +342,28 @@ def _grid(pooled: Values, nodes: int) -> tuple[Values, Values]:
     return upper, np.add.reduceat(pooled, starts) / np.diff(np.r_[starts, n])
 
 
-def _bins(values: Values, upper: Values) -> npt.NDArray[np.intp]:
-    """Bin of each value; non-finite values get the number after the last bin."""
-    return np.where(np.isfinite(values), np.searchsorted(upper, values), len(upper))
-
-
 def _distances(
-    a: npt.NDArray[np.float32], b: npt.NDArray[np.float32], positions: Values
-) -> tuple[Values, Values]:
-    """W1 and KS of histograms along the first axis, with their events at `positions`.
+    values: tuple[Values, Values], draws: Draws, upper: Values, positions: Values
+) -> Values:
+    """W1 of each pair of draws, whose events are counted up to `upper`, at `positions`.
 
-    Draws in which a histogram is empty are left out.
+    Non-finite values are beyond the last bin; draws without others are left out.
     """
-    # float32 represents whole numbers and their sums exactly below 2^24
-    below = [np.cumsum(h, axis=0) for h in (a, b)]
+    below = []
+    for of_set, resampled in zip(values, draws, strict=True):
+        bins = np.where(np.isfinite(of_set), np.searchsorted(upper, of_set), len(upper))
+        # float32 represents whole numbers and their sums exactly below 2^24
+        below.append(np.cumsum(resampled.counts(bins, len(upper)), axis=0))
     drawn = (below[0][-1] > 0) & (below[1][-1] > 0)
     if not drawn.any():
-        return np.full(1, np.nan), np.full(1, np.nan)
-    one, other = (c[:, drawn] / c[-1, drawn].astype(float) for c in below)
-    heights = np.abs(np.subtract(one, other, out=one), out=one)
-    return np.diff(positions) @ heights[:-1], heights.max(axis=0)
+        return np.full(1, np.nan)
+    first, second = (c[:-1, drawn] / c[-1, drawn].astype(float) for c in below)
+    heights = np.abs(np.subtract(first, second, out=first), out=first)
+    return np.asarray(np.diff(positions) @ heights)
 
 
 def _finite(values: Values) -> Values:
     return values[np.isfinite(values)]
-
-
-ByMethod = dict[str, float]
-
-
-@dataclass(frozen=True)
-class Missing:
-    """Reason why something is not scored."""
-
-    missing: str
-
-
-class Compared(TypedDict):
-    """Result of `compare` for one parameter."""
-
-    iou: ByMethod
-    iou_std: ByMethod
-    wasserstein: ByMethod
-    wasserstein_std: ByMethod
-    wasserstein_null: float
-    wasserstein_null_std: float
-    ks: ByMethod
-    ks_std: ByMethod
-    ks_null: float
-    ks_null_std: float
-    mean: float
-    shift: ByMethod
-    shift_std: ByMethod
-    chi_square: ByMethod
-    degrees: dict[str, int]
-    p: ByMethod
-    missing: dict[str, int]
-    axis: dict[str, float | None]
 
 
 def histogram(values: Values, axis: hist.axis.Regular) -> Values:
@@ -600,30 +581,6 @@ def compare(
     moved
         Values by method and parameter at both ends of each axis of the errors of its fit,
         see `two_sample_test`.
-
-    Returns
-    -------
-    dict
-        For each parameter, NaN where a number does not exist:
-
-        ``iou``, ``iou_std``
-            IoU and its error in percent, by method and for the ``ceiling``.  The ceiling
-            is computed for the largest of the simulated datasets.
-        ``wasserstein``, ``ks``, ``wasserstein_std``, ``ks_std``
-            distances of the finite values and their errors, by method; in the parameter's
-            unit, and 0 … 1.  The errors are spreads over bootstraps of both datasets.
-        ``wasserstein_null``, ``ks_null``, ``wasserstein_null_std``, ``ks_null_std``
-            mean and spread of the distances of two samples of the data's own distribution,
-            at the sizes of the data and of the largest of the simulated datasets.
-        ``mean``, ``shift``, ``shift_std``
-            mean of the data within the bins; that of a method minus that of the data, and its
-            error.
-        ``chi_square``, ``degrees``, ``p``
-            by method, see `two_sample_test`.
-        ``missing``
-            number of NaN values, by method and for the ``data``.
-        ``axis``
-            ``low``, ``high`` and ``bins`` of the binning.
     """
     # all parameters and methods share the same draws of data events
     rng, n_data = np.random.default_rng(seed), len(next(iter(data.values())))
@@ -632,53 +589,41 @@ def compare(
     null = resampled_twice(n_data, n_sim, n_data, scores.bootstraps, rng)
     present = {name: values for name, values in data.items() if np.isfinite(values).any()}
     axes = {name: data_axis(values, scores.max_bins) for name, values in present.items()}
-    results = {name: _of_data(values, null, axes.get(name)) for name, values in data.items()}
+    results: dict[str, dict[str, Any]] = {}
+    for name, values in data.items():
+        axis, (w1, spread) = axes.get(name), null_wasserstein(values, null)
+        score, std = (np.nan, np.nan) if axis is None else ceiling(values, axis, null)
+        results[name] = {
+            "iou": {"ceiling": score},
+            "iou_std": {"ceiling": std},
+            "wasserstein_null": w1,
+            "wasserstein_null_std": spread,
+            "missing": {"data": int(np.isnan(values).sum())},
+        }
+        if axis is not None:
+            low, high = axis.edges[[0, -1]].tolist()
+            results[name]["mean"] = _finite(values).clip(low, high).mean()
+            results[name]["axis"] = Binning(low=low, high=high, bins=axis.size)
     own = null[1]
     del null
-    for method, values in methods.items():
+    for method, by_name in methods.items():
         draws = (own, Resampled.of(sizes[method], sizes[method], scores.bootstraps, rng))
-        for name, one in results.items():
-            both = data[name], values[name]
-            one["wasserstein"][method] = wasserstein(*both)
-            one["ks"][method] = kolmogorov_smirnov(*both)
-            errors = distance_errors(*both, draws)
-            one["wasserstein_std"][method], one["ks_std"][method] = errors
-            one["missing"][method] = int(np.isnan(values[name]).sum())
-            axis = axes.get(name)
-            one["iou"][method] = np.nan if axis is None else iou(*both, axis)
-            one["iou_std"][method] = np.nan if axis is None else iou_error(*both, axis, draws)
+        for name, result in results.items():
+            both, axis = (data[name], by_name[name]), axes.get(name)
             ends = moved.get(method, {}).get(name)
-            one["shift"][method], one["shift_std"][method] = shift(*both, ends)
-            tested = two_sample_test(*both, ends)
-            one["chi_square"][method], one["degrees"][method], one["p"][method] = tested
-    return results
-
-
-def _of_data(data: Values, null: Draws, axis: hist.axis.Regular | None) -> Compared:
-    """Ceiling and nulls from the data alone, before any method is added."""
-    distances = null_distances(data, null)
-    mean, std = (np.nan, np.nan) if axis is None else ceiling(data, axis, null)
-    low, high = (None, None) if axis is None else axis.edges[[0, -1]].tolist()
-    return Compared(
-        iou={"ceiling": mean},
-        iou_std={"ceiling": std},
-        wasserstein={},
-        wasserstein_std={},
-        wasserstein_null=distances.wasserstein,
-        wasserstein_null_std=distances.wasserstein_std,
-        ks={},
-        ks_std={},
-        ks_null=distances.ks,
-        ks_null_std=distances.ks_std,
-        mean=np.nan if axis is None else float(_finite(data).clip(*axis.edges[[0, -1]]).mean()),
-        shift={},
-        shift_std={},
-        chi_square={},
-        degrees={},
-        p={},
-        missing={"data": int(np.isnan(data).sum())},
-        axis={"low": low, "high": high, "bins": None if axis is None else axis.size},
-    )
+            tested, (difference, error) = two_sample_test(*both, ends), shift(*both, ends)
+            of_method = tested._asdict() | {
+                "wasserstein": wasserstein(*both),
+                "wasserstein_std": wasserstein_error(*both, draws),
+                "missing": int(np.isnan(by_name[name]).sum()),
+                "iou": np.nan if axis is None else iou(*both, axis),
+                "iou_std": np.nan if axis is None else iou_error(*both, axis, draws),
+                "shift": difference,
+                "shift_std": error,
+            }
+            for key, value in of_method.items():
+                result.setdefault(key, {})[method] = value
+    return {name: Compared(**result) for name, result in results.items()}
 
 
 def _overlap(a: npt.NDArray[np.floating], b: npt.NDArray[np.floating]) -> Values:

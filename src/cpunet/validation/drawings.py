@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,11 +13,10 @@ from cpunet.pulses.parameters import PARAMETERS, Values
 from cpunet.pulses.shape_parameters import A_OVER_E, data_axis
 from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
-from cpunet.validation.ae_energy import ae_energy_figure
 from cpunet.validation.evaluation import Evaluation
-from cpunet.validation.noise import spectrum_of_noise
 from cpunet.validation.peaks import MeanPulse, PeakSets, around_half
 from cpunet.validation.run_figures import (
+    ae_energy_figure,
     cycle_figure,
     further_histograms,
     loss_curves,
@@ -27,34 +25,32 @@ from cpunet.validation.run_figures import (
     parameter_histograms,
     roc_figure,
     shape_figure,
+    spectrum_of_noise,
 )
-from cpunet.validation.verdicts import held_out, judged_parameters
 
-# methods in the figures; a reader may hide some
-DRAWN = ("data", "raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth")
 SINGLE = ("raw", "rc", "rc_late", "ren", "truth")  # methods in the figure of a single pulse
 SLICED = ("data", "rc", "rc_late", "ren")  # and in slices
 MAIN_FIGURES = (A_OVER_E, "rise_time", "lq")  # further parameters with a figure of their own
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
 
 Drawing = Callable[[], Figure]
-T = TypeVar("T")
 
 
 def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
-    if peaks := held_out(evaluated.metrics):
-        drawn["overlap with data"] = partial(overlap_figure, evaluated.metrics, peaks)
-    if evaluated.ae_energy.methods:
-        drawn["A over E and energy"] = partial(ae_energy_figure, evaluated.ae_energy.methods)
+    metrics = evaluated.metrics
+    if peaks := metrics.held_out:
+        drawn["overlap with data"] = partial(overlap_figure, metrics, peaks)
+    if courses := metrics.ae_energy.methods:
+        drawn["A over E and energy"] = partial(ae_energy_figure, courses)
     for peak in evaluated.sets:
         if peak.name in evaluated.values:
             of_peak = _of_peak(peak, evaluated)
             drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak.items()}
     if DEP in evaluated.values and len(evaluated.values) > 1:
         ae = {
-            name: {m: v["current_amplitude"] for m, v in _shown(of_peak).items()}
+            name: {m: v["current_amplitude"] for m, v in of_peak.items()}
             for name, of_peak in evaluated.values.items()
         }
         drawn["A over E survival"] = partial(roc_figure, ae, DEP)
@@ -80,13 +76,9 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     return drawn
 
 
-def _shown(by_method: Mapping[str, T], methods: Collection[str] = DRAWN) -> dict[str, T]:
-    return {method: one for method, one in by_method.items() if method in methods}
-
-
 def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
     name, dt_ns, bins = peak.name, evaluated.run.dt_ns, evaluated.run.recipe.scores.max_bins
-    scores, values = evaluated.metrics["peaks"][name], _shown(evaluated.values[name])
+    scores, values = evaluated.metrics.peaks[name], evaluated.values[name]
     drawn: dict[str, Drawing] = {}
     further: dict[str, dict[str, Values]] = {}
     for parameter, data in values["data"].items():
@@ -94,29 +86,27 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
         if not np.isfinite(data).any():
             continue
         if parameter in (*PARAMETERS, *MAIN_FIGURES):
-            axis, compared = data_axis(data, bins), judged_parameters(scores)[parameter]
+            axis, compared = data_axis(data, bins), scores.judged[parameter]
             how = (by_method, axis, parameter, name, compared)
             drawn[parameter.replace("_", " ")] = partial(parameter_histograms, *how)
         else:
             further[parameter] = by_method
     drawn["further parameters"] = partial(further_histograms, further, bins, name)
     slices = evaluated.slices[name]
-    means = {"": {method: of_method.whole for method, of_method in _shown(slices).items()}}
+    means = {"": {method: of_method.whole for method, of_method in slices.items()}}
     title = f"{name}: mean pulse"
     drawn["mean pulse"] = partial(shape_figure, means, dt_ns, title)
     edges = slices["data"].edges
     columns = {
-        f"{low:.0f} … {high:.0f} ns": {
-            m: of_method.pulses[i] for m, of_method in _shown(slices, SLICED).items()
-        }
+        f"{low:.0f} … {high:.0f} ns": {m: slices[m].pulses[i] for m in SLICED if m in slices}
         for i, (low, high) in enumerate(pairwise(edges))
     }
     title = f"{name}: superpulses in slices of rise time 1–90 %"
     drawn["superpulses"] = partial(shape_figure, columns, dt_ns, title)
     if (single := _single_pulse(peak)) is not None:
         drawn["single pulse"] = single
-    if "missing" not in scores["noise"]["data"]:
-        noise = _shown(scores["noise"], ("frequency_mhz", "data", "ren"))
+    if not scores.noise["data"].missing:
+        noise = {m: scores.noise[m] for m in ("data", "ren")}
         drawn["noise"] = partial(spectrum_of_noise, noise, name)
     return drawn
 
@@ -125,8 +115,8 @@ def _single_pulse(peak: PeakSets) -> Drawing | None:
     """The first simulated event with an edge in every method, with a measured pulse."""
     dt_ns = peak.translations.ren.dt_ns
     for row in peak.known_to_all():
-        windows = _shown(peak.translations.without_noise(row), SINGLE)
-        shapes = {m: around_half(w, dt_ns)[0] for m, w in windows.items()}
+        windows = peak.translations.without_noise(row)
+        shapes = {m: around_half(windows[m], dt_ns)[0] for m in SINGLE if m in windows}
         if all(np.isfinite(shape).any() for shape in shapes.values()):
             data = peak.windows("data")
             place, rms = nearest(around_half(data, dt_ns), shapes["ren"])

@@ -8,16 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
-from cpunet.pulses.parameters import tail_slope
+from cpunet.pulses.parameters import Values, tail_slope
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.shape_parameters import median_decay_ns
@@ -28,14 +25,13 @@ from cpunet.validation.a_over_e import (
     DEP,
     Range,
     RangeSurvival,
-    Spread,
     SurvivalRow,
-    dep_scale,
+    dep_scales,
     peak_survival,
     subtracted,
     survival_table,
 )
-from cpunet.validation.ae_energy import AgainstEnergy, against_energy
+from cpunet.validation.ae_energy import against_energy
 from cpunet.validation.comparisons import Missing
 from cpunet.validation.methods import (
     Translations,
@@ -43,18 +39,16 @@ from cpunet.validation.methods import (
     translate_all,
     true_responses,
 )
+from cpunet.validation.metrics import Metrics, PeakScores
 from cpunet.validation.peaks import (
     ByMethod,
-    PeakScores,
     PeakSets,
     Slices,
-    aligned_means,
     fit_ends,
     moved_values,
     score_peak,
+    sliced,
 )
-from cpunet.validation.report import as_stored
-from cpunet.validation.verdicts import summary, verdict_table
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 
@@ -70,18 +64,15 @@ class Evaluation:
     sets, values, slices
         Pulses, and parameters and mean pulses by method, each by peak.  The latter two exist
         only for scored peaks.
-    ae_energy
-        A/E against energy.
     metrics
-        Content of ``metrics.json``.
+        All numbers.
     """
 
     run: Run
     sets: list[PeakSets]
     values: Mapping[str, ByMethod]
     slices: Mapping[str, Mapping[str, Slices]]
-    ae_energy: AgainstEnergy
-    metrics: dict[str, Any]
+    metrics: Metrics
 
 
 @one_thread_for_matrices()
@@ -109,7 +100,8 @@ def evaluate(
     names = list(dict.fromkeys([*recipe.peaks, trained_on, *others]))
     # energies of the peaks, with all sidebands and continua
     selection = parse_selection(",".join(names), recipe.peaks)
-    more = [band for _, bands in _lines(recipe).values() for band in bands]
+    lines = _lines(recipe)
+    more = [band for _, sidebands in lines.values() for band in sidebands]
     more += recipe.scores.continuum_kev.values()
     selection = replace(selection, ranges_kev=(*selection.ranges_kev, *more))
     sim_set = load_pulses(sim, "simulated", recipe, selection, max_pulses=max_pulses)
@@ -127,116 +119,99 @@ def evaluate(
     )
     translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
     sets = [PeakSets.of(n, parse_selection(n, recipe.peaks), translations) for n in names]
+    dep = next((peak.rows for peak in sets if peak.name == DEP), {})
+    amplitudes, energy_kev = translations.amplitudes, translations.energy_kev
+    scales = dep_scales({m: amplitudes[m][rows] for m, rows in dep.items()}, seed)
+    samples = recipe.preparation.at(ren.dt_ns).decay_fit_samples
+    decays = {  # as an analysis has one for a channel
+        method: median_decay_ns(tail_slope(windows, ren.dt_ns, samples))
+        for method, windows in translations.windows.items()
+    }
+    ends = fit_ends(run, ren)
+    score = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
+
+    def scored(peak: PeakSets) -> tuple[dict[str, Values], ByMethod, PeakScores]:
+        moved = moved_values(peak, ends, seed)
+        return moved, *score(peak, moved)
+
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
     slices: dict[str, dict[str, Slices]] = {}
-    ends = fit_ends(run, ren)
+    moved_amplitudes: dict[str, Values] = {}
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        scales = _dep_scales(sets, seed)
-        samples = recipe.preparation.at(ren.dt_ns).decay_fit_samples
-        decays = {  # as an analysis has one for a channel
-            method: median_decay_ns(tail_slope(windows, ren.dt_ns, samples))
-            for method, windows in translations.windows.items()
-        }
-        ended = pool.map(partial(moved_values, ends=ends, seed=seed), sets)
-        moved = {peak.name: values for peak, values in zip(sets, ended, strict=True)}
-        work = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
-        scored = pool.map(work, sets, moved.values())
-        for peak, (by_method, peaks[peak.name]) in zip(sets, scored, strict=True):
+        for peak, (moved, by_method, scores) in zip(sets, pool.map(scored, sets), strict=True):
+            peaks[peak.name] = scores
+            if moved:
+                moved_amplitudes[peak.name] = moved["current_amplitude"]
             if by_method:
                 values[peak.name] = by_method
                 rise = {method: v["rise_01_90"] for method, v in by_method.items()}
-                slices[peak.name] = aligned_means(peak.windows, rise, run.dt_ns)
+                slices[peak.name] = sliced(peak.windows, rise, run.dt_ns)
             bar.update(1)
     if not values:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    survivals = survival_table(
+    survivals, ranges = _survivals(
         {
             name: {method: v["current_amplitude"] for method, v in of_peak.items()}
             for name, of_peak in values.items()
         },
-        {name: of_peak["current_amplitude"] for name, of_peak in moved.items() if of_peak},
-        seed=seed,
+        moved_amplitudes,
+        translations,
+        lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
+        seed,
     )
-    ranges = _range_survivals(translations, survivals, recipe)
-    if not isinstance(survivals, Missing) and not isinstance(ranges, Missing):
-        survivals = subtracted(survivals, ranges)
     tails = None if run.fit is None else run.fit.tails
-    ae_energy = against_energy(
-        {method: translations.amplitudes[method] for method in ("data", "ren")},
-        translations.energy_kev,
-        {name: span for name, (span, _) in _lines(recipe).items()},
-    )
-    metrics = {
-        "compared": _compared(run, sim_set, data_set),
-        "peaks": peaks,
-        "ae_survival": survivals,
-        "ae_details": {"survival by energy range": ranges},
-        "ae_energy": ae_energy,
-        "a_over_e_scale": {method: list(spread) for method, spread in scales.items()},
-        "baseline_methods": {
-            "fits": {
-                name: method.describe() for name, method in baseline_methods.methods.items()
-            },
+    metrics = Metrics(
+        compared=_compared(run, sim_set, data_set),
+        peaks=peaks,
+        ae_survival=survivals,
+        ae_details={"survival by energy range": ranges},
+        ae_energy=against_energy(
+            {method: amplitudes[method] for method in ("data", "ren")},
+            energy_kev,
+            {name: span for name, (span, _) in lines.items()},
+        ),
+        a_over_e_scale=scales,
+        baseline_methods={
+            "fits": {name: of.describe() for name, of in baseline_methods.methods.items()},
             "missing": baseline_methods.missing,
         },
-        "training": {"recipe": recipe.name}
+        training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
-        "tails": None if tails is None else tails.model_dump(exclude_unset=True),
-        "rejections": {
+        tails=None if tails is None else tails.model_dump(exclude_unset=True),
+        rejections={
             "sim": sim_set.prepared.rejections,
             "data": data_set.prepared.rejections,
         },
-    }
-    stored = as_stored(metrics)
-    stored["verdicts"] = {
-        "summary": [summary(stored, name, "ren") for name in values],
-        "table": verdict_table(stored),
-    }
-    return Evaluation(run, sets, values, slices, ae_energy, stored)
+    )
+    return Evaluation(run, sets, values, slices, metrics)
 
 
-def _dep_scales(sets: list[PeakSets], seed: int) -> dict[str, Spread]:
-    """Position of the single-site peak of A/E in the DEP, and its error, by method."""
-    dep = next((peak for peak in sets if peak.name == DEP), None)
-    if dep is None:
-        return {}
-    scales = {
-        method: dep_scale(dep.translations.amplitudes[method][rows], seed)
-        for method, rows in dep.rows.items()
-    }
-    return scales if np.isfinite(list(scales.values())).all() else {}
-
-
-def _range_survivals(
+def _survivals(
+    ae: Mapping[str, Mapping[str, Values]],
+    moved: Mapping[str, Values],
     translations: Translations,
-    ae_survival: dict[str, SurvivalRow] | Missing,
-    recipe: Recipe,
-) -> dict[str, dict[str, RangeSurvival]] | Missing:
-    """A/E survival of gamma lines, sideband-subtracted, and of continua, after given cuts."""
-    if isinstance(ae_survival, Missing):
-        return Missing(f"there is no A/E cut: {ae_survival.missing}")
-    cuts, errors = ae_survival[DEP].cut or {}, ae_survival[DEP].cut_std or {}  # of each method
-    ranges = {name: line for name, line in _lines(recipe).items() if name != DEP}
-    ranges |= {name: (span, []) for name, span in recipe.scores.continuum_kev.items()}
-    return {
+    bands: Mapping[str, tuple[Range, list[Range]]],
+    seed: int,
+) -> tuple[dict[str, SurvivalRow] | Missing, dict[str, dict[str, RangeSurvival]] | Missing]:
+    """A/E survival of peaks, and of bands of energy with their sidebands subtracted."""
+    table = survival_table(ae, moved, seed=seed)
+    if isinstance(table, Missing):
+        return table, Missing(missing=f"there is no A/E cut: {table.missing}")
+    cuts, errors = table[DEP].cut, table[DEP].cut_std
+    values, kev = translations.amplitudes, translations.energy_kev
+    ranges = {
         name: {
-            method: peak_survival(
-                values,
-                translations.energy_kev[method],
-                cuts[method],
-                span,
-                sidebands,
-                errors[method],
-            )
-            for method, values in translations.amplitudes.items()
-            if method in cuts
+            m: peak_survival(values[m], kev[m], cut, span, sidebands, errors[m])
+            for m, cut in cuts.items()
         }
-        for name, (span, sidebands) in ranges.items()
+        for name, (span, sidebands) in bands.items()
+        if name != DEP
     }
+    return subtracted(table, ranges), ranges
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
@@ -268,10 +243,11 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
         f"{run.sim.used} simulated and {run.data.used} measured pulses",
         run.started[:10],
     )
+    legend = re.match(r"l\d+-(p\d\d)-(r\d{3})-", data.path.name)
     facts = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
-        "period": period_of(data.path),
+        "period": legend and f"{legend[1]} {legend[2]}",
     }
     compared = {name: str(value) for name, value in facts.items() if value is not None}
     compared |= {
@@ -286,15 +262,3 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
     if run.fit is not None and run.fit.verdict:
         compared["fit"] = run.fit.verdict
     return compared | {"scored with": f"cpunet {cpunet.__version__}"}
-
-
-def period_of(path: Path) -> str | None:
-    """Period and run in a file name of LEGEND; None for other names.
-
-    Examples
-    --------
-    >>> period_of(Path("l200-p03-r001-cal-20230318T012144Z-tier_raw.lh5"))
-    'p03 r001'
-    """
-    match = re.match(r"l\d+-(p\d\d)-(r\d{3})-", path.name)
-    return None if match is None else f"{match[1]} {match[2]}"

@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,7 @@ import numpy.typing as npt
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
-from cpunet.electronics.finishing import finish
+from cpunet.electronics.finishing import Finished, finish
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.electronics.superpulses import BASELINE_METHODS
 from cpunet.errors import CpunetError
@@ -39,6 +38,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.translation.forms import wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
+from cpunet.validation.metrics import PairedScores
 
 log = logging.getLogger(__name__)
 
@@ -76,14 +76,6 @@ def true_responses(path: Path, sim: InputSet) -> FloatArray:
     return used
 
 
-class PairedScores(TypedDict):
-    """RMS differences of pulse pairs in units of the full charge, and pairs left out."""
-
-    rmse: float
-    edge_rmse: float
-    unaligned: int
-
-
 def pair_squares(
     methods: Mapping[str, FloatArray], truth: FloatArray, edge_samples: int
 ) -> dict[str, Values]:
@@ -105,16 +97,13 @@ def pair_squares(
         samples that both records of a pair have, and over the ``2 * edge_samples + 1`` samples
         around the crossing; all 0 where a pulse cannot be aligned.
     """
-    squares = {method: np.zeros((len(truth), 4)) for method in methods}
-    for rows in blocks(len(truth)):
-        half = truth.shape[1]
-        aligned = aligned_block(truth[rows], half, half)
-        edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
-        for method, translated in methods.items():
-            difference = aligned_block(translated[rows], half, half)
-            difference -= aligned
-            squares[method][rows, :2] = _squares(difference)
-            squares[method][rows, 2:] = _squares(difference[:, edge])
+    half, squares = truth.shape[1], {}
+    aligned = aligned_block(truth, half, half)
+    edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
+    for method, translated in methods.items():
+        difference = aligned_block(translated, half, half) - aligned
+        parts = _squares(difference), _squares(difference[:, edge])
+        squares[method] = np.concatenate(parts, axis=1)
     return squares
 
 
@@ -125,13 +114,6 @@ def scores_of_squares(squares: Values) -> PairedScores:
 
     over pulses :math:`p` and samples :math:`k`.
 
-    Returns
-    -------
-    dict
-        ``rmse`` and ``edge_rmse`` in units of the full charge (NaN if no pair is left), and
-        ``unaligned``, the number of pairs left out because one of the two does not cross
-        half of its maximum.
-
     Examples
     --------
     A time shift is no difference of shape:
@@ -140,15 +122,15 @@ def scores_of_squares(squares: Values) -> PairedScores:
     >>> time = np.arange(100)
     >>> early, late = np.array([1 / (1 + np.exp((t0 - time) / 3)) for t0 in (40, 50)])
     >>> squares = pair_squares({"ren": late[None]}, early[None], edge_samples=10)
-    >>> round(scores_of_squares(squares["ren"])["rmse"], 6)
+    >>> round(scores_of_squares(squares["ren"]).rmse, 6)
     0.0
     """
     rmse, edge_rmse = (
-        float(np.sqrt(total / count)) if count else float("nan")
+        np.sqrt(total / count) if count else None
         for total, count in squares.sum(axis=0).reshape(2, 2)
     )
     unaligned = int((squares[:, 1] == 0).sum())
-    return {"rmse": rmse, "edge_rmse": edge_rmse, "unaligned": unaligned}
+    return PairedScores(rmse=rmse, edge_rmse=edge_rmse, unaligned=unaligned)
 
 
 def _squares(difference: Values) -> Values:
@@ -318,23 +300,30 @@ def translate_all(
     generator = np.random.default_rng(seed)
     # all methods get the same noise
     rngs = {name: np.random.default_rng(seed) for name in others}
-    with stage("Translating", len(pulses)) as bar:
+
+    def finished(name: str, rows: slice) -> Finished:
+        method, raw = baselines.methods.get(name), pulses.waveforms[rows]
+        return finish(
+            given[name][rows] if method is None else method.translate(raw),
+            recipe.preparation,
+            dt_ns=pulses.dt_ns,
+            noise=noise,
+            energy_kev=pulses.energy_kev[rows],
+            seed=rngs[name],
+        )
+
+    with (
+        stage("Translating", len(pulses)) as bar,
+        ThreadPoolExecutor(usable_cores()) as pool,
+    ):
         for rows in blocks(len(pulses)):
             block = pulses[rows]
+            done = {name: pool.submit(finished, name, rows) for name in others}
             clean = {"raw": block.waveforms}
-            for name in others:
-                method = baselines.methods.get(name)
-                finished = finish(
-                    given[name][rows] if method is None else method.translate(block.waveforms),
-                    recipe.preparation,
-                    dt_ns=block.dt_ns,
-                    noise=noise,
-                    energy_kev=block.energy_kev,
-                    seed=rngs[name],
-                )
-                clean[name] = finished.clean
+            for name, translated in done.items():
+                clean[name] = translated.result().clean
                 if noise is not None:
-                    noisy[name][rows] = finished.windows
+                    noisy[name][rows] = translated.result().windows
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"][rows] = like_data(ren, block, generator)
             for windows in clean.values():

@@ -12,16 +12,14 @@ well before the start of nine out of ten measured pulses, and the others are lef
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy.special import erfc
-from scipy.stats import norm
+from pydantic import Field
+from scipy.special import erfc, ndtri
 
-from cpunet.plotting import COLOURS, STACKED, group, label, panels, styled
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
+from cpunet.validation.comparisons import Number, Result
 
 MIN_BASELINES = 10  # baselines for a spectrum with an error
 BANDS_PER_OCTAVE = 2
@@ -31,12 +29,45 @@ EARLY_SHARE = 0.1  # of the measured pulses that may begin too early and are lef
 MIN_SAMPLES = 32  # of the stretch
 
 
+class Spectrum(Result):
+    """Noise of one method, and how it differs from that of the data.
+
+    Attributes
+    ----------
+    n, samples
+        Numbers of pulses, and of the samples that are compared of each.
+    frequency_mhz, power, power_std
+        Centre of each band, and the mean square in it, in squared pulse heights.
+    rms, rms_std
+        RMS and its error in pulse heights.
+    rms_ratio, sigma
+        RMS over that of the data, and its difference from that in standard deviations.
+    worst_band_sigma, spectrum_sigma
+        Largest difference of a band, and the same corrected for the number of bands.
+    missing
+        Reason why there is none.
+    """
+
+    n: int | None = None
+    samples: int | None = None
+    frequency_mhz: list[float] = Field(default_factory=list)
+    power: list[float] = Field(default_factory=list)
+    power_std: list[float] = Field(default_factory=list)
+    rms: Number = None
+    rms_std: Number = None
+    rms_ratio: Number = None
+    sigma: Number = None
+    worst_band_sigma: Number = None
+    spectrum_sigma: Number = None
+    missing: str | None = None
+
+
 def baseline_spectra(
     windows: Mapping[str, FloatArray],
     begins: Mapping[str, Values],
     samples: int,
     dt_ns: float,
-) -> dict[str, Any]:
+) -> dict[str, Spectrum]:
     """Compare the baseline noise of each method with that of the data.
 
     Parameters
@@ -50,23 +81,13 @@ def baseline_spectra(
     dt_ns
         Sampling period in ns.
 
-    Returns
-    -------
-    dict
-        JSON-ready: ``frequency_mhz`` (centre of each band), and by method the number ``n`` of
-        pulses, the ``samples`` compared of each, ``power`` and ``power_std`` (mean square in
-        each band, in squared pulse heights), ``rms`` and ``rms_std``.  For methods other than
-        the data also ``rms_ratio``, its ``sigma`` from 1, ``worst_band_sigma``, and
-        ``spectrum_sigma``, which corrects the latter for the number of bands; or ``missing``
-        with the reason.
-
     Examples
     --------
     >>> rng = np.random.default_rng(1)
     >>> sets = {m: rng.normal(0, s, (400, 64)) for m, s in (("data", 1), ("ren", 1.1))}
     >>> begins = dict.fromkeys(sets, np.full(400, 200.0))
     >>> spectra = baseline_spectra(sets, begins, samples=64, dt_ns=16)
-    >>> round(spectra["ren"]["rms_ratio"], 1), spectra["ren"]["sigma"] > 5
+    >>> round(spectra["ren"].rms_ratio, 1), spectra["ren"].sigma > 5
     (1.1, True)
     """
     free = {method: begins[method] - MARGIN_NS / dt_ns for method in windows}
@@ -75,87 +96,41 @@ def baseline_spectra(
     if samples < MIN_SAMPLES:
         few = f"{max(samples, 0)} samples before measured pulses begin"
         early = f"{few}; {MIN_SAMPLES} are needed"
-        return {"frequency_mhz": []} | {method: {"missing": early} for method in windows}
+        return {method: Spectrum(missing=early) for method in windows}
     # bands of half an octave, from the lowest frequency to the highest
     steps = 2 ** np.arange(0, np.log2(samples // 2 + 1), 1 / BANDS_PER_OCTAVE)
     edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1)).astype(float)
     frequencies = np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.5)) / (samples * dt_ns * 1e-3)
-    by_method: dict[str, Any] = {"frequency_mhz": frequencies.tolist()}
+    spectra = {}
     for method, pulses in windows.items():
         power = _band_powers(pulses[free[method] >= samples, :samples], edges)
         if len(power) < MIN_BASELINES:
-            by_method[method] = {
-                "missing": f"{len(power)} baselines; {MIN_BASELINES} are needed"
-            }
+            missing = f"{len(power)} baselines; {MIN_BASELINES} are needed"
+            spectra[method] = Spectrum(missing=missing)
             continue
-        n, mean, total = len(power), power.mean(axis=0), power.sum(axis=1)
+        n, total = len(power), power.sum(axis=1)
         rms = float(np.sqrt(total.mean()))
-        by_method[method] = {
-            "samples": samples,
-            "n": n,
-            "power": mean.tolist(),
-            "power_std": (power.std(axis=0, ddof=1) / np.sqrt(n)).tolist(),
-            "rms": rms,
-            "rms_std": float(total.std(ddof=1) / np.sqrt(n) / (2 * rms)) if rms else 0.0,
-        }
-    data = by_method["data"]
-    for method in windows:
-        if method != "data" and "missing" not in data | by_method[method]:
-            # deviation of the noise from that of the data; None where it is undefined
-            own = by_method[method]
-            error = np.hypot(own["rms_std"], data["rms_std"])
-            difference = np.subtract(own["power"], data["power"])
-            errors = np.hypot(own["power_std"], data["power_std"])
+        spectra[method] = Spectrum(
+            samples=samples,
+            n=n,
+            frequency_mhz=frequencies.tolist(),
+            power=power.mean(axis=0).tolist(),
+            power_std=(power.std(axis=0, ddof=1) / np.sqrt(n)).tolist(),
+            rms=rms,
+            rms_std=float(total.std(ddof=1) / np.sqrt(n) / (2 * rms)) if rms else 0.0,
+        )
+    data = spectra["data"]
+    for method, own in spectra.items():
+        if method != "data" and not (own.missing or data.missing):
+            difference = np.subtract(own.power, data.power)
+            errors = np.hypot(own.power_std, data.power_std)
             bands = np.abs(difference[errors > 0] / errors[errors > 0])
-            by_method[method] |= {
-                "rms_ratio": own["rms"] / data["rms"] if data["rms"] else None,
-                "sigma": float((own["rms"] - data["rms"]) / error) if error else None,
-                "worst_band_sigma": float(bands.max()) if bands.size else None,
-                "spectrum_sigma": _of_so_many(float(bands.max(initial=0)), bands.size),
-            }
-    return by_method
-
-
-@styled
-def spectrum_of_noise(by_method: Mapping[str, Any], peak: str) -> Figure:
-    """Draw the noise power by band and method, and its ratio to that of the data.
-
-    Parameters
-    ----------
-    found
-        Result of `baseline_spectra`.
-    peak
-        Name of the gamma line, for the title.
-    """
-    methods = [m for m, s in by_method.items() if m != "frequency_mhz" and "missing" not in s]
-    frequency = np.asarray(by_method["frequency_mhz"])
-    figure, ((above,), (below,)) = panels((5.6, 4.4), 2, **STACKED)
-    data = np.asarray(by_method["data"]["power"])
-    for method in methods:
-        power, error = (np.asarray(by_method[method][key]) for key in ("power", "power_std"))
-        look = {"color": COLOURS[method], "marker": "o", "markersize": 3}
-        group(above.errorbar(frequency, power, error, label=label(method), **look), method)
-        if method != "data":
-            # bands without noise in the data have no ratio
-            ratio, spread = (
-                np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
-                for values in (power, error)
-            )
-            group(below.errorbar(frequency, ratio, spread, **look), method)
-    below.axhline(1, color="black", linewidth=0.8)
-    silent = not any(np.any(by_method[method]["power"]) for method in methods)
-    above.set(
-        title=f"{peak}: noise before the pulse",
-        ylabel="Mean square per band\n[pulse height²]",
-        xscale="log",
-        yscale="linear" if silent else "log",
-    )
-    above.legend()
-    for axis in (above.yaxis, below.xaxis):
-        axis.set_major_formatter("{x:g}")  # powers as formulas take long to set
-        axis.set_minor_formatter("")
-    below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
-    return figure
+            error = np.hypot(own.rms_std or 0.0, data.rms_std or 0.0)
+            own.rms_ratio = (own.rms or 0.0) / data.rms if data.rms else None
+            own.sigma = ((own.rms or 0.0) - (data.rms or 0.0)) / error if error else None
+            own.worst_band_sigma = bands.max() if bands.size else None
+            own.spectrum_sigma = _of_so_many(float(bands.max(initial=0)), bands.size)
+    return spectra
 
 
 def _band_powers(baselines: FloatArray, edges: Values) -> Values:
@@ -181,4 +156,4 @@ def _of_so_many(worst: float, n: int) -> float | None:
         return None
     chance = -np.expm1(n * np.log1p(-of_one))
     # beyond 37 standard deviations the probability underflows, and it does not matter
-    return float(norm.isf(chance)) if chance > 0 else worst
+    return float(-ndtri(chance)) if chance > 0 else worst

@@ -27,13 +27,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.processes import usable_cores
@@ -47,8 +48,9 @@ from cpunet.training.closed_forms import error_ends
 from cpunet.training.run import Run
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import REN
-from cpunet.validation.comparisons import Compared, Missing, compare
-from cpunet.validation.methods import PairedScores, Translations, scores_of_squares
+from cpunet.validation.comparisons import Missing, compare
+from cpunet.validation.methods import Translations, scores_of_squares
+from cpunet.validation.metrics import PairedScores, PeakScores
 from cpunet.validation.noise import baseline_spectra
 
 BEFORE_NS, AFTER_NS = 1600.0, 2400.0  # of a mean pulse before and after half maximum
@@ -103,68 +105,42 @@ class Slices:
     edges: Values
 
 
-def slice_edges(rise_time: Values, slices: int = SLICES) -> Values:
-    """Edges of slices with equal numbers of measured pulses.
-
-    Parameters
-    ----------
-    rise_time
-        Rise times of the measured pulses in ns; NaN and infinity are ignored.
-    slices
-        Number of slices; one more edge is returned, in ns.
-
-    Examples
-    --------
-    >>> slice_edges(np.arange(101.0), slices=4)
-    array([  0.,  25.,  50.,  75., 100.])
-    """
-    finite = rise_time[np.isfinite(rise_time)]
-    return np.quantile(finite, np.linspace(0, 1, slices + 1))
-
-
 def around_half(windows: FloatArray, dt_ns: float) -> FloatArray:
     """Pulses from `BEFORE_NS` before their half maximum to `AFTER_NS` after it."""
     before, after = round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns)
     return align_half_maximum(windows, before, after)
 
 
-def aligned_means(
-    windows: Callable[[str], FloatArray], rise_time: Mapping[str, Values], dt_ns: float
+def sliced(
+    windows: Callable[[str], FloatArray],
+    rise_time: Mapping[str, Values],
+    dt_ns: float,
+    slices: int = SLICES,
 ) -> dict[str, Slices]:
-    """Mean pulses of each method, in the same slices for all.
+    """Mean pulses of each method, in the same slices of the rise time for all.
 
     Parameters
     ----------
     windows
         Prepared pulses of a method, shape ``(n, length)``.
     rise_time
-        Their rise times in ns by method, those of the measured pulses under ``"data"``.
+        Their rise times in ns by method.  The edges divide the finite ones of the measured
+        pulses, under ``"data"``, into equal numbers; the last slice includes its upper edge.
     dt_ns
         Sampling period in ns.
+    slices
+        Number of slices.
     """
-    edges = slice_edges(rise_time["data"])
-    return {
-        method: sliced(around_half(windows(method), dt_ns), times, edges)
-        for method, times in rise_time.items()
-    }
-
-
-def sliced(aligned: FloatArray, rise_time: Values, edges: Values) -> Slices:
-    """Mean pulse of each slice.
-
-    Parameters
-    ----------
-    aligned
-        Pulses aligned by `align_half_maximum`, shape ``(n, samples)``.
-    rise_time
-        Rise time of each pulse in ns, shape ``(n,)``.
-    edges
-        Edges of the slices in ns, see `slice_edges`; the last slice includes its upper edge.
-    """
-    inside = (rise_time >= edges[0]) & (rise_time <= edges[-1])  # not those that are NaN
-    place = np.searchsorted(edges[1:-1], rise_time, side="right")
-    means = tuple(MeanPulse.of(aligned[inside & (place == i)]) for i in range(len(edges) - 1))
-    return Slices(MeanPulse.of(aligned), means, edges)
+    measured = rise_time["data"][np.isfinite(rise_time["data"])]
+    edges = np.quantile(measured, np.linspace(0, 1, slices + 1))
+    means = {}
+    for method, times in rise_time.items():
+        aligned = around_half(windows(method), dt_ns)
+        place = np.searchsorted(edges[1:-1], times, side="right")
+        place[~((times >= edges[0]) & (times <= edges[-1]))] = -1  # also those that are NaN
+        pulses = tuple(MeanPulse.of(aligned[place == i]) for i in range(slices))
+        means[method] = Slices(MeanPulse.of(aligned), pulses, edges)
+    return means
 
 
 MIN_PULSES = 10  # minimum number of pulses of a distribution
@@ -212,45 +188,10 @@ class PeakSets:
         rows = self.rows["raw"]
         return rows[self.translations.comparable[rows]]
 
-    def paired_scores(self) -> dict[str, PairedScores] | None:
-        """Paired scores by method; None if the truth is unknown."""
+    def paired_scores(self) -> dict[str, PairedScores]:
+        """Paired scores by method; none if the truth is unknown."""
         rows, squares = self.known_to_all(), self.translations.squares
-        return {
-            name: scores_of_squares(of_method[rows]) for name, of_method in squares.items()
-        } or None
-
-
-@dataclass(frozen=True, eq=False)
-class PeakScores:
-    """Scores of a peak, its entry in ``metrics.json``.
-
-    Attributes
-    ----------
-    n_sim, n_data
-        Numbers of pulses.
-    not_prepared
-        Number of translated pulses that cannot be prepared like data, by method.
-    parameters, further
-        Comparison of each parameter, of `PARAMETERS` and of all others.
-    two_sample
-        Classifier test between each method and the data.
-    noise
-        Result of `baseline_spectra`.
-    paired
-        Paired scores by method; None if the truth is unknown.
-    missing
-        Reason why the peak is not scored.
-    """
-
-    n_sim: int
-    n_data: int
-    not_prepared: dict[str, int]
-    parameters: dict[str, Compared] = field(default_factory=dict)
-    further: dict[str, Compared] | None = None
-    two_sample: dict[str, TwoSample | Missing] | None = None
-    noise: Mapping[str, Any] | None = None
-    paired: dict[str, PairedScores] | None = None
-    missing: str | None = None
+        return {method: scores_of_squares(of[rows]) for method, of in squares.items()}
 
 
 def score_peak(
@@ -293,12 +234,15 @@ def score_peak(
         for method, whole in peak.translations.whole.items()
         if method != "data"
     }
-    counted = PeakScores(len(raw), len(data), {m: n for m, n in lost.items() if n})
+    result = PeakScores(
+        n_sim=len(raw), n_data=len(data), not_prepared={m: n for m, n in lost.items() if n}
+    )
     sides = (("simulated", raw), ("measured", data))
     few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
     if few:
-        missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
-        return {}, replace(counted, missing=missing)
+        result.parameters = {}
+        result.missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
+        return {}, result
     dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
     values = {
         method: all_parameters(
@@ -319,37 +263,20 @@ def score_peak(
             error = np.hypot(own, other)
             moved_by = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
             ends[method][A_OVER_E] = moved_by[np.newaxis]
-    chief, others = (
-        {
-            m: {name: v for name, v in of.items() if (name in PARAMETERS) is chosen}
-            for m, of in values.items()
-        }
-        for chosen in (True, False)
-    )
-    parameters, further = (
-        compare(
-            of["data"],
-            {m: of_method for m, of_method in of.items() if m != "data"},
-            recipe.scores,
-            seed,
-            ends,
-        )
-        for of in (chief, others)
-    )
-    noise = baseline_spectra(
+    others = {m: of_method for m, of_method in values.items() if m != "data"}
+    compared = compare(values["data"], others, recipe.scores, seed, ends)
+    result.parameters = {name: compared.pop(name) for name in PARAMETERS}
+    result.further = compared
+    result.two_sample = classifier_tests(peak, values, seed)
+    result.noise = baseline_spectra(
         {method: peak.windows(method)[:, :samples].copy() for method in values},
         {m: recipe.preparation.samples_before + of["t01"] / dt_ns for m, of in values.items()},
         samples,
         dt_ns,
     )
-    return values, replace(
-        counted,
-        parameters=parameters,
-        further=further,
-        two_sample=classifier_tests(peak, chief, seed),
-        noise=noise,
-        paired=peak.paired_scores(),
-    )
+    if paired := peak.paired_scores():
+        result.paired = paired
+    return values, result
 
 
 def classifier_tests(
@@ -367,13 +294,16 @@ def classifier_tests(
         Seed of the folds.
     """
     data = peak.windows("data")
+    chief = {
+        m: {name: of_method[name] for name in PARAMETERS} for m, of_method in values.items()
+    }
 
     def tested(method: str) -> TwoSample | Missing:
-        features = values["data"], values[method]
+        features = chief["data"], chief[method]
         try:
             return classifier_auc(data, peak.windows(method), seed=seed, features=features)
         except CpunetError as error:
-            return Missing(str(error))
+            return Missing(missing=str(error))
 
     methods = list(values)[1:]
     with ThreadPoolExecutor(usable_cores()) as pool:
@@ -385,11 +315,29 @@ PULSES = 300  # of a peak, for which an effect is calculated
 Ends = Sequence[tuple[REN, REN]]
 
 
+@dataclass(frozen=True, eq=False)
+class _DrawnOnce(BaselineNoise):
+    """Noise that is drawn once for the same energies: all ends of an error have one seed."""
+
+    drawn: dict[bytes, tuple[FloatArray, Mapping[str, Any]]] = field(default_factory=dict)
+
+    def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
+        key = energy_kev.tobytes()
+        if key not in self.drawn:
+            noise = super().draw(energy_kev, length, rng)
+            noise.flags.writeable = False
+            self.drawn[key] = noise, rng.bit_generator.state
+        noise, rng.bit_generator.state = self.drawn[key]
+        return noise
+
+
 def fit_ends(run: Run, ren: REN) -> Ends:
     """A translator at both ends of each axis of the errors; none of a network."""
-    backend = ren.backend
+    backend = copy.copy(ren.backend)
     if run.fit is None or not isinstance(backend, ResponseBackend):
         return []
+    if backend.noise is not None:
+        backend.noise = _DrawnOnce(**vars(backend.noise))
 
     def at(response: ElectronicsResponse) -> REN:
         moved = copy.copy(ren)

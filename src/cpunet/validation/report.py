@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import gc
 import json
-import shutil
 from collections import UserDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
+from pydantic import ValidationError
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.parameters import Values
-from cpunet.settings import plain, read_json
+from cpunet.settings import read_json
 from cpunet.tables import text_table
-from cpunet.validation.verdicts import (
-    Metrics,
-    headline,
-    held_out,
-    judged_scores,
-    main_table,
-)
+from cpunet.validation.metrics import Metrics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,7 +61,7 @@ class Report:
     Parameters
     ----------
     metrics
-        The content of ``metrics.json``; numbers that are not finite are None.
+        The content of ``metrics.json``; `to_dict` gives it as plain values.
     values
         Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
     folder
@@ -117,44 +110,39 @@ class Report:
         from pandas import DataFrame
 
         index = ["peak", "parameter", "method"]
-        columns = [*index, "iou", "iou_std", "ceiling", "ks", "wasserstein"]
         rows = [
             [
-                *(peak, parameter, method, iou, compared["iou_std"].get(method)),
-                *(compared["iou"].get("ceiling"), compared["ks"].get(method)),
-                compared["wasserstein"].get(method),
+                *(peak, parameter, method, iou, of.iou_std.get(method)),
+                *(of.iou.get("ceiling"), of.wasserstein.get(method)),
             ]
-            for peak in self.metrics["peaks"]
-            for parameter, compared in self._compared(peak).items()
-            for method, iou in compared["iou"].items()
+            for peak, scores in self.metrics.peaks.items()
+            for parameter, of in scores.parameters.items()
+            for method, iou in of.iou.items()
             if method != "ceiling"
         ]
+        columns = [*index, "iou", "iou_std", "ceiling", "wasserstein"]
         return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
-        peaks = {
-            name: name
-            for name, scores_of in self.metrics["peaks"].items()
-            if scores_of["parameters"]
-        }
+        peaks = {name: name for name in self.metrics.scored}
         selected: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
         return selected
 
-    def to_dict(self) -> Metrics:
-        """A copy of the content of ``metrics.json``."""
-        return deepcopy(self.metrics)
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``metrics.json``."""
+        return self.metrics.to_dict()
 
     @property
     def verdicts(self) -> list[str]:
         """Verdicts on the translation in words, peak by peak."""
-        return list(self.metrics["verdicts"]["summary"])
+        return [self.metrics.summary(peak) for peak in self.metrics.scored]
 
     @property
-    def figures(self) -> Mapping[str, Figure | Picture]:
-        """Figures by name, drawn on every access; of an opened report its pictures."""
+    def figures(self) -> Mapping[str, Figure | Path]:
+        """Figures by name, drawn on every access; of an opened report its SVG files."""
         if self.drawn is None:
             files = [] if self.folder is None else sorted(self.folder.glob("*.svg"))
-            return {file.stem.replace("_", " "): Picture(file) for file in files}
+            return {file.stem.replace("_", " "): file for file in files}
         return _Figures(self.drawn)
 
     def hist(
@@ -185,10 +173,10 @@ class Report:
 
         of_peak = named(self.values, peak, "scored peak")
         named(of_peak["data"], parameter, "parameter")
-        scores = self.metrics["peaks"][peak]
-        compared = (scores["parameters"] | scores["further"])[parameter]
-        low, high, scored = (compared["axis"][key] for key in ("low", "high", "bins"))
-        axis = labelled(hist.axis.Regular(scored, low, high), parameter, bins)
+        scores = self.metrics.peaks[peak]
+        binning = (scores.parameters | scores.further)[parameter].axis
+        axis = hist.axis.Regular(binning.bins or 1, binning.low or 0.0, binning.high or 1.0)
+        axis = labelled(axis, parameter, bins)
         made = Histogram(hist.axis.StrCategory(list(of_peak), name="method"), axis)
         for method, values in of_peak.items():
             made.fill(method, values[parameter][np.isfinite(values[parameter])])
@@ -217,13 +205,12 @@ class Report:
             If there is no such peak, or no such parameter is scored there.
         """
         from cpunet.plotting import own_axes
-        from cpunet.validation.drawings import DRAWN
         from cpunet.validation.run_figures import draw_parameter
 
         peak = next(iter(self.values)) if peak is None else peak
         of_peak = named(self.values, peak, "scored peak")
-        compared = named(self._compared(peak), parameter, "scored parameter")
-        values = {m: of_peak[m][parameter] for m in DRAWN if m in of_peak}
+        compared = named(self.metrics.peaks[peak].parameters, parameter, "scored parameter")
+        values = {method: of_method[parameter] for method, of_method in of_peak.items()}
         axis = self.hist(peak, parameter).axes[1]
         ax = own_axes(ax)
         draw_parameter(ax, values, axis, parameter, compared)
@@ -249,9 +236,7 @@ class Report:
 
         if self.drawn is None:
             raise CpunetError(f"{self.folder}: is a report already", "copy the folder")
-        text = json.dumps(
-            self.metrics, indent=2, sort_keys=True, allow_nan=False, ensure_ascii=False
-        )
+        text = json.dumps(self.to_dict(), indent=2, allow_nan=False, ensure_ascii=False)
         (folder / METRICS).write_text(text + "\n", encoding="utf-8")
         parameters = {
             f"{peak}/{method}/{name}": of_method[name]
@@ -273,17 +258,17 @@ class Report:
         names = [_NAMES.get(name, name) for name in head]
         rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
         lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
-        if peaks := held_out(self.metrics):
-            table = text_table(*main_table(self.metrics, peaks), words=2)
-            lines = [headline(self.metrics)[1], table, "", *lines]
-        for peak, scores in self.metrics["peaks"].items():
-            if "missing" in scores:
-                lines.append(f"{peak}: not scored, {scores['missing']}")
+        if peaks := self.metrics.held_out:
+            table = text_table(*self.metrics.main_table(peaks), words=2)
+            lines = [self.metrics.headline()[1], table, "", *lines]
+        for peak, scores in self.metrics.peaks.items():
+            if scores.missing:
+                lines.append(f"{peak}: not scored, {scores.missing}")
         return "\n".join(lines if self.folder is None else [*lines, str(self.folder / PAGE)])
 
     def __repr__(self) -> str:
         where = "" if self.folder is None else f" {self.folder}"
-        off, judged = judged_scores(self.metrics, "ren")
+        off, judged = self.metrics.off("ren")
         return f"<Report{where}: {f'{off} of {judged} scores off' if judged else 'not judged'}>"
 
     def _repr_html_(self) -> str:
@@ -295,15 +280,12 @@ class Report:
         where = {"page": None if self.folder is None else self.folder / PAGE}
         return part("object", "cpunet report", where, head, rows, self.verdicts)
 
-    def _compared(self, peak: str) -> Mapping[str, Any]:
-        return dict(self.metrics["peaks"][peak]["parameters"])
-
     def _table(self, methods: Iterable[str]) -> tuple[list[str], list[list[str]]]:
         """IoU by peak and parameter, of the methods that have any."""
         of_all = {
-            (peak, parameter): compared["iou"]
-            for peak in self.metrics["peaks"]
-            for parameter, compared in self._compared(peak).items()
+            (peak, parameter): compared.iou
+            for peak, scores in self.metrics.peaks.items()
+            for parameter, compared in scores.parameters.items()
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
         rows = [
@@ -322,45 +304,12 @@ def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:
         If the file cannot be read or does not contain the scores of a validation.
     """
     content = read_json(file, remedy)
-    if not isinstance(content.get("peaks"), dict):
+    try:
+        return Metrics.model_validate(content)
+    except ValidationError as error:
         raise CpunetError(
             f"{file}: holds no scores by peak", "give a report of cpunet validate"
-        )
-    return content
-
-
-def as_stored(results: Any) -> Any:
-    """Results ready for JSON, see `plain`, without the fields of objects that are None."""
-    if is_dataclass(results):
-        results = {name: result for name, result in vars(results).items() if result is not None}
-    if isinstance(results, Mapping):
-        return {name: as_stored(result) for name, result in results.items()}
-    return [*map(as_stored, results)] if isinstance(results, list) else plain(results)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure of a report that was opened: its SVG file, which a notebook shows."""
-
-    path: Path
-
-    def _repr_svg_(self) -> str:
-        return self.path.read_text(encoding="utf-8")
-
-    def savefig(self, path: str | Path) -> None:
-        """Copy the picture.
-
-        Raises
-        ------
-        CpunetError
-            If another format is asked for.
-        """
-        if Path(path).suffix.lower() != ".svg":
-            raise CpunetError(
-                f"{path}: an opened report has its figures as SVG",
-                "give a name in .svg, or validate again for others",
-            )
-        shutil.copyfile(self.path, path)
+        ) from error
 
 
 class _Figures(UserDict[str, Any]):

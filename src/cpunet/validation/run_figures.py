@@ -22,6 +22,7 @@ from cpunet.errors import CpunetError
 from cpunet.plotting import (
     COLOURS,
     DATA_FILL,
+    GROUP,
     LINE,
     STACKED,
     group,
@@ -35,9 +36,11 @@ from cpunet.plotting import (
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
-from cpunet.validation.comparisons import histogram
+from cpunet.validation.ae_energy import REFERENCE_KEV, Course, columns
+from cpunet.validation.comparisons import Compared, histogram
+from cpunet.validation.metrics import QUANTITIES, Metrics
+from cpunet.validation.noise import Spectrum
 from cpunet.validation.peaks import BEFORE_NS, MeanPulse
-from cpunet.validation.verdicts import QUANTITIES, judged_parameters, methods_of
 
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is stated
@@ -121,7 +124,7 @@ def parameter_histograms(
     axis: hist.axis.Regular,
     parameter: str,
     peak: str,
-    comparison: Mapping[str, Any],
+    comparison: Compared,
 ) -> Figure:
     """Distributions of one parameter at a peak, and differences from the data in sigma.
 
@@ -155,7 +158,7 @@ def sigma_panel(axes: Axes) -> None:
 
 
 @styled
-def overlap_figure(metrics: Mapping[str, Any], peaks: Sequence[str]) -> Figure:
+def overlap_figure(metrics: Metrics, peaks: Sequence[str]) -> Figure:
     """Overlap with the data by quantity and method, and that of data with data as a band.
 
     Parameters
@@ -167,32 +170,23 @@ def overlap_figure(metrics: Mapping[str, Any], peaks: Sequence[str]) -> Figure:
     """
     figure, (grid,) = panels((1.2 + 4.2 * len(peaks), 3.6), 1, len(peaks), sharey=True)
     for axes, peak in zip(grid, peaks, strict=True):
-        compared = judged_parameters(metrics["peaks"][peak])
-        names = [name for name in compared if compared[name]["iou"].get("ceiling") is not None]
-        methods = [m for m in methods_of(metrics, peak) if m != "raw"]
-        for x, name in enumerate(names):
-            iou, error = compared[name]["iou"], compared[name]["iou_std"]
-            middle, half = iou["ceiling"], error["ceiling"]
-            band = {"color": DATA_FILL, "lw": 0, "zorder": 0}
-            axes.fill_between([x - 0.45, x + 0.45], middle - half, middle + half, **band)
-            axes.hlines(middle, x - 0.45, x + 0.45, color=COLOURS["data"], lw=1)
-            for i, method in enumerate(methods):
-                if iou.get(method) is not None:
-                    at = x + 0.7 * ((i + 0.5) / len(methods) - 0.5)
-                    look = {"color": COLOURS[method], "marker": "o", "markersize": 3.5}
-                    name_once = label(method) if x == 0 else "_"
-                    drawn = axes.errorbar(
-                        at,
-                        iou[method],
-                        error[method],
-                        label=name_once,
-                        **look,
-                        lw=0,
-                        elinewidth=1,
-                    )
-                    group(drawn, method)
-        axes.set(title=peak, xticks=range(len(names)), ylim=(0, 100))
-        texts = [QUANTITIES.get(name, name.replace("_", " ")) for name in names]
+        scores = metrics.peaks[peak]
+        compared = {n: c for n, c in scores.judged.items() if c.iou.get("ceiling") is not None}
+        methods = [m for m in scores.methods if m != "raw"]
+        x, every = np.arange(len(compared)), ["ceiling", *methods]
+        of = compared.values()
+        iou = {m: np.array([c.iou.get(m) for c in of], float) for m in every}
+        error = {m: np.array([c.iou_std.get(m) for c in of], float) for m in every}
+        half = error["ceiling"]
+        axes.bar(x, 2 * half, 0.9, iou["ceiling"] - half, color=DATA_FILL, zorder=0)
+        axes.hlines(iou["ceiling"], x - 0.45, x + 0.45, color=COLOURS["data"], lw=1)
+        for i, method in enumerate(methods):
+            at = x + 0.7 * ((i + 0.5) / len(methods) - 0.5)
+            look = {"color": COLOURS[method], "marker": "o", "markersize": 3.5, "lw": 0}
+            look |= {"elinewidth": 1, "label": label(method)}
+            group(axes.errorbar(at, iou[method], error[method], **look), method)
+        axes.set(title=peak, xticks=range(len(compared)), ylim=(0, 100))
+        texts = [QUANTITIES.get(name, name.replace("_", " ")) for name in compared]
         axes.set_xticklabels(texts, rotation=30, ha="right")
     grid[0].set_ylabel("Overlap with the data [%]\n(bands: data vs data)")
     legend_above(figure, grid[0], 4)
@@ -206,7 +200,7 @@ def draw_parameter(
     values: Mapping[str, Values],
     axis: hist.axis.Regular,
     parameter: str,
-    comparison: Mapping[str, Any],
+    comparison: Compared,
 ) -> None:
     """Draw the distributions of one parameter: the data filled, each method as a line.
 
@@ -228,7 +222,7 @@ def draw_parameter(
     """
     for method, of_method in values.items():
         name, kind = ("ceiling", "data vs data") if method == "data" else (method, "IoU")
-        score, missing = comparison["iou"].get(name), int(np.isnan(of_method).sum())
+        score, missing = comparison.iou.get(name), int(np.isnan(of_method).sum())
         text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
         text += f", n = {len(of_method)}" + (f", {missing} undefined" if missing else "")
         below, *shares, above, _ = histogram(of_method, axis) / max(len(of_method), 1)
@@ -396,4 +390,77 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     grid[0].yaxis.set_major_formatter("{x:g}")
     grid[0].yaxis.set_minor_formatter("")
     legend_above(figure, grid[0], 3)
+    return figure
+
+
+@styled
+def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
+    """Relative shift and relative width of the single-site peak of A/E against energy.
+
+    Parameters
+    ----------
+    methods
+        ``methods`` of `against_energy`.
+    """
+    figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
+    for method, course in methods.items():
+        colour, line = COLOURS[method], course.mean
+        energy, mean, error, sigma, sigma_error = columns(course.points)
+        look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
+        for axes, value, spread in (
+            (above, mean / course.scale - 1, error / course.scale),
+            (below, sigma / mean, sigma_error / mean),
+        ):
+            group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
+        along = np.linspace(energy.min(), energy.max(), 100)
+        text = f"{label(method)}: {line.per_mev_percent:+.3f} ± "
+        text += f"{line.per_mev_error_percent:.3f} % per MeV"
+        fit = {"color": colour, "gid": GROUP + method}
+        above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
+        below.plot(along, 100 * course.resolution.of(along), **fit)
+    above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
+    below.set(ylabel="Width σ of A/E [%]", xlabel="Energy [keV]")
+    above.legend()
+    return figure
+
+
+@styled
+def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
+    """Draw the noise power by band and method, and its ratio to that of the data.
+
+    Parameters
+    ----------
+    spectra
+        Result of `baseline_spectra`.
+    peak
+        Name of the gamma line, for the title.
+    """
+    figure, ((above,), (below,)) = panels((5.6, 4.4), 2, **STACKED)
+    data = np.array(spectra["data"].power)
+    drawn = {method: spectrum for method, spectrum in spectra.items() if not spectrum.missing}
+    for method, spectrum in drawn.items():
+        power, error = np.array(spectrum.power), np.array(spectrum.power_std)
+        look = {"color": COLOURS[method], "marker": "o", "markersize": 3}
+        bars = above.errorbar(spectrum.frequency_mhz, power, error, label=label(method), **look)
+        group(bars, method)
+        if method != "data":
+            # bands without noise in the data have no ratio
+            ratio, spread = (
+                np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
+                for values in (power, error)
+            )
+            group(below.errorbar(spectrum.frequency_mhz, ratio, spread, **look), method)
+    below.axhline(1, color="black", linewidth=0.8)
+    silent = not any(any(spectrum.power) for spectrum in drawn.values())
+    above.set(
+        title=f"{peak}: noise before the pulse",
+        ylabel="Mean square per band\n[pulse height²]",
+        xscale="log",
+        yscale="linear" if silent else "log",
+    )
+    above.legend()
+    for axis in (above.yaxis, below.xaxis):
+        axis.set_major_formatter("{x:g}")  # powers as formulas take long to set
+        axis.set_minor_formatter("")
+    below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure

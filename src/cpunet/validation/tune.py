@@ -6,7 +6,6 @@ output folder.  Every process that is given the same folder works on the same se
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -29,17 +28,24 @@ from cpunet.pulses.parameters import Values, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import ReadOptions, Source
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import Recipe, SearchConfig
-from cpunet.settings import Set, flat, read_settings, yaml_text
+from cpunet.recipes.schema import Recipe
+from cpunet.settings import flat, read_settings, yaml_text
 from cpunet.training.job import TrainingJob
 from cpunet.training.run import resolve_device
 from cpunet.training.unfinished import differences
 from cpunet.translation.translator import REN
-from cpunet.validation.comparisons import null_distances, resampled_twice, wasserstein
+from cpunet.validation.comparisons import null_wasserstein, resampled_twice, wasserstein
 from cpunet.validation.methods import like_data
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
+    Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
 
 log = logging.getLogger(__name__)
 
@@ -50,16 +56,16 @@ MIN_PULSES = 20  # minimum per side for a distribution
 MAX_LOST = 0.01  # share of lost translations: losing bad ones would improve the score
 # pulses and their comparison must be the same for all trials, so only these may be tuned
 TUNED = ("generator", "discriminator", "training")
-UNCHANGED, REASON, BEGUN = "unchanged recipe", "reason", "begun with"  # user attributes
+REASON, BEGUN = "reason", "begun with"  # user attributes
 
 
 def tune(
     sim: Source,
     data: Source,
     out: str | Path,
+    space: Mapping[str, Distribution],
     *,
     recipe: str | Path | Recipe = "fast",
-    settings: Set = (),
     trials: int = 30,
     peak: str = "FEP",
     seed: int = 0,
@@ -75,8 +81,11 @@ def tune(
     out
         Folder of the search, a new one or one to continue: ``best.yaml`` (a recipe),
         ``trials.csv``, and ``journal.log`` with all that Optuna knows.
-    recipe, settings
-        Recipe with its search space; its own values are the first trial.
+    space
+        Distributions of Optuna by setting, as
+        ``{"training.level_ns": FloatDistribution(100, 2000, log=True)}``.
+    recipe
+        Name, file or recipe; if the space has its own values, they are the first trial.
     trials
         Total number of trials, including completed and failed ones.
     seed
@@ -85,7 +94,7 @@ def tune(
     Returns
     -------
     optuna.Study
-        Choices of a search space are JSON texts in its trials.
+        With all trials.
 
     Raises
     ------
@@ -95,14 +104,14 @@ def tune(
     """
     try:
         import optuna
-        from optuna.storages.journal import JournalFileBackend
     except ImportError as error:
         raise CpunetError(
             "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    out, sides, recipe = Path(out), read.files(sim, data), load_recipe(recipe, settings)
-    device, space = resolve_device(device, recipe), search_space(recipe)
+    out, sides, recipe = Path(out), read.files(sim, data), load_recipe(recipe)
+    device = resolve_device(device, recipe)
+    own = own_values(recipe, space)
     refuse_inputs(out, *sides[0].files, *sides[1].files)
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
@@ -114,23 +123,12 @@ def tune(
     require_both_sides(simulated, measured, selection)
     held_out = HeldOut.of(simulated, measured, recipe, seed)
     out.mkdir(parents=True, exist_ok=True)
-    study = optuna.create_study(
-        study_name="cpunet",
-        storage=optuna.storages.JournalStorage(JournalFileBackend(str(out / JOURNAL))),
-        load_if_exists=True,
-    )
     begun = {"recipe": recipe.model_dump(mode="json"), "peak": peak, "seed": seed}
+    begun |= {"space": {key: str(of) for key, of in space.items()}}
     begun |= {"simulation": simulated.fingerprint(), "data": measured.fingerprint()}
-    for difference in differences(study.user_attrs.get(BEGUN, begun), begun):
-        raise CpunetError(
-            f"{out}: was begun with other settings or pulses: {difference}; give the same, or "
-            "choose another name"
-        )
-    study.set_user_attr(BEGUN, begun)
-    own = {key: v for key, v in flat(recipe.model_dump(mode="json")) if key in space}
-    given = {key: _in_journal(space[key], value) for key, value in own.items()}
-    if not study.trials and None not in given.values():
-        study.enqueue_trial(given, {UNCHANGED: True})
+    study = _study(out, begun)
+    if not study.trials and all(_contains(of, own[key]) for key, of in space.items()):
+        study.enqueue_trial(own)
     ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
     with stage("Trials", trials) as bar:
         while (done := len(study.get_trials(states=ended))) < trials:
@@ -142,20 +140,40 @@ def tune(
                 n_startup_trials=STARTS,
                 warn_independent_sampling=False,
             )
-            values = {key: _suggested(trial, key, own[key], space[key]) for key in space}
+            values = {key: _suggested(trial, key, of) for key, of in space.items()}
             try:
-                ren = held_out.train(with_values(recipe, values), seed, device)
+                ren = held_out.train(read_settings(Recipe, recipe, values), seed, device)
                 study.tell(trial, held_out.score(ren))
             except CpunetError as error:
                 trial.set_user_attr(REASON, str(error))
                 log.info(f"trial {trial.number} failed: {error}")
                 study.tell(trial, state=ended[1])
         bar.update(done - bar.n)
-    _write(out, study, recipe, space)
+    _write(out, study, recipe)
     return study
 
 
-def _write(out: Path, study: Study, recipe: Recipe, space: Mapping[str, SearchConfig]) -> None:
+def _study(out: Path, begun: Mapping[str, Any]) -> Study:
+    """The study of a folder, a new one or one that was begun with the same."""
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
+    study = optuna.create_study(
+        study_name="cpunet",
+        storage=optuna.storages.JournalStorage(JournalFileBackend(str(out / JOURNAL))),
+        load_if_exists=True,
+    )
+    for difference in differences(study.user_attrs.get(BEGUN, begun), begun):
+        raise CpunetError(
+            f"{out}: was begun with other settings or pulses: {difference}; give the same, or "
+            "choose another name"
+        )
+    study.set_user_attr(BEGUN, begun)
+    return study
+
+
+def _write(out: Path, study: Study, recipe: Recipe) -> None:
+    """Write all trials, and the recipe of the best."""
     with written_aside(out / TABLE) as aside:
         columns = ("number", "state", "value", "duration", "params", "user_attrs")
         study.trials_dataframe(columns).to_csv(aside, index=False)
@@ -165,72 +183,51 @@ def _write(out: Path, study: Study, recipe: Recipe, space: Mapping[str, SearchCo
         reasons = [t.user_attrs[REASON] for t in study.trials if REASON in t.user_attrs]
         first = next(iter(reasons), "interrupted")
         raise CpunetError(f"{out}: no trial has a score; the first: {first}") from error
-    chosen = {k: json.loads(v) for k, v in best.params.items() if space[k].choices is not None}
     description = f"{recipe.description}; tuned, trial {best.number}"
-    tuned = with_values(recipe, best.params | chosen).model_copy(
+    tuned = read_settings(Recipe, recipe, best.params).model_copy(
         update={"name": f"{recipe.name}-tuned", "description": description}
     )
     with written_aside(out / BEST) as aside:
         aside.write_text(yaml_text(tuned.model_dump(mode="json")), encoding="utf-8")
 
 
-def search_space(recipe: Recipe) -> dict[str, SearchConfig]:
-    """The search space of a recipe, after checking its keys and values.
+def own_values(recipe: Recipe, space: Mapping[str, Distribution]) -> dict[str, Any]:
+    """The recipe's own values of a search space, after checking its settings and their values.
 
     Raises
     ------
     CpunetError
-        If there is none, or a key or value is not allowed; the message names the key.
+        If a setting or value is not allowed; the message names the setting.
     """
-    if not recipe.search:
-        raise CpunetError(
-            f"recipe {recipe.name}: has no search space; add one, as "
-            "search: {training.noise_sets: {choices: [2, 4, 8]}}"
-        )
-    settings_by_name = dict(flat(recipe.model_dump(mode="json")))
-    for key, config in recipe.search.items():
+    if not space:
+        raise CpunetError("the search space is empty; give some settings in `space`")
+    values = dict(flat(recipe.model_dump(mode="json")))
+    for key, of in space.items():
         if key.split(".")[0] not in TUNED:
-            raise CpunetError(
-                f"recipe {recipe.name}: search.{key}: only settings of {', '.join(TUNED)} "
-                "can be tuned"
-            )
-        if key not in settings_by_name:
-            raise CpunetError(f"recipe {recipe.name}: search.{key}: there is no such setting")
-        for value in config.choices or (config.low, config.high):
+            raise CpunetError(f"space: {key}: only settings of {', '.join(TUNED)} can be tuned")
+        if key not in values:
+            raise CpunetError(f"space: {key}: there is no such setting")
+        for value in of.choices if hasattr(of, "choices") else (of.low, of.high):
             try:
-                with_values(recipe, {key: value})
+                read_settings(Recipe, recipe, {key: value})
             except CpunetError as error:
-                raise CpunetError(f"recipe {recipe.name}: search.{key}: {error}") from error
-    return dict(recipe.search)
+                raise CpunetError(f"space: {error}") from error
+    return {key: values[key] for key in space}
 
 
-def with_values(recipe: Recipe, values: Mapping[str, Any]) -> Recipe:
-    """A recipe with other values, and no search space.
-
-    Raises
-    ------
-    CpunetError
-        If a value is not allowed.
-    """
-    return read_settings(Recipe, recipe, {**values, "search": None})
+def _contains(of: Distribution, value: Any) -> bool:
+    """Whether a distribution has a value."""
+    if hasattr(of, "choices"):
+        return value in of.choices
+    return isinstance(value, int | float) and of.low <= value <= of.high
 
 
-def _in_journal(config: SearchConfig, value: Any) -> Any:
-    """A value as the journal has it, choices as JSON; None if the space does not contain it."""
-    if (choices := config.choices) is not None:  # a setting of 4.0 is the choice 4
-        return json.dumps(choices[choices.index(value)]) if value in choices else None
-    number = isinstance(value, int | float)
-    return value if number and config.low <= value <= config.high else None
-
-
-def _suggested(trial: Trial, key: str, own: Any, config: SearchConfig) -> Any:
-    """The value of a setting proposed for a trial; an integer if all that is given is."""
-    if config.choices is not None:
-        return json.loads(trial.suggest_categorical(key, [*map(json.dumps, config.choices)]))
-    ends: Any = config.low, config.high
-    if all(type(number) is int for number in (own, *ends)):
-        return trial.suggest_int(key, *ends, log=config.log)
-    return trial.suggest_float(key, *ends, log=config.log)
+def _suggested(trial: Trial, key: str, of: Distribution) -> Any:
+    """The value of a setting proposed for a trial."""
+    if hasattr(of, "choices"):
+        return trial.suggest_categorical(key, of.choices)
+    suggest: Any = trial.suggest_int if isinstance(of.low, int) else trial.suggest_float
+    return suggest(key, of.low, of.high, step=of.step, log=of.log)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,13 +261,22 @@ class HeldOut:
         CpunetError
             If too few pulses would be held out.
         """
-        rng = np.random.default_rng(seed)
-        fit_sim, held_sim = _split(sim, rng)
-        fit_data, held_data = _split(data, rng)
+        rng, sides = np.random.default_rng(seed), []
+        for side in (sim, data):
+            prepared = side.prepared
+            rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
+            if n < MIN_PULSES:
+                raise CpunetError(
+                    f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, and "
+                    f"{MIN_PULSES} are needed; select more energies (`peak`) or give more"
+                )
+            rest = replace(side, prepared=prepared[np.sort(rows[n:])])
+            sides.append((rest, prepared.pulses[np.sort(rows[:n])]))
+        (fit_sim, held_sim), (fit_data, held_data) = sides
         values = pulse_parameters(held_data, recipe.preparation, recipe.scores)
         n_sim, n_data = len(held_sim), len(held_data)
         draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
-        nulls = {name: null_distances(v, draws).wasserstein for name, v in values.items()}
+        nulls = {name: null_wasserstein(v, draws)[0] for name, v in values.items()}
         return cls(fit_sim, fit_data, held_sim, held_data, values, nulls, seed)
 
     def score(self, ren: REN) -> float:
@@ -309,16 +315,3 @@ class HeldOut:
         whole = recipe.at(self.fit_sim.dt_ns)
         job = TrainingJob(whole, "", seed, device, self.fit_sim, self.fit_data)
         return REN.of(job.trained(), device)
-
-
-def _split(side: InputSet, rng: np.random.Generator) -> tuple[InputSet, Pulses]:
-    """The pulses of a side to fit, and those held out."""
-    prepared = side.prepared
-    rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
-    if n < MIN_PULSES:
-        raise CpunetError(
-            f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, "
-            f"and {MIN_PULSES} are needed; select more energies (`peak`) or give more"
-        )
-    rest = replace(side, prepared=prepared[np.sort(rows[n:])])
-    return rest, prepared.pulses[np.sort(rows[:n])]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from cpunet.settings import require_seed
 from cpunet.training.run import INFO, Run, RunLike, used_run
 from cpunet.validation.compare import compared
 from cpunet.validation.report import REPORT, Report
-from cpunet.validation.verdicts import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -88,15 +87,22 @@ def validate(
     if max_pulses < 100:
         raise CpunetError(f"`max_pulses`: {max_pulses} are too few to compare", "give 100")
     sim, data = read.files(sim, data)
-    how: dict[str, Any] = {"baselines": baselines, "max_pulses": max_pulses, "further": peak}
-    how |= {"seed": require_seed(seed), "truth": truth and Path(truth)}
     folder = None if out is None else Path(out)
+    score = partial(
+        _validated,
+        truth=None if truth is None else Path(truth),
+        baselines=baselines,
+        further=peak,
+        max_pulses=max_pulses,
+        seed=require_seed(seed),
+        force=force,
+    )
     if data.table != ALL:
-        return _validated(used_run(run), (sim, data), folder, how, force)
+        return score(used_run(run), (sim, data), folder)
     if folder is None:
         raise CpunetError(f"`data_table` {ALL}: give `out`, the folder of the reports")
     channels = paired(sim, data)
-    outcome = each_channel(channels, folder, partial(_of_channel, run, how, force))
+    outcome = each_channel(channels, folder, partial(_of_channel, run, score))
     if outcome.done:
         folders = [folder / name for name in channels]
         # without force, a channel with a report fails and keeps it
@@ -107,11 +113,11 @@ def validate(
 
 
 def _validated(
-    run: Run, pair: Pair, out: Path | None, how: Mapping[str, Any], force: bool
+    run: Run, pair: Pair, out: Path | None, *, truth: Path | None, force: bool, **how: Any
 ) -> Report:
     """Scores, and functions that draw; translated pulses are forgotten."""
     pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
-    read = (run.folder, *pair[0].files, *pair[1].files, how["truth"])
+    read = (run.folder, *pair[0].files, *pair[1].files, truth)
     with ExitStack() as stack:
         aside = None
         if out is not None:
@@ -119,11 +125,11 @@ def _validated(
         # imported late: not needed for the help of the command
         from cpunet.validation.evaluation import evaluate
 
-        evaluation = evaluate(run, *pair, **how)
+        evaluation = evaluate(run, *pair, truth=truth, **how)
         # nor is matplotlib while the pulses take most memory
         from cpunet.validation.drawings import drawings
 
-        notes = _notes(run, evaluation.metrics, how["truth"])
+        notes = _notes(run, truth)
         drawn = drawings(evaluation)
         report = Report(evaluation.metrics, evaluation.values, out, drawn, notes)
         del evaluation  # all pulses
@@ -133,30 +139,30 @@ def _validated(
 
 
 def _of_channel(
-    runs: RunLike, how: Mapping[str, Any], force: bool, name: str, pair: Pair, folder: Path
+    runs: RunLike, score: Callable[..., Report], name: str, pair: Pair, folder: Path
 ) -> Path:
     """The folder of the report of a channel, made in a process of its own."""
     run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-    _validated(used_run(run), pair, folder, how, force)
+    score(used_run(run), pair, folder)
     return folder
 
 
-def _notes(run: Run, metrics: Metrics, truth: Path | None) -> list[str]:
+def _notes(run: Run, truth: Path | None) -> list[str]:
     notes = [
         f"Peaks other than {run.peak} took no part in the training.",
         "IoU is the overlap of two distributions in percent. Two samples of the same "
         "distribution do not reach 100 at finite size: data vs data is what two samples of the "
         "measured distribution have at these sizes.",
     ]
-    tails = metrics["tails"] or {}
-    if tails.get("rate_khz"):
+    tails = None if run.fit is None else run.fit.tails
+    if tails is not None and tails.rate_khz:
         shares = ", ".join(
             f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
-            for size, share in tails["percent_above"].items()
+            for size, share in tails.percent_above.items()
         )
         notes.append(
-            f"Traces of the training lie on pile-up tails, {tails['rate_khz']:.2f} ± "
-            f"{tails['rate_error_khz']:.2f} kHz decaying with {tails['decay_us']:.1f} µs: "
+            f"Traces of the training lie on pile-up tails, {tails.rate_khz:.2f} ± "
+            f"{tails.rate_error_khz:.2f} kHz decaying with {tails.decay_us:.1f} µs: "
             f"percent of the traces, measured (by the law), {shares}. All translations and the "
             "truth have tails drawn by this law, as likely as they pass the quality cuts."
         )
