@@ -160,7 +160,7 @@ def home(tmp_path_factory) -> Path:
     edges = phased_edges(4, np.random.default_rng(2), 550, 3000)
     fine = Pulses.of(edges, dt_ns=1, energy_kev=np.full(4, KEV[0]))
     write_pulses(folder / "fine.lh5", fine)
-    recipe = load_recipe("fast", [f"training.{value}" for value in (*SHORT, "noise_sets=1")])
+    recipe = load_recipe("fast", [f"training.{value}" for value in SHORT])
     sides = PulseFile(folder / "sim.lh5"), PulseFile(folder / "raw.lh5")
     train(*sides, folder / "run", recipe=recipe, device="cpu")
     for seed in ("seed_000", "seed_001"):

@@ -34,7 +34,6 @@ from synthetic import FACTS, KEV, write_run, write_sides
 SHORT = {
     "training.steps": 20,
     "training.start_factors": [1],
-    "training.noise_sets": 1,
     "scores.bootstraps": 20,
 }
 N = 260

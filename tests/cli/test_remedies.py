@@ -79,7 +79,7 @@ REMEDIES = {
         "{} geds_hit.lh5:geds/hit/E_cal",
     ),
     "energies of another file": Remedy(
-        "info geds_hit.lh5", "their energies may be here: (--data-energy) FILE:COLUMN",
+        "info geds_hit.lh5", "energies are (--data-energy) FILE:COLUMN",
         f"& {CHECK} --data adc.lh5 {{}} geds_hit.lh5:geds/hit/E_cal",
     ),
     "energies elsewhere": Remedy(
@@ -93,7 +93,7 @@ REMEDIES = {
         f"{CHECK} --sim sim10.lh5", "or give (--dt-ns) if one says it wrongly", "{} 16"
     ),
     "an array": Remedy(
-        "info array.h5", r"\((\w+)\); if it holds traces, name it by (--table) .*give --dt-ns",
+        "info array.h5", r"holds (\w+) .*name an array .* by (--table) .*give --dt-ns",
         "{1} {0} --dt-ns 16", "90 of 1200 samples",
     ),
     "sides": Remedy(

@@ -288,10 +288,9 @@ class MatchingConfig(Timed):
     last ``level_ns`` scaled to the level of the preparation.  The valley is searched for with
     ``search_pulses`` of each side, in fits of at most ``steps`` iterations.  A fit that ends in
     the wrong valley is started again with the response's poles times the next of
-    ``start_factors``; the best of all counts.  Each pulse is compared with ``noise_sets``
-    draws of the noise.  If a fit is bad and pulses begin differently than simulated, up to
-    ``drift_terms`` parameters that stretch the drift are tried, and used if held-out pulses
-    gain.
+    ``start_factors``; the best of all counts.  If a fit is bad and pulses begin differently
+    than simulated, up to ``drift_terms`` parameters that stretch the drift are tried, and used
+    if held-out pulses gain.
     """
 
     method: Literal["matching"]
@@ -303,7 +302,6 @@ class MatchingConfig(Timed):
     steps: Count
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     drift_terms: DriftTerms
-    noise_sets: Annotated[int, Field(ge=1, le=1000)]
 
     @property
     def before(self) -> int:

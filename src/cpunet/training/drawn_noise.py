@@ -52,16 +52,16 @@ class Noise:
         noise: BaselineNoise,
         energy_kev: Values,
         length: int,
-        draws: int,
+        pairs: int,
         rng: np.random.Generator,
         tails: DrawnTails | None = None,
     ) -> Noise:
         """Draw noise for records of `length` samples.
 
-        Every second draw is the previous with opposite sign, so that the contribution of
-        noise to a mean cancels.
+        The two draws of a pair are of opposite sign, so that the contribution of noise to a
+        mean cancels.
         """
-        n, pairs = len(energy_kev), -(-draws // 2)
+        n = len(energy_kev)
         n_traces = min(NOISE_TRACES, n * pairs)
         traces = noise.draw(np.ones(n_traces), 2 * length, rng)
         # each trace is used before any is used again
@@ -71,16 +71,16 @@ class Noise:
         sign = rng.choice((-1.0, 1.0), (pairs, n))
         drawn = cls(
             traces,
-            np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)[:draws],
-            np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)[:draws],
+            np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0),
+            np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0),
             np.asarray(
-                np.stack([sign, -sign], axis=1).reshape(2 * pairs, n)[:draws] / energy_kev,
+                np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev,
                 np.float32,
             ),
         )
         if tails is None:
             return drawn
-        left = np.stack([tails.factors(energy_kev, rng) for _ in range(draws)])
+        left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
         return replace(drawn, left=left, decay=np.asarray(tails.decay(length), np.float32))
 
     def of(self, rows: Samples | npt.NDArray[np.bool_] | slice) -> Noise:

@@ -33,6 +33,7 @@ SLICES, IN_SLICE = 32, 50
 CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
 HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
 MIN_PULSES = 200  # of a side, for a covariance
+NOISES = 1000  # draws of noise that few pulses have, for the same
 # Pulses that give the slope of the tails
 DRAWN = 8192
 
@@ -256,8 +257,9 @@ class PulseSets:
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
         sim, data = sim[rows], data[np.isfinite(data).all(axis=1)]
         length = record_length(sim.waveforms.shape[1], sim.dt_ns)
-        drawn = (sim.energy_kev, length, training.noise_sets, self.rng, self.tails)
-        noise, frame = Noise.draw(self.noise, *drawn), Frame.of(training)
+        pairs = max(1, round(NOISES / len(sim)))
+        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng, self.tails)
+        frame = Frame.of(training)
         level, kev = preparation.tail_level, sim.energy_kev
         return Sides(sim.waveforms, data, noise, frame, level, kev, rows)
 
