@@ -163,8 +163,8 @@ def test_windows_are_those_of_the_true_response(sigma_ns: float, tau_ns: float) 
     scores = paired_scores(windows, truth, 100)
     # What a response computed at 16 ns instead of on the fine grid costs: up to 5.0e-4
     # at the narrowest kernel drawn here, one sample wide.
-    assert scores["edge_rmse"] < 8e-4
-    assert scores["unaligned"] == 0
+    assert scores.edge_rmse < 8e-4
+    assert scores.unaligned == 0
 
 
 OF_80_NS = BaselineMethod(DT_NS, -18.0, partial(rc, DT_NS, 80.0), {})

@@ -156,13 +156,6 @@ def test_reversed_dimensions_are_named(tmp_path, suffix):
         open_pulses(path, dt_ns=16)
 
 
-def test_arrays_that_could_be_traces_are_named(tmp_path):
-    with h5py.File(tmp_path / "hits.lh5", "w") as file:
-        file["mc/pos"] = np.zeros((50, 3))
-    with pytest.raises(CpunetError, match=r"it holds mc/pos \(50, 3\) of float64; name"):
-        open_pulses(tmp_path / "hits.lh5")
-
-
 TIME = np.arange(800)
 
 

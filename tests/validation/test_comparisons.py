@@ -206,13 +206,6 @@ def test_the_distance_of_few_values_on_the_grid_is_exact(a, b):
     assert found == pytest.approx(exact, rel=1e-9, abs=1e-9)
 
 
-def test_the_null_of_a_uniform_distribution_is_the_area_under_a_bridge():
-    data = np.random.default_rng(9).uniform(size=5000)
-    null, _ = null_wasserstein(data, resampled_twice(5000, 5000, 5000, 400, 1))
-    area = np.sqrt(2 / np.pi) * np.pi / 8  # of E|B(x)| = √(2 x (1 - x) / π)
-    assert null == pytest.approx(area * np.sqrt(2 / 5000), rel=0.08)
-
-
 def parameters(seed: int, shift: float = 0.0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     return {

@@ -356,16 +356,6 @@ def test_the_example_is_valid():
     jsonschema.Draft202012Validator(schema).validate(example)
 
 
-def test_the_profile_suits_small_nodes():
-    profile = yaml.safe_load((WORKFLOW / "profiles" / "slurm" / "config.yaml").read_text())
-    text = "".join(file.read_text() for file in (WORKFLOW / "rules").iterdir())
-    threads = [int(n) for n in re.findall(r"^    threads: (\d+)$", text, re.MULTILINE)]
-    assert max(threads) == 2
-    assert "set-threads" not in profile
-    assert profile["executor"] == "slurm"
-    assert profile["keep-going"] is True
-
-
 def write_raw(path: Path, first: int, n: int) -> None:
     """Traces of channel 1 in an LH5 file, and energies as in a hit tier in another."""
     values = np.arange(n * 8, dtype=np.uint16).reshape(n, 8) + first
