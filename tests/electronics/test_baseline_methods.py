@@ -176,20 +176,6 @@ def test_finished_windows_are_prepared_ones(sim) -> None:
     np.testing.assert_allclose(again, windows, atol=1e-6)
 
 
-def test_a_response_is_linear_and_causal(sim) -> None:
-    method = OF_80_NS
-    both = method.translate(0.3 * sim[:5] + 0.7 * sim[5:10])
-    np.testing.assert_allclose(
-        both, 0.3 * method.translate(sim[:5]) + 0.7 * method.translate(sim[5:10]), atol=1e-6
-    )
-    late = np.zeros((1, CONFIG.length), np.float32)
-    late[:, 500:] = 1
-    record = method.translate(late)[0]
-    start = np.flatnonzero(padded(late)[0])[0]
-    np.testing.assert_allclose(record[:start], 0, atol=1e-6)
-    assert record[start + 20] > 0.9
-
-
 def test_bad_input_is_named(sim) -> None:
     for method in BASELINE_METHODS.values():
         with pytest.raises(CpunetError, match=r"7 simulated pulses; give \d+ or more"):

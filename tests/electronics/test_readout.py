@@ -99,14 +99,10 @@ def test_presets_rise_and_decay_as_measured():
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        ({"bandwidth_poles_ns": [-40]}, "bandwidth_poles_ns"),
         ({"slow": {"fraction": 0.1, "tau_ns": 0}}, "slow.tau_ns"),
         ({"decays": [{"fraction": 0.9, "tau_us": 50}]}, "decays"),
-        ({"before_ns": 22_400}, "before_ns"),
         ({"before_ns": 5}, "before_ns"),
         ({"record_ns": 1e9}, "record_ns"),
-        ({"dt_ns": 0.05}, "dt_ns"),
-        ({"dt_ns": 3000}, "dt_ns"),
         ({"baseline_mean_adc": 70000}, "baseline_mean_adc"),
         ({"noise": {"rms_kev": 1}}, "noise"),
         ({"gain_adc_per_kev": float("inf")}, "gain_adc_per_kev"),

@@ -191,38 +191,12 @@ def test_the_fingerprint_tells_detectors_apart() -> None:
     assert ICPC.fingerprint(without) == changed(bias_V=3999).fingerprint(without)
 
 
-OF_THE_DETECTOR = {  # key of a shift: value, and the value of the field that it gives
-    "temperature_K": (2.0, "temperature_K", 92.0),
-    "bias_V": (20.0, "bias_V", 4020.0),
-    "li_thickness_mm": (0.1, "li_thickness", 1.1),
-    "impurity_tilt_1e10_per_cm4": (0.01, "impurity_tilt_1e10_per_cm4", 0.01),
-    "impurity_factor": (1.03, "impurity_scale", 1.03),
-}
-OF_THE_SETTINGS = {
-    "cloud_fwhm_mm": 0.3,
-    "diffusion_constant": 0.09,
-    "self_repulsion": 0.5,
-    "hole_velocity_low_factor": 0.95,
-    "hole_velocity_high_factor": 0.95,
-    "electron_velocity_low_factor": 1.05,
-    "electron_velocity_high_factor": 1.05,
-    "hole_trapping_per_us": 0.01,
-    "electron_trapping_per_us": 0.01,
-}
-
-
-def test_every_key_has_its_place() -> None:
-    settings = SimulationSettings()
-    assert set(Shift.model_fields) == set(OF_THE_DETECTOR) | set(OF_THE_SETTINGS)
-    cases = {
-        key: (value, {field: result}, {})
-        for key, (value, field, result) in OF_THE_DETECTOR.items()
-    }
-    cases |= {key: (value, {}, {key: value}) for key, value in OF_THE_SETTINGS.items()}
-    for key, (value, of_detector, of_settings) in cases.items():
-        shift = Shift(**{key: value})
-        assert shift.applied(ICPC) == ICPC.model_copy(update=of_detector)
-        assert shift.applied(settings) == settings.model_copy(update=of_settings)
+def test_every_key_changes_the_value_that_it_names() -> None:
+    for key in Shift.model_fields:
+        shift = Shift(**{key: 1.05 if key.endswith("factor") else 0.01})
+        pairs = [(before, shift.applied(before)) for before in (ICPC, SimulationSettings())]
+        (name,) = (n for a, b in pairs for n, value in a if value != getattr(b, n))
+        assert key.startswith(name) or (key, name) == ("impurity_factor", "impurity_scale")
 
 
 def test_files_and_single_keys(tmp_path: Path) -> None:

@@ -302,8 +302,6 @@ DEFECTS: dict[str, tuple[dict[str, object], str]] = {
         {"library": {"grid_mm": 2}},
         "detectors.V01: library takes its geometry; give simulate in place of simulations",
     ),
-    "spacing": ({"library": {"grid_mm": 0}}, "library.grid_mm: 0 is less than the minimum"),
-    "no events": ({"events": {}}, "events: 'hits' is a required property"),
     "energies of one": (
         {"periods.p03.energies": "raw p03/*.lh5"},
         "detectors.B02: no energy, the column in the files of periods.p03.energies",
