@@ -27,15 +27,12 @@ from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.translation import file_translation
 from cpunet.translation.file_translation import Counts, noise_seed
-from cpunet.translation.forms import to_adc
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import expanded, translate
 from cpunet.translation.translator import REN
 from synthetic import (
     FACTS,
-    decay,
     edges,
-    in_traces,
     load_recipe,
     nearly_full_disk,
     write_chain,
@@ -369,29 +366,6 @@ def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, 
 
 
 # --- ADC counts
-
-
-def measured(n=30, seed=3):
-    """Traces in ADC with a decay and noise, of all energies, the edge at about sample 600."""
-    rng = np.random.default_rng(seed)
-    traces = np.pad(in_traces(charge(n, seed)), ((0, 0), (0, 100)), mode="edge")
-    traces *= decay(590, 55_000 / DT_NS, 1300)
-    height, baseline = rng.uniform(3000, 40_000, (n, 1)), rng.uniform(8000, 16000, (n, 1))
-    return np.rint(baseline + height * traces + rng.normal(0, 8, traces.shape))
-
-
-def test_the_preparation_is_undone_to_half_a_count():
-    raw = measured()
-    prepared = prepare(Pulses.of(raw, dt_ns=DT_NS), load_recipe("fast").preparation, "measured")
-    assert len(prepared) == len(raw)
-    back, saturated = to_adc(prepared.pulses.waveforms, prepared.scale, prepared.baseline)
-    rows = prepared.align_sample[:, None] - 400 + np.arange(800)
-    assert np.abs(back - np.take_along_axis(raw, rows, axis=1)).max() <= 0.5
-    assert not saturated.any()
-    again = prepare(Pulses.of(back, dt_ns=DT_NS), load_recipe("fast").preparation, "measured")
-    np.testing.assert_allclose(again.scale, prepared.scale, atol=1)
-    lost = np.abs(again.pulses.waveforms - prepared.pulses.waveforms).max(axis=1)
-    assert (lost * prepared.scale < 1.0).all()
 
 
 @pytest.mark.parametrize("adc", [Adc(), ADC])

@@ -237,16 +237,6 @@ def test_compare_takes_any_methods():
         assert by_method["raw"] is None
 
 
-@pytest.mark.parametrize("values", [np.array([]), np.array([np.nan, np.nan])])
-def test_compare_without_usable_data_gives_none(values):
-    result = compare({"drift_time": values}, {"ren": parameters(1)}, SCORES, seed=1)[
-        "drift_time"
-    ]
-    assert set(result.iou.values()) == {None}
-    assert result.wasserstein_null is result.wasserstein_null_std is None
-    assert result.missing["data"] == len(values)
-
-
 @pytest.mark.parametrize("size", [2, 50])
 def test_histograms_of_the_draws_are_multinomial(size, either_way):
     bins = np.repeat([1, 2, 4, 5], [1, 3, 4, 2])  # the last is drawn and not counted
