@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import load_recipe
 
-# Pulses of the peak, on each side: as few as a fit takes, and enough for a small error.
-FEW, ENOUGH = 240, 420
 # A readout of few numbers, and a chain that can describe it.
 READOUT = {
     "slow": {"fraction": 0.065, "tau_ns": 400.0},
@@ -31,26 +28,14 @@ PLAIN = (
 )
 
 
-def shifted_stand(out: Path, full_energy: int, **readout: object) -> Path:
-    """A small stand whose data are 3 K warmer than simulated."""
-    chain = Electronics.model_validate(read_electronics("legend200").model_dump() | readout)
-    events = {"FEP": full_energy, "DEP": 60}
-    shift = {"temperature_K": 3}
-    cpunet.make_stand(
-        out, electronics=chain, detector="ppc", events=events, shift=shift, seed=3
-    )
-    return out
-
-
-def calibrated_to(stand: Path, run: Path, *overrides: str) -> cpunet.Calibration:
-    recipe = load_recipe("fast", overrides)
-    sides = stand / "sim.lh5", stand / "data.lh5"
-    return cpunet.calibrate(*sides, run, free=["temperature"], recipe=recipe)
-
-
 @pytest.fixture(scope="module")
 def stand(tmp_path_factory) -> Path:
-    return shifted_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, **READOUT)
+    """A small stand, of as few pulses as a fit takes, whose data are warmer than simulated."""
+    out = tmp_path_factory.mktemp("calibrate") / "stand"
+    chain = Electronics.model_validate(read_electronics("legend200").model_dump() | READOUT)
+    how = {"electronics": chain, "detector": "ppc", "events": {"FEP": 240, "DEP": 60}}
+    cpunet.make_stand(out, **how, shift={"temperature_K": 3}, seed=3)
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +44,11 @@ def calibrated_and_reads(
 ) -> tuple[cpunet.Calibration, Counter[Path]]:
     """A search of two short rounds for few parameters; how often files were read."""
     reads.clear()
+    sides, out = (stand / "sim.lh5", stand / "data.lh5"), tmp_path_factory.mktemp("calibrated")
+    how = {"free": ["temperature"], "recipe": load_recipe("fast", PLAIN)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cpunet.calibration.search.ROUNDS", 2)
-        run = calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
+        run = cpunet.calibrate(*sides, out / "run", **how)
     return run, reads.copy()
 
 
@@ -70,8 +57,8 @@ def calibrated(calibrated_and_reads) -> cpunet.Calibration:
     return calibrated_and_reads[0]
 
 
-def require_temperature(run: Path) -> dict[str, Any]:
-    """What is told of the temperature, which must be near the true one."""
+def test_the_temperature_is_found(calibrated):
+    run = calibrated.folder
     told = json.loads((run / "calibration.json").read_text())
     temperature = told["parameters"]["temperature_K"]
     simulated = read_detector("ppc").temperature_K
@@ -86,11 +73,6 @@ def require_temperature(run: Path) -> dict[str, Any]:
     assert np.shape(told["covariance"]) == (1, 1)
     for name in ("pulls", "directions"):
         assert (run / f"{name}.png").stat().st_size > 1000
-    return told
-
-
-def test_the_temperature_is_found(calibrated):
-    require_temperature(calibrated.folder)
 
 
 def test_each_side_is_read_once(calibrated_and_reads, stand):

@@ -11,14 +11,12 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 
 from cpunet.electronics.drawn_pile_up import SIZES_KEV
 from cpunet.errors import CpunetError
-from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.processes import outcomes
 from cpunet.progress import Stage
 from cpunet.pulses.container import Pulses
@@ -31,13 +29,11 @@ from cpunet.translation.options import Adc
 from cpunet.translation.translate import expanded, translate
 from cpunet.translation.translator import REN
 from synthetic import (
-    FACTS,
     edges,
     load_recipe,
     nearly_full_disk,
     write_chain,
     write_pulses,
-    write_run,
     write_table,
 )
 
@@ -85,18 +81,6 @@ def busy(tmp_path_factory):
     """A chain of data with pile-up tails."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     return write_chain(folder, noise_kev=NOISE_KEV, data=DATA, fit={"tails": TAILS})
-
-
-@pytest.fixture(scope="module")
-def network(tmp_path_factory):
-    """A narrow network that was not trained."""
-    recipe = load_recipe("published", ["generator.width=2"])
-    torch.manual_seed(0)
-    model = {"ren": PositionalUNet(recipe.cyclegan.generator, 800)}
-    folder = tmp_path_factory.mktemp("networks") / "run"
-    folder.mkdir()
-    write_run(folder, model, recipe, FACTS)
-    return folder
 
 
 def sim_file(path, n=N, seed=1, **others):
