@@ -20,7 +20,7 @@ from cpunet.validation.drawings import drawings
 from cpunet.validation.evaluation import Evaluation, _compared, evaluate
 from cpunet.validation.methods import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
-from synthetic import after_pole, decay, load_recipe, phased_edges, write_pulses
+from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
 
 RECIPE = load_recipe(
     "fast",
@@ -192,11 +192,12 @@ def test_a_run_of_ren_alone_is_drawn_without_cycles(whole) -> None:
 
 
 @pytest.fixture(scope="module")
-def report(run, files, tmp_path_factory, all_undrawn) -> cpunet.Report:
+def report(run, files, tmp_path_factory) -> cpunet.Report:
     """Nothing is written before it is saved."""
     folder = tmp_path_factory.mktemp("report")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        leave_undrawn(patch)
         made = run.validate(str(files["sim"].path), files["data"], baselines=False)
         assert made.folder is None
         assert not list(folder.iterdir())
