@@ -9,11 +9,7 @@ import scipy.fft
 
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.readout import linear_response
-from cpunet.networks.response_layer import (
-    DriftClock,
-    ElectronicsResponse,
-    padded_length,
-)
+from cpunet.networks.response_layer import DriftClock, ElectronicsResponse, padded_length
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ResponseConfig
 from synthetic import PADDING_AFTER, PADDING_BEFORE
