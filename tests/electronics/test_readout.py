@@ -172,7 +172,7 @@ def test_noise_has_the_spectrum_asked_for(dt_ns: float):
     spectrum = NoiseSpectrum(
         corner_MHz=8.5, order=3, excess=10, excess_corner_kHz=30, lines=(line,)
     )
-    noise = coloured_noise(spectrum, 2000, 8192, dt_ns, np.random.default_rng(2))
+    noise = coloured_noise(spectrum, 1000, 8192, dt_ns, np.random.default_rng(2))
     assert noise.std() == pytest.approx(1, rel=0.01)
     measured = (np.abs(np.fft.rfft(noise)) ** 2).mean(axis=0)
     measured[1:-1] *= 2  # negative frequencies
