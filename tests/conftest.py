@@ -98,30 +98,12 @@ def reads() -> Iterator[Counter[Path]]:
         yield times
 
 
-def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
-    from matplotlib.figure import Figure
-
-    from cpunet.validation import page
-
-    def write_page(folder: Path, metrics: Any, figures: Any, notes: Any) -> None:
-        write(folder, metrics, dict.fromkeys(figures, Figure), notes)
-
-    write = page.write_page
-    patch.setattr(page, "write_page", write_page)
-
-
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the figures of reports empty: to draw them takes most of a small report's time."""
+    from synthetic import leave_undrawn
+
     leave_undrawn(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def all_undrawn() -> Iterator[None]:
-    """As above, for fixtures of a module."""
-    with pytest.MonkeyPatch.context() as patch:
-        leave_undrawn(patch)
-        yield
 
 
 @pytest.fixture(scope="session")

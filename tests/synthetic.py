@@ -39,6 +39,7 @@ from cpunet.pulses.writing import Columns, PulseWriter
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.adversarial import Game
 from cpunet.training.run import Run
+from cpunet.validation import page
 from cpunet.validation.methods import pair_squares, scores_of_squares, true_responses
 from cpunet.validation.metrics import Metrics, PairedScores
 from cpunet.validation.report import Report
@@ -380,6 +381,16 @@ def interrupted_in(iteration: int) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Game, "step", interrupted)
         yield
+
+
+def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
+    """Leave the figures of reports empty."""
+
+    def write_page(folder: Path, metrics: Any, figures: Any, notes: Any) -> None:
+        write(folder, metrics, dict.fromkeys(figures, Figure), notes)
+
+    write = page.write_page
+    patch.setattr(page, "write_page", write_page)
 
 
 def write_report(

@@ -15,7 +15,6 @@ from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.provenance import left_out, trace_properties
-from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits
 from cpunet.training import chain_description
 from synthetic import load_recipe, status_of, write_pulses, write_run
@@ -219,21 +218,6 @@ def test_numbers_of_a_detector():
     assert told["bias"] == "2500 V"
     low, high = (float(told[f"{k} field"].split()[0]) for k in ("lowest", "highest"))
     assert 0 < low < 300 < 1000 < high
-
-
-@pytest.mark.usefixtures("own_cache")
-def test_impurities_from_the_measured_depletion():
-    values = COARSE | {"measured_depletion_V": 2200}
-    found = info("ppc", settings=values | {"impurity_scale": "depletion"})
-    depletion = dict(found.lines)["depletion voltage"]
-    assert float(depletion.split()[0]) == pytest.approx(2200, abs=1)
-    # given by hand, the scale leads to the same fields
-    scale = {
-        "impurity_scale": read_detector(
-            "ppc", values | {"impurity_scale": "depletion"}
-        ).impurity_scale
-    }
-    assert info("ppc", settings=values | scale).lines == found.lines
 
 
 @pytest.mark.usefixtures("own_cache")

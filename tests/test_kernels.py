@@ -96,16 +96,6 @@ def test_of_two_who_compile_at_once_none_has_the_code_of_the_other(
     assert sum(later.stats.cache_hits.values()) == 1
 
 
-def test_sums_in_an_order_of_the_compilers_choice_are_part_of_what_calls_them() -> None:
-    """Else a process that compiles has other last bits than those that load its code."""
-
-    def total(values):
-        return values.sum()
-
-    assert kernels.kernel(fastmath={"reassoc"})(total).targetoptions["forceinline"]
-    assert not kernels.kernel(total).targetoptions.get("forceinline")
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("first", ["import torch; torch.get_num_threads()", ""])
 def test_a_parallel_loop_leaves_torch_its_threads(home: Path, first: str) -> None:

@@ -338,8 +338,8 @@ def test_the_page_runs_on_a_stand(tmp_path, monkeypatch):
 
 
 @pytest.mark.thorough
-def test_what_one_would_type_works(home, tmp_path, all_undrawn):
-    """Paths and objects alike, from files to scores, nothing written unless one saves it."""
+def test_pulses_in_memory_do_what_files_do(home, tmp_path):
+    """From files to runs, nothing written unless one saves it."""
     sim, data = (cpunet.open_pulses(home / f"{side}.lh5").read() for side in ("sim", "raw"))
     assert (len(sim), len(sim[:7]), len(sim[sim.energy_kev > 0])) == (N, 7, N - 1)
     assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
@@ -363,10 +363,6 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     saved = run.save(tmp_path / "run")
     assert cpunet.load(tmp_path / "run").fit == saved.fit
 
-    like_data = run.translate(sim, seed=1)
-    assert like_data.waveforms.shape == (N, 800)
-    assert {"current_amplitude", "energy_kev"} <= {*like_data.to_dataframe()}
-    assert len(cpunet.load(like_data.save(tmp_path / "translated.lh5")).open().read()) == N
     two = run.ren.translate(sim.waveforms[:2], noise=False)
     assert two.shape == (2, 800)
     as_set = run.ren.translate(sim[:2], noise=False)
@@ -374,18 +370,8 @@ def test_what_one_would_type_works(home, tmp_path, all_undrawn):
     np.testing.assert_array_equal(as_set.energy_kev, sim.energy_kev[:2])
     assert run.iren.translate(data.waveforms[:2]).shape == (2, 800)
 
-    report = run.validate(sim, data, baselines=False)
-    assert report["FEP"].loc["drift_time", "ren"].ceiling > 0
-    report.save(tmp_path / "report")
-    again = cpunet.load(tmp_path / "report")
-    assert again.verdicts == report.verdicts
-    assert len(cpunet.compare(tmp_path / "report", again).metrics) == 2
-    for shown in (sim, run, like_data, report, cpunet.info(tmp_path / "run")):
-        assert "\n" not in repr(shown)
-
 
 PEAKS = ("FEP", "SEP", "DEP")
-BASELINE_METHODS = ("rc", "rc_late", "gauss_exp", "superpulse")
 
 
 @pytest.fixture(scope="module")
@@ -394,19 +380,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> cpunet.Report:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cpunet.demonstration.FEW", "FEP=450,SEP=60,DEP=60")
         return demo(tmp_path_factory.mktemp("whole") / "demo", quick=True)
-
-
-@pytest.mark.thorough
-def test_every_method_and_the_truth_stand_beside_the_ren(whole: cpunet.Report) -> None:
-    metrics = whole.metrics
-    assert metrics.baseline_methods["missing"] == {}
-    assert set(metrics.baseline_methods["fits"]) == set(BASELINE_METHODS)
-    for scores in metrics.peaks.values():
-        assert {*BASELINE_METHODS, "truth"} <= set(scores.parameters["current_amplitude"].iou)
-        # a response fitted to the data comes nearer to the truth than none
-        edges = {method: paired.edge_rmse for method, paired in scores.paired.items()}
-        assert max(edges[method] for method in BASELINE_METHODS) < edges["raw"] / 3
-        assert edges["ren"] < edges["raw"] / 3
 
 
 @pytest.mark.thorough

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +14,6 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import load_recipe
 
-# Pulses of the peak, on each side: as few as a fit takes, and enough for a small error.
-FEW, ENOUGH = 240, 420
 # A readout of few numbers, and a chain that can describe it.
 READOUT = {
     "slow": {"fraction": 0.065, "tau_ns": 400.0},
@@ -31,47 +27,31 @@ PLAIN = (
 )
 
 
-def shifted_stand(out: Path, full_energy: int, **readout: object) -> Path:
-    """A small stand whose data are 3 K warmer than simulated."""
-    chain = Electronics.model_validate(read_electronics("legend200").model_dump() | readout)
-    events = {"FEP": full_energy, "DEP": 60}
-    shift = {"temperature_K": 3}
-    cpunet.make_stand(
-        out, electronics=chain, detector="ppc", events=events, shift=shift, seed=3
-    )
+@pytest.fixture(scope="module")
+def stand(tmp_path_factory) -> Path:
+    """A small stand, of as few pulses as a fit takes, whose data are warmer than simulated."""
+    out = tmp_path_factory.mktemp("calibrate") / "stand"
+    chain = Electronics.model_validate(read_electronics("legend200").model_dump() | READOUT)
+    how = {"electronics": chain, "detector": "ppc", "events": {"FEP": 240, "DEP": 60}}
+    cpunet.make_stand(out, **how, shift={"temperature_K": 3}, seed=3)
     return out
 
 
-def calibrated_to(stand: Path, run: Path, *overrides: str) -> cpunet.Calibration:
-    recipe = load_recipe("fast", overrides)
-    sides = stand / "sim.lh5", stand / "data.lh5"
-    return cpunet.calibrate(*sides, run, free=["temperature"], recipe=recipe)
-
-
 @pytest.fixture(scope="module")
-def stand(tmp_path_factory) -> Path:
-    return shifted_stand(tmp_path_factory.mktemp("calibrate") / "stand", FEW, **READOUT)
-
-
-@pytest.fixture(scope="module")
-def calibrated_and_reads(
-    stand, tmp_path_factory, reads
-) -> tuple[cpunet.Calibration, Counter[Path]]:
-    """A search of two short rounds for few parameters; how often files were read."""
+def calibrated(stand, tmp_path_factory, reads) -> cpunet.Calibration:
+    """A search of two short rounds for few parameters."""
     reads.clear()
+    sides, out = (stand / "sim.lh5", stand / "data.lh5"), tmp_path_factory.mktemp("calibrated")
+    how = {"free": ["temperature"], "recipe": load_recipe("fast", PLAIN)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cpunet.calibration.search.ROUNDS", 2)
-        run = calibrated_to(stand, tmp_path_factory.mktemp("calibrated") / "run", *PLAIN)
-    return run, reads.copy()
+        run = cpunet.calibrate(*sides, out / "run", **how)
+    assert [reads[side] for side in sides] == [1, 1]
+    return run
 
 
-@pytest.fixture(scope="module")
-def calibrated(calibrated_and_reads) -> cpunet.Calibration:
-    return calibrated_and_reads[0]
-
-
-def require_temperature(run: Path) -> dict[str, Any]:
-    """What is told of the temperature, which must be near the true one."""
+def test_the_temperature_is_found(calibrated):
+    run = calibrated.folder
     told = json.loads((run / "calibration.json").read_text())
     temperature = told["parameters"]["temperature_K"]
     simulated = read_detector("ppc").temperature_K
@@ -86,16 +66,6 @@ def require_temperature(run: Path) -> dict[str, Any]:
     assert np.shape(told["covariance"]) == (1, 1)
     for name in ("pulls", "directions"):
         assert (run / f"{name}.png").stat().st_size > 1000
-    return told
-
-
-def test_the_temperature_is_found(calibrated):
-    require_temperature(calibrated.folder)
-
-
-def test_each_side_is_read_once(calibrated_and_reads, stand):
-    _, reads = calibrated_and_reads
-    assert {reads[stand / f"{side}.lh5"] for side in ("sim", "data")} == {1}
 
 
 @pytest.mark.slow  # two to three minutes

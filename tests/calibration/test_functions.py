@@ -7,8 +7,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from cpunet.calibration.sliced_functions import AMPLITUDES, DENSITY, OTHERS, SLICES, SlicedJoint
-from cpunet.training.joint import Joint
+from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.training.pulse_sets import PulseSets
 from synthetic import load_recipe
 from unpaired import CHAIN, measured_with
@@ -31,18 +30,6 @@ def values_of(functions, words):
     chosen = [i for i, name in enumerate(names_of(functions)) if name.startswith(words)]
     assert chosen
     return functions.data[:, chosen]
-
-
-def test_each_function_has_a_name(functions):
-    plain, names = Joint(functions.sides), names_of(functions)
-    assert functions.data.shape == (len(functions.sides.data), len(names))
-    assert len(set(names)) == len(names)
-    n = plain.data.shape[1]
-    assert np.array_equal(functions.data[:, :n], plain.data)
-    assert len(names) == n + DENSITY + (OTHERS + AMPLITUDES) * SLICES
-    of_band = SlicedJoint(functions.sides, band="FEP")
-    assert names_of(of_band)[0] == f"FEP: {names[0]}"
-    assert next(iter(of_band.names)) == "FEP: samples"
 
 
 def test_slices_multiply_components_and_amplitudes(functions):

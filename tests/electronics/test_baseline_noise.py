@@ -80,23 +80,6 @@ def test_the_error_of_the_rms_covers_the_truth() -> None:
     assert 0.5 < np.sqrt((pulls**2).mean()) < 1.5
 
 
-def test_finished_pulses_have_the_noise_of_the_data(noise) -> None:
-    records = shape(200, 1200).astype(np.float32)
-    windows = finish(
-        records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
-    ).windows
-    raw = traces(200, seed=8)[:]
-    data = finish(raw.waveforms, CONFIG, dt_ns=DT_NS).windows[raw.energy_kev == 1592.5]
-    assert np.isfinite(windows).all()
-    assert np.median(windows[:, :200].std(axis=1)) == pytest.approx(
-        np.median(data[:, :200].std(axis=1)), rel=0.05
-    )
-    again = finish(
-        records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=np.full(200, 1592.5), seed=3
-    ).windows
-    np.testing.assert_array_equal(windows, again)
-
-
 def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
     records = shape(600, 1200).astype(np.float32)
     records[3] = 0  # cannot be prepared

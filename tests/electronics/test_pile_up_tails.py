@@ -10,12 +10,7 @@ import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.drawn_pile_up import (
-    SIZES_KEV,
-    DrawnTails,
-    TraceNoise,
-    passing,
-)
+from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TraceNoise, passing
 from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines, tail_shape
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.tails_law import (

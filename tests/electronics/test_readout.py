@@ -99,14 +99,10 @@ def test_presets_rise_and_decay_as_measured():
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        ({"bandwidth_poles_ns": [-40]}, "bandwidth_poles_ns"),
         ({"slow": {"fraction": 0.1, "tau_ns": 0}}, "slow.tau_ns"),
         ({"decays": [{"fraction": 0.9, "tau_us": 50}]}, "decays"),
-        ({"before_ns": 22_400}, "before_ns"),
         ({"before_ns": 5}, "before_ns"),
         ({"record_ns": 1e9}, "record_ns"),
-        ({"dt_ns": 0.05}, "dt_ns"),
-        ({"dt_ns": 3000}, "dt_ns"),
         ({"baseline_mean_adc": 70000}, "baseline_mean_adc"),
         ({"noise": {"rms_kev": 1}}, "noise"),
         ({"gain_adc_per_kev": float("inf")}, "gain_adc_per_kev"),
@@ -176,7 +172,7 @@ def test_noise_has_the_spectrum_asked_for(dt_ns: float):
     spectrum = NoiseSpectrum(
         corner_MHz=8.5, order=3, excess=10, excess_corner_kHz=30, lines=(line,)
     )
-    noise = coloured_noise(spectrum, 2000, 8192, dt_ns, np.random.default_rng(2))
+    noise = coloured_noise(spectrum, 1000, 8192, dt_ns, np.random.default_rng(2))
     assert noise.std() == pytest.approx(1, rel=0.01)
     measured = (np.abs(np.fft.rfft(noise)) ** 2).mean(axis=0)
     measured[1:-1] *= 2  # negative frequencies

@@ -13,12 +13,7 @@ import yaml
 
 from cpunet.electronics.exponentials import Exponentials
 from cpunet.errors import CpunetError
-from cpunet.legend.export import (
-    current_delay_ns,
-    equivalent_kernel,
-    export_legend,
-    kernel_step,
-)
+from cpunet.legend.export import current_delay_ns, equivalent_kernel, export_legend, kernel_step
 from cpunet.networks.generators import ResponseGenerator
 from synthetic import write_chain
 

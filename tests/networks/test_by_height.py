@@ -10,14 +10,12 @@ import pytest
 from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.networks.by_height import LAG_KNOTS, PER_STEP, ByHeight
-from cpunet.networks.generators import LinearInverse, ResponseGenerator
-from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import open_pulses
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
-from synthetic import edges, load_recipe, write_pulses, write_run
+from synthetic import edges, load_recipe, write_chain, write_pulses
 
 KEV, LIMIT = 2000.0, 60.0
 
@@ -71,22 +69,8 @@ def test_noise_passes_the_amplifier_with_the_pulse() -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    recipe = load_recipe("fast", ["generator.by_height=true"])
-    chain = ResponseGenerator(recipe.at(16.0).generator, 16.0)
-    assert isinstance(chain.response, ElectronicsResponse)
-    by_height = chain.response.by_height
-    assert by_height is not None
-    by_height.fill(slewing().arrays())
-    at = recipe.at(16.0)
-    inverse = LinearInverse(at.preparation.length, at.matching.training)
-    info = {"recipe": recipe.name, "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-    write_run(
-        tmp_path,
-        {"ren": chain, "iren": inverse},
-        recipe,
-        info | {"seconds": 1.0, "device": "cpu"},
-    )
-    return tmp_path
+    fill = lambda chain: chain.response.by_height.fill(slewing().arrays())  # noqa: E731
+    return write_chain(tmp_path, "generator.by_height=true", change=fill)
 
 
 def test_a_run_stores_what_acts_by_height_and_asks_for_energies(run: Path) -> None:

@@ -55,13 +55,6 @@ def test_a_window_that_is_no_pulse_has_nothing_to_say_to_others(identity):
     np.testing.assert_allclose(result[[0, 2]], edges(25, 33), atol=1e-5, rtol=1e-5)
 
 
-def test_sizes_of_a_recipe_fit_its_windows():
-    recipe = load_recipe("fast")
-    made = LinearInverse(recipe.preparation.length, recipe.matching.training)
-    assert (made.length, made.before, made.after) == (800, 230, 170)
-    assert (made.baseline, made.level) == ((-230, -130), (300, 400))
-
-
 def test_a_stretch_goes_on_with_the_edge_values():
     pulses = np.array([[1.0, 2, 3], [4, 5, 6]])
     result = stretch(pulses, np.array([0, 2]), -2, 2)

@@ -9,11 +9,7 @@ import scipy.fft
 
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.readout import linear_response
-from cpunet.networks.response_layer import (
-    DriftClock,
-    ElectronicsResponse,
-    padded_length,
-)
+from cpunet.networks.response_layer import DriftClock, ElectronicsResponse, padded_length
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ResponseConfig
 from synthetic import PADDING_AFTER, PADDING_BEFORE
@@ -164,18 +160,3 @@ def test_the_factor_changes_along_the_drift():
     late = before[:at] - before[at]
     expected = rise(before[at] + late / (1 + a + b * late), 2.0)
     assert np.abs(found[:at] - expected).max() < 1e-4
-
-
-def test_a_template_may_keep_its_begin():
-    """Templates of a library are summed by time, which counts from the begin of the drift."""
-    fine = pulses(1.0, samples=1200, dt_ns=4.0)
-    begin = END - 250
-    kept = clock(0.1, 0.05)
-    kept.keeps_begin = True
-    found = kept(fine, dt_ns=4.0)[0]
-    assert np.abs(found[: begin + 2]).max() < 1e-5
-    assert found[begin + 12] > 1e-5
-    took = int((fine[0] >= 0.999).argmax()) - begin
-    long_us = 4e-3 * took
-    expected = took * 1.1 / (1 - 0.05 * long_us)
-    assert int((found >= 0.999).argmax()) - begin == pytest.approx(expected, abs=1.5)

@@ -17,7 +17,7 @@ from lgdo import Array, Table, VectorOfVectors, WaveformTable
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.writing import PulseWriter, other_columns
+from cpunet.pulses.writing import other_columns
 from synthetic import waveform_table, write_pulses, write_table
 
 RNG = np.random.default_rng(1)
@@ -269,23 +269,6 @@ def test_no_pulses_leave_no_file(tmp_path, blocks):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_samples_of_another_type_and_columns_of_any_kind(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    pulses = Pulses.of(np.arange(12).reshape(4, 3) * 5000, dt_ns=16)
-    hits = [[1.0], [], [2.0, 3.0], [4.0]]
-    with PulseWriter(path, samples=np.uint16, waveform_units="ADC") as writer:
-        for rows in (slice(0, 1), slice(1, 4)):
-            column = VectorOfVectors(hits[rows], dtype=np.float64)
-            writer.append(pulses[rows], {"edep": column})
-        writer.annotate("made", "by hand", file=True)
-    table = lh5.read("geds/sim", path)
-    assert table.waveform.values.nda.dtype == np.uint16
-    np.testing.assert_array_equal(table.waveform.values.nda, pulses.waveforms)
-    assert [list(row) for row in table.edep] == hits
-    with h5py.File(path) as file:
-        assert file.attrs["made"] == "by hand"
-
-
 def test_no_column_replaces_another(tmp_path):
     columns = {
         name: np.full(6, len(name)) for name in ("rejection", "rejection_source", "scale")
@@ -298,11 +281,3 @@ def test_no_column_replaces_another(tmp_path):
         read, _ = other_columns(open_pulses(tmp_path / name, dt_ns=16), own)
         values = {name: column.nda[0] for name, column in read(0, 6).items()}
         assert values == {"rejection_source_source": 9, "rejection_source": 16, "scale": 5}
-
-
-def test_the_users_period_corrects_that_of_the_file(file, raw, caplog):
-    write_table(file, "raw", raw)
-    assert open_pulses(file, dt_ns=16).dt_ns == 16
-    assert not caplog.records
-    assert open_pulses(file, dt_ns=10).read().dt_ns == 10
-    assert "every 16 ns; taken as 10 ns" in caplog.text

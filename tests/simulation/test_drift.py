@@ -81,15 +81,6 @@ def test_cubic_symmetry(x: float, y: float, z: float) -> None:
         np.testing.assert_allclose(turned, expected, atol=1e-12)
 
 
-def test_colder_crystals_are_faster_and_no_field_means_no_motion() -> None:
-    field = [[300.0, 100.0, 50.0], [0.0, 0.0, 0.0]]
-    for carrier in (ELECTRON, HOLE):
-        cold = np.linalg.norm(drift_velocity(velocity_table(77), field, carrier), axis=1)
-        warm = np.linalg.norm(drift_velocity(velocity_table(95), field, carrier), axis=1)
-        assert cold[0] > warm[0] > 0
-        assert cold[1] == warm[1] == 0
-
-
 def test_factors_hold_below_and_above_and_change_smoothly_in_between() -> None:
     factors = ((1.0, 1.0), (0.9, 1.2))
     own, scaled = velocity_table(90), velocity_table(90, factors)

@@ -83,7 +83,6 @@ def test_a_siggen_configuration_is_the_same_detector(tmp_path: Path) -> None:
         ("pc_radius 2.3", "pc_radios 2.3", "pc_radios"),
         ("pc_radius 2.3", "", "point_contact_radius"),
         ("bulletize_PC 0", "bulletize_PC 1", "bulletize_PC"),
-        ("hole_length 69.9", "hole_length 94", "bore_length"),
     ],
 )
 def test_bad_siggen_lines_are_named(tmp_path: Path, old: str, new: str, key: str) -> None:

@@ -221,7 +221,6 @@ def test_energies_of_another_unit_are_named(tmp_path, factor, said) -> None:
     [
         ({"time": (np.full(3 * N, np.nan), "ns")}, "event 0: a step has no finite position or"),
         ({"evtid": (np.where(EVENT == 0, np.nan, EVENT), "")}, "column evtid"),
-        ({"edep": (0 * EDEP_KEV, "keV")}, "no step deposits energy"),
     ],
 )
 def test_what_is_wrong_with_values_is_told(tmp_path, change, said) -> None:
@@ -300,14 +299,6 @@ def test_geant4_csv_needs_units(reference_data: Path) -> None:
     assert 2500 < hits.energy_kev.max() < 2615
 
 
-def test_npz_of_geant4(reference_data: Path) -> None:
-    path = reference_data / "geant4" / "g4_h20mm.npz"
-    hits = read_hits(path)
-    with np.load(path) as archive:
-        np.testing.assert_allclose(hits.energy_kev, archive["event_etot_keV"], rtol=1e-5)
-    assert 0 <= hits.z_mm.min() < hits.z_mm.max() <= 96
-
-
 def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
     def read(**changed: list[float]) -> Hits:
         columns = {"event": [4, 4, 7, 7, 7], "volID": [1, 1, 1, 2, 0]}
@@ -354,7 +345,6 @@ def test_transform_to_the_crystal(tmp_path: Path) -> None:
         (["event", "Edep", "x", "y", "z"], ["1,2,3"], "3 values a line for 5 columns"),
         (["event", "Edep", "x", "y", "z"], [], "holds no steps"),
         (["event", "Edep", "x", "y", "z"], ["8,-2,3,4,5"], "event 8: a step"),
-        (["event", "Edep", "x", "y", "z"], ["8,nan,3,4,5"], "event 8: a step"),
         (["event", "Edep", "x", "y", "z"], ["8,0,3,4,5"], "no step deposits energy"),
     ],
 )

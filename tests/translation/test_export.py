@@ -84,12 +84,12 @@ def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
 
 
 @pytest.mark.slow
-def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
+def test_onnx_runtime_gives_the_network_with_its_draw(network, sim, tmp_path):
     pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")
-    export_onnx(run, tmp_path / "ren.onnx")
+    export_onnx(network, tmp_path / "ren.onnx")
     session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
-    windows, translator = prepared(sim), REN.load(run)
+    windows, translator = prepared(sim), REN.load(network)
     channels = translator.backend.network.unet.latent_mean.out_channels
     zeros = np.zeros((5, channels, 50), np.float32)
     (mean,) = session.run(None, {"windows": windows, "epsilon": zeros})
@@ -103,10 +103,10 @@ def test_onnx_runtime_gives_the_network_with_its_draw(run, sim, tmp_path):
 
 
 @pytest.mark.thorough
-def test_graphs_of_inverses_and_of_a_stretched_drift(run, chain, tmp_path):
+def test_graphs_of_inverses_and_of_a_stretched_drift(network, chain, tmp_path):
     # as where the physics are off
     stretched = written(tmp_path / "stretched", "generator.drift_terms=2")
-    for folder, kind in ((run, IREN), (chain, IREN), (stretched, REN)):
+    for folder, kind in ((network, IREN), (chain, IREN), (stretched, REN)):
         graph = graph_of(kind.load(folder).backend.network, 800)
         assert write_onnx(graph, tmp_path / "graph", {}) < 2e-5
 
@@ -220,19 +220,19 @@ def test_noise_by_the_energy_of_each_event(chain, sim):
     assert spread[1] / spread[0] == pytest.approx(4, rel=0.2)
 
 
-def test_a_network_both_ways(run, sim, data):
+def test_a_network_both_ways(network, sim, data):
     kev = np.ones(5)
     forward = build_dsp(
-        raw_in=table(sim, kev), dsp_config=config(run, "ren", [], False), block_width=5
+        raw_in=table(sim, kev), dsp_config=config(network, "ren", [], False), block_width=5
     )
-    expected = REN.load(run).translate(sim, noise=False)
+    expected = REN.load(network).translate(sim, noise=False)
     np.testing.assert_allclose(forward["wf_out"]["values"].nda, expected, atol=1e-5)
     back = build_dsp(
         raw_in=table(data.astype(np.uint16), kev),
-        dsp_config=config(run, "iren", [], 7),
+        dsp_config=config(network, "iren", [], 7),
         block_width=5,
     )
-    translator = IREN.load(run)
+    translator = IREN.load(network)
     drawn = translator.translate_pulses(
         Pulses.of(data.astype(np.uint16), dt_ns=16), generator=np.random.default_rng(7)
     )

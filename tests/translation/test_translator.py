@@ -16,13 +16,13 @@ from cpunet.translation.translator import IREN, REN, RejectionWarning
 
 
 @pytest.fixture(scope="session")
-def ren(run: Path) -> REN:
-    return REN.load(run)
+def ren(network: Path) -> REN:
+    return REN.load(network)
 
 
 @pytest.fixture(scope="session")
-def iren(run: Path) -> IREN:
-    return IREN.load(str(run))
+def iren(network: Path) -> IREN:
+    return IREN.load(str(network))
 
 
 def test_any_array_and_a_copy_for_another_process_give_the_same(ren, sim):

@@ -31,13 +31,6 @@ def by_peak(**sets):
     return {peak: {m: of_set[peak] for m, of_set in sets.items()} for peak in sets["data"]}
 
 
-def test_survival_is_the_analytic_one():
-    sample = peaks(np.random.default_rng(0), 200_000, 200_000)
-    cut, _, survived = ae_survival(sample.pop("DEP"), sample, bootstraps=20)
-    assert cut == pytest.approx(10 + ndtri(0.1), abs=0.02)
-    assert survived["SEP"][0] == pytest.approx(SEP_SURVIVAL, abs=0.8)
-
-
 @pytest.mark.parametrize("n_dep", [20, 24, 61])
 def test_new_events_survive_with_the_acceptance_however_few_set_the_cut(n_dep):
     rng = np.random.default_rng(1)
@@ -100,12 +93,6 @@ def test_table_says_what_does_not_exist():
     assert table["FEP"].missing == {"data": 0, "few": 1}
     assert set(table["FEP"].survival.values()) == {None}
     assert "lack peak DEP" in survival_table({"SEP": {"data": data["SEP"]}}).missing
-
-
-def test_without_a_background_the_error_is_binomial():
-    survival, std = sideband_survival(30, 120, 0, 0, scale=1.0)
-    assert survival == pytest.approx(25)
-    assert std == pytest.approx(100 * np.sqrt(0.25 * 0.75 / 120))
 
 
 def test_sideband_error_is_the_spread_over_repeated_experiments():
@@ -257,16 +244,3 @@ def test_too_few_events_are_told() -> None:
     nothing = np.full(500, np.nan)
     assert against_energy({"data": nothing}, {"data": 2000 + 0 * nothing}, LINES).missing
     assert site_fit(np.full(500, 0.1)) is None
-
-
-def test_sigma_of_agreeing_sets_is_standard_normal():
-    rng = np.random.default_rng(5)
-    sigmas = [
-        survival_table(
-            by_peak(data=peaks(rng, 300, 300), ren=peaks(rng, 500, 700)),
-            seed=rng,
-        )["SEP"].sigma["ren"]
-        for _ in range(200)
-    ]
-    assert np.mean(sigmas) == pytest.approx(0, abs=0.25)
-    assert np.std(sigmas) == pytest.approx(1, abs=0.15)

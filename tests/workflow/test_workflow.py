@@ -302,8 +302,6 @@ DEFECTS: dict[str, tuple[dict[str, object], str]] = {
         {"library": {"grid_mm": 2}},
         "detectors.V01: library takes its geometry; give simulate in place of simulations",
     ),
-    "spacing": ({"library": {"grid_mm": 0}}, "library.grid_mm: 0 is less than the minimum"),
-    "no events": ({"events": {}}, "events: 'hits' is a required property"),
     "energies of one": (
         {"periods.p03.energies": "raw p03/*.lh5"},
         "detectors.B02: no energy, the column in the files of periods.p03.energies",
@@ -354,16 +352,6 @@ def test_the_example_is_valid():
     jsonschema.Draft202012Validator.check_schema(schema)
     example = yaml.safe_load((WORKFLOW / "config" / "example.yaml").read_text())
     jsonschema.Draft202012Validator(schema).validate(example)
-
-
-def test_the_profile_suits_small_nodes():
-    profile = yaml.safe_load((WORKFLOW / "profiles" / "slurm" / "config.yaml").read_text())
-    text = "".join(file.read_text() for file in (WORKFLOW / "rules").iterdir())
-    threads = [int(n) for n in re.findall(r"^    threads: (\d+)$", text, re.MULTILINE)]
-    assert max(threads) == 2
-    assert "set-threads" not in profile
-    assert profile["executor"] == "slurm"
-    assert profile["keep-going"] is True
 
 
 def write_raw(path: Path, first: int, n: int) -> None:
