@@ -104,7 +104,7 @@ def test_a_single_pole_and_a_single_decay(tmp_path):
     assert numbers["pole_1_ns"] == pytest.approx(50)
     assert numbers["rise_10_90_ns"] == pytest.approx(50 * np.log(9), rel=1e-3)
     assert numbers["rise_1_99_ns"] == pytest.approx(50 * np.log(99), rel=1e-3)
-    assert numbers["missing_500_ns"] == pytest.approx(np.exp(-10), abs=1e-7)
+    assert numbers["missing_500_ns"] == pytest.approx(0.5 * np.exp(-10), abs=1e-7)
     assert numbers["overshoot"] == pytest.approx(0, abs=1e-9)
     assert numbers["slow_share"] == 0
     assert "slow_time_ns" not in numbers

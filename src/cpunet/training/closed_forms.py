@@ -121,7 +121,8 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     dict
         Values by name, with the unit as suffix.  ``rise_…_ns``: rise times of the step
         response between fractions of its maximum.  ``missing_…_ns``: fraction of the charge
-        that has not arrived, and ``overshoot``, both after the decay of its part from 4 to 6 µs
+        that has not arrived so long after half of the rise (how late a response is as a whole
+        cannot be seen in unpaired pulses), and ``overshoot``, both after the decay of its part from 4 to 6 µs
         is taken off: how much is a decay and how much late charge cannot be seen earlier.
         ``effective_decay_us``: from the slope of the logarithm over the fitted tail.
         ``noise_rms_kev`` and ``noise_corner_mhz``, the frequency at which the noise power falls
@@ -129,12 +130,13 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     """
     step, flat = chain.step(_TIMES_NS), _pole_zeroed(chain.step)
     end_ns = _reaches_ns(step, preparation.align_fraction) + preparation.after_ns
+    half_ns = _reaches_ns(step, 0.5)
     numbers = {
         name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
         for name, low in _RISES.items()
     }
     for time in (500, 1000):
-        numbers[f"missing_{time}_ns"] = float(1 - flat(time))
+        numbers[f"missing_{time}_ns"] = float(1 - flat(half_ns + time))
     inside = _TIMES_NS[LATE_NS[0] > _TIMES_NS]
     numbers["overshoot"] = max(0.0, float(flat(inside).max()) - 1)
     tail_ns = np.arange(end_ns - preparation.decay_fit_ns, end_ns, dt_ns)
