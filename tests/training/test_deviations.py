@@ -66,7 +66,7 @@ def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> Electroni
 def test_chi_square_at_the_truth_is_one(plain):
     response = true_response()
     sides = sides_of(plain)
-    found = Comparison(sides, 1.5).differences(response.transfer(sides.padded))
+    found = Comparison(sides, response.transfer(sides.padded), 1.5).differences()
     assert np.mean([d.chi_square for d in found if d.sliced]) == pytest.approx(1.0, abs=0.15)
     assert all(d.chi_square < 1.6 for d in found)
 
@@ -78,13 +78,13 @@ def test_derivatives_are_those_of_differences(plain, at_ns):
     sides, lags = sides_of(plain), deviation_lags(DT_NS)
     sides.noise = replace(sides.noise, factor=1e-4 * sides.noise.factor)
     change = np.exp(-0.5 * ((lags * DT_NS - at_ns) / 60.0) ** 2)
-    comparison, step = Comparison(sides, 6.0), 1e-4
-    basis = Basis(int(lags[0]), change[:, np.newaxis])
-    found = comparison.differences(response.transfer(sides.padded), basis)
-    ends = [
-        comparison.differences(deviating(response, sign * step * change).transfer(sides.padded))
-        for sign in (1, -1)
-    ]
+    basis, step = Basis(int(lags[0]), change[:, np.newaxis]), 1e-4
+    found, *ends = (
+        Comparison(sides, deviating(response, size * change).transfer(sides.padded), 6.0)
+        for size in (0.0, step, -step)
+    )
+    found = found.differences(basis)
+    ends = [end.differences() for end in ends]
     for here, up, down in zip(found[2:], ends[0][2:], ends[1][2:], strict=True):
         wanted = (up.values - down.values) / (2 * step)
         off = np.linalg.norm(here.slopes[:, 0] - wanted) / np.linalg.norm(wanted)

@@ -78,7 +78,7 @@ def _starts(
 ) -> Iterator[ElectronicsResponse]:
     """Where fits start: the response given, then chains of the recipe with the data's decay."""
     if start_from is not None:
-        yield with_decay(copy.deepcopy(start_from), sets.tail_slope, fitter.decay)
+        yield with_decay(copy.deepcopy(start_from), sets.tail_slope)
     config, training = sets.recipe.matching
     for factor in training.start_factors:
         start = ElectronicsResponse(config, sets.noise.dt_ns)
@@ -177,12 +177,12 @@ def described(
     response, pulls, quantiles = best.response, dict[str, float](), []
     parameters, covariance = Parameters(best.chain.response), best.chain.covariance
     for name, sides in zip(sets.names, bands, strict=True):
-        comparison = Comparison(sides.entering(response), WIDTH)
         transfer = response.transfer(sides.padded)
-        z = comparison.mean_pulse(transfer).tolist()
+        here = Comparison(sides.entering(response), transfer, WIDTH)
         band = f"{name}: " if len(bands) > 1 else ""
-        pulls |= {f"{band}{t:.0f} ns": z for t, z in zip(sides.time_ns, z, strict=True)}
-        differences = comparison.differences(transfer)
+        z = zip(sides.time_ns, here.mean_pulse().tolist(), strict=True)
+        pulls |= {f"{band}{t:.0f} ns": value for t, value in z}
+        differences = here.differences()
         quantiles += [d for d in differences if d.name == f"{AMPLITUDE} quantiles"]
     total, functions = chi_square(response, bands)
     fitter.count(total)
