@@ -337,8 +337,9 @@ def _too_short(sim: InputSet, preparation: PreparationConfig) -> list[Finding]:
         longest_ns = float(np.quantile(samples, LONGEST)) * sim.dt_ns
         if longest_ns > (room_ns := window_ns - taken_ns):
             text = (
-                f"the window is shorter than the drift: pulses {what} up to {longest_ns:.0f} ns "
-                f"{where} half of their height, for which it has {room_ns:.0f} ns"
+                f"the window is shorter than the drift: pulses {what} up to "
+                f"{longest_ns:.0f} ns {where} half of their height, for which it has "
+                f"{room_ns:.0f} ns"
             )
             wanted = 100 * math.ceil((window_ns + longest_ns - room_ns) / 100)
             remedy = f"preparation.{where}_ns={wanted} in `settings`"

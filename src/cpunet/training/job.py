@@ -7,7 +7,6 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,7 +27,7 @@ from cpunet.pulses.loading import (
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import EnergySelection, parse_selection
+from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PunetConfig, Recipe
 from cpunet.training.chain_fit import Fitter
 from cpunet.training.chain_parameters import with_settings
@@ -88,14 +87,14 @@ class TrainingJob:
             kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
             raise CpunetError(f"{init.name}: {kinds}; resample them")
 
-        def both(energies: EnergySelection) -> tuple[InputSet, InputSet]:
-            measured = load_pulses(pair[1], "measured", recipe, energies, tell=False)
-            return load_pulses(pair[0], "simulated", recipe, energies, tell=False), measured
+        def both() -> tuple[InputSet, InputSet]:
+            measured = load_pulses(pair[1], "measured", recipe, away, tell=False)
+            return load_pulses(pair[0], "simulated", recipe, away, tell=False), measured
 
         away = continuum(recipe)
         fewest = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
         if fewest >= MIN_PULSES and not selection.ranges_kev:
-            how["continuum"] = partial(both, away)
+            how["continuum"] = both
         return cls(recipe.at(data.dt_ns), peak, sim=sim, data=data, init=init, **how)
 
     def trained(self) -> Run:
@@ -211,7 +210,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
         If pulses or baselines are too few, or the fit diverges.
     """
     started, clock = datetime.now(UTC), time.perf_counter()
-    recipe, (sim, data) = job.recipe, (job.sim.prepared, job.data.prepared)
+    recipe, sim = job.recipe, job.sim.prepared.pulses
     if job.init is not None:
         start = known_response(job.init, recipe)
     records = list[Record]()
@@ -228,13 +227,12 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
             terms = min(start.config.drift_terms, recipe.matching.training.drift_terms)
             start = with_settings(start, drift_terms=terms, deviations=False, by_height=False)
             recipe = recipe.model_copy(update={"generator": start.config})
-        rng, drawn = np.random.default_rng(job.seed), noise.tails
-        pulses = sim.pulses, data.pulses
-        sets = PulseSets(*pulses, noise.noise, recipe, rng, drawn, job.continuum)
+        pulses, rng = (sim, job.data.prepared.pulses), np.random.default_rng(job.seed)
+        sets = PulseSets(*pulses, noise.noise, recipe, rng, noise.tails, job.continuum)
         fitter = Fitter(recipe.matching.training, listen)
         response, info = fit_response(sets, fitter, start)
     chain = ResponseGenerator(response.config, job.sim.dt_ns)
-    chain.response, chain.tails = response, drawn
+    chain.response, chain.tails = response, noise.tails
     chain.set_noise(noise.noise)
     n, rms, error = noise.noise.n_baselines, noise.noise.rms, noise.noise.rms_error
     of_noise = {"baselines": n, "rms": rms, "rms_error": error}
@@ -242,8 +240,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
     _say(info)
     # a stretch or deviations may have been added
     recipe = job.recipe.model_copy(update={"generator": response.config})
-    of_sim = sim.pulses.waveforms, sim.pulses.energy_kev
-    iren = fit_inverse(chain, *of_sim, recipe, seed=job.seed)
+    iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)
     parts: dict[str, Any] = {"ren": chain, "iren": iren}
     if recipe.residual is not None:
         from cpunet.training.network_runs import learned_residuals
