@@ -165,7 +165,6 @@ train | SIDES | D
 train | SIDES | .
 train | SIDES --recipe D/my.yaml | D
 train | --sim sim.lh5 --data data.lh5 --data-energy D/hits.lh5:ch1/hit/energy | D
-train | --sim sim.lh5 --data data.lh5 --init RUN | RUN
 calibrate | SIDES | D
 calibrate | SIDES --recipe D/my.yaml | D
 translate | RUN D/sim.lh5 | D/sim.lh5

@@ -14,14 +14,12 @@ from cpunet.networks.response_layer import (
     late_lags,
     padding,
 )
-from cpunet.training.chain_fit import Fitter
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
 from cpunet.training.comparison import Comparison, Sides, hats
 from cpunet.training.derivatives import Basis
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_fit import fit_response
 from cpunet.training.verdict import PARTS, Verdict, verdict
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, Unpaired, charge, faster, measured_with, simulated
@@ -120,15 +118,6 @@ def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
         steps.append(chain.step(time_ns + half_ns) / chain.step(3000.0))
     assert np.abs(steps[0] - steps[1]).max() < 0.002
     assert np.abs(steps[2] - steps[1]).max() > 0.008
-
-
-@pytest.mark.thorough
-def test_a_fit_learns_what_its_chain_cannot(rings):
-    sets = PulseSets(*rings, RECIPE, np.random.default_rng(0))
-    response, fit = fit_response(sets, Fitter(RECIPE.matching.training))
-    assert response.config.deviations
-    assert fit.checks.good
-    assert fit.verdict.startswith("good: the mean pulse is within")
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.15])

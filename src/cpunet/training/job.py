@@ -13,14 +13,13 @@ from typing import Any, Self
 import numpy as np
 
 from cpunet.electronics.measured import trace_noise
-from cpunet.errors import CpunetError
 from cpunet.networks import require_torch
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
-from cpunet.pulses.channels import Pair, own_folder
+from cpunet.pulses.channels import Pair
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
@@ -28,7 +27,7 @@ from cpunet.pulses.loading import (
     require_same_sampling,
 )
 from cpunet.pulses.peaks import parse_selection
-from cpunet.recipes.schema import PunetConfig, Recipe
+from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import Fitter
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
@@ -36,7 +35,7 @@ from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import fit_response
-from cpunet.training.run import INFO, RUN, Record, Run, RunLike, as_run, versions
+from cpunet.training.run import INFO, RUN, Record, Run, versions
 from cpunet.training.verdict import FitInfo
 
 log = logging.getLogger(__name__)
@@ -52,8 +51,6 @@ class TrainingJob:
         Settings, energies, seed, and the device to train on.
     sim, data
         Prepared pulses of both sides.
-    init
-        Run to start from.
     checkpoints, resume
         Folder of the checkpoints of networks, and whether their training is to be resumed.
     continuum
@@ -66,13 +63,12 @@ class TrainingJob:
     device: str
     sim: InputSet
     data: InputSet
-    init: Run | None = None
     checkpoints: Path | None = None
     resume: bool = False
     continuum: Continuum | None = None
 
     @classmethod
-    def of(cls, pair: Pair, recipe: Recipe, peak: str, init: Run | None, **how: Any) -> Self:
+    def of(cls, pair: Pair, recipe: Recipe, peak: str, **how: Any) -> Self:
         """Read and prepare both sides, and warn of what makes a training on them doubtful."""
         selection = parse_selection(peak, recipe.peaks)
         data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
@@ -83,9 +79,6 @@ class TrainingJob:
         for finding in compare_sides(sim, data, selection, recipe.preparation):
             if finding.level != Level.FINE:
                 log.warning(finding)
-        if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
-            kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-            raise CpunetError(f"{init.name}: {kinds}; resample them")
 
         def both() -> tuple[InputSet, InputSet]:
             measured = load_pulses(pair[1], "measured", recipe, away, tell=False)
@@ -95,7 +88,7 @@ class TrainingJob:
         fewest = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
         if fewest >= MIN_PULSES and not selection.ranges_kev:
             how["continuum"] = both
-        return cls(recipe.at(data.dt_ns), peak, sim=sim, data=data, init=init, **how)
+        return cls(recipe.at(data.dt_ns), peak, sim=sim, data=data, **how)
 
     def trained(self) -> Run:
         """Train what the recipe says."""
@@ -134,7 +127,6 @@ class TrainingJob:
             recipe,
             peak=self.peak,
             seed=self.seed,
-            init=None if self.init is None else self.init.name,
             device=self.device,
             started=started,
             seconds=round(seconds, 1),
@@ -147,25 +139,18 @@ class TrainingJob:
         return run.model_copy(update={"log": records})
 
 
-def of_channel(
-    name: str, pair: Pair, folder: Path, *, init: RunLike | None, **how: Any
-) -> Path:
+def of_channel(name: str, pair: Pair, folder: Path, **how: Any) -> Path:
     """The folder of the run of a channel, trained in a process of its own."""
     if how["resume"] and (folder / INFO).is_file():
         log.info(f"{name}: trained already")
         return folder
-    if isinstance(init, str | Path):
-        init = own_folder(Path(init), name, INFO)
-    trained_in(folder, pair, init, **how)
+    trained_in(folder, pair, **how)
     return folder
 
 
-def trained_in(
-    out: Path | None, pair: Pair, init: RunLike | None, force: bool, **how: Any
-) -> Run:
+def trained_in(out: Path | None, pair: Pair, force: bool, **how: Any) -> Run:
     """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes."""
-    start = None if init is None else as_run(init)
-    files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
+    files = *pair[0].files, *pair[1].files
     networks, folder = how["recipe"].networks, None
     if networks:
         require_torch()
@@ -177,32 +162,15 @@ def trained_in(
             how["checkpoints"] = stack.enter_context(unfinished)
         elif out is not None:
             folder = stack.enter_context(folder_written_aside(out, RUN, *files, force=force))
-        run = TrainingJob.of(pair, init=start, **how).trained()
+        run = TrainingJob.of(pair, **how).trained()
         if out is not None:
             folder = folder or stack.enter_context(folder_written_aside(out, RUN, force=force))
             run.write(folder)
     return run.model_copy(update={"folder": out})
 
 
-def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
-    """The response of a run, as a starting point for a recipe.
-
-    Raises
-    ------
-    CpunetError
-        If the run has no response of the recipe's kind.
-    """
-    generator = run.recipe.generator
-    if generator.name != like.generator.name or isinstance(generator, PunetConfig):
-        raise CpunetError(
-            f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
-            f"give a run of {like.name}"
-        )
-    return run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
-
-
 def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> Run:
-    """Fit a readout chain, starting from that of ``init`` or from `start`, if given.
+    """Fit a readout chain, starting from `start`, if given.
 
     Raises
     ------
@@ -211,8 +179,6 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
     """
     started, clock = datetime.now(UTC), time.perf_counter()
     recipe, sim = job.recipe, job.sim.prepared.pulses
-    if job.init is not None:
-        start = known_response(job.init, recipe)
     records = list[Record]()
     with stage("Fitting") as bar:  # the number of steps is not foreseen
 

@@ -83,8 +83,8 @@ class Run(InfoPart):
         Arrays of all parts by name.
     folder
         Folder of the run; None if it is in memory only.
-    peak, seed, device, init
-        Energies trained on, seed, device, and the run started from.
+    peak, seed, device
+        Energies trained on, seed, and device.
     dt_ns
         Sampling period in ns.
     started, seconds
@@ -110,7 +110,6 @@ class Run(InfoPart):
     seed: Annotated[int, Field(ge=0)] | None
     device: str
     seconds: Annotated[float, Field(ge=0, le=1e15)] | None
-    init: str | None = None
     started: str = ""
     sim: SideInfo = SideInfo()
     data: SideInfo = SideInfo()
