@@ -16,7 +16,7 @@ from cpunet.networks.response_layer import (
 )
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
-from cpunet.training.comparison import Comparison, Sides, hats
+from cpunet.training.comparison import Comparison, Sides
 from cpunet.training.derivatives import Basis
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
@@ -172,13 +172,6 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
     closed = learned_chain(copy.deepcopy(own), "").step(time_ns)
     np.testing.assert_allclose(record[30:1000], closed[30:], atol=3e-4)
     assert own.describe()["deviation"] == pytest.approx(0.014)
-
-
-def test_bins_add_up():
-    values = np.random.default_rng(0).normal(size=100)
-    bins, slopes = hats(values, np.array([-1.0, 0.0, 0.5]))
-    np.testing.assert_allclose(bins.sum(axis=1), 1)
-    np.testing.assert_allclose(slopes.sum(axis=1), 0, atol=1e-12)
 
 
 def test_a_deviation_is_the_same_at_other_sampling_periods():
