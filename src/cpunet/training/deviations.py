@@ -34,15 +34,7 @@ from scipy.special import expit
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
 from cpunet.training.aligned import Values
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import (
-    MOST,
-    NONE,
-    Comparison,
-    Difference,
-    Moved,
-    Sides,
-    Spectrum,
-)
+from cpunet.training.comparison import MOST, NONE, Comparison, Moved, Sides, Spectrum
 from cpunet.training.derivatives import Basis
 from cpunet.training.joint import Joint
 
@@ -371,13 +363,14 @@ class Linearised:
 
     def evaluate(self, transfer: Spectrum, place: Values, *, anew: bool) -> float:
         """Chi-square; information and right side with derivatives at this place if `anew`."""
-        basis, differences = self.basis if anew else None, list[Difference]()
+        basis = self.basis if anew else None
         with np.errstate(divide="ignore", invalid="ignore"):  # far away, pulses have no edge
-            for sides in self.bands:
-                differences += Comparison(sides, transfer, *self.how).differences(basis)
-        if not all(
+            here = (Comparison(sides, transfer, *self.how) for sides in self.bands)
+            differences = [d for comparison in here for d in comparison.differences(basis)]
+        finite = [
             np.isfinite(d.slopes).all() & np.isfinite(d.values).all() for d in differences
-        ):
+        ]
+        if not all(finite):
             return np.nan
         n, cost = len(place), 0.0
         self.right = np.zeros(n)

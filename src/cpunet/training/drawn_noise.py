@@ -6,7 +6,7 @@ those of the responses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -68,30 +68,22 @@ class Noise:
         trace = np.concatenate(
             [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
         )
+        trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
         sign = rng.choice((-1.0, 1.0), (pairs, n))
-        drawn = cls(
-            traces,
-            np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0),
-            np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0),
-            np.asarray(
-                np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev,
-                np.float32,
-            ),
-        )
-        if tails is None:
-            return drawn
-        left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
-        return replace(drawn, left=left, decay=np.asarray(tails.decay(length), np.float32))
+        start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
+        factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
+        left = decay = None
+        if tails is not None:
+            left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
+            decay = np.asarray(tails.decay(length), np.float32)
+        return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
 
     def of(self, rows: Samples | npt.NDArray[np.bool_] | slice) -> Noise:
         """Noise of some of the pulses."""
-        return replace(
-            self,
-            trace=np.ascontiguousarray(self.trace[:, rows]),
-            start=np.ascontiguousarray(self.start[:, rows]),
-            factor=np.ascontiguousarray(self.factor[:, rows]),
-            left=None if self.left is None else self.left[:, rows],
-        )
+        drawn = self.trace, self.start, self.factor
+        trace, start, factor = (np.ascontiguousarray(of[:, rows]) for of in drawn)
+        left = None if self.left is None else self.left[:, rows]
+        return Noise(self.traces, trace, start, factor, left, self.decay)
 
     def add(self, records: FloatArray, draw: int) -> FloatArray:
         """Records of the pulses with the noise of a draw."""

@@ -29,7 +29,6 @@ from cpunet.pulses.loading import (
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import Fitter
-from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
@@ -189,10 +188,6 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
         noise, tails = trace_noise(job.data, recipe.preparation)
-        if start is not None:  # its deviations are those of another readout
-            terms = min(start.config.drift_terms, recipe.matching.training.drift_terms)
-            start = with_settings(start, drift_terms=terms, deviations=False, by_height=False)
-            recipe = recipe.model_copy(update={"generator": start.config})
         pulses, rng = (sim, job.data.prepared.pulses), np.random.default_rng(job.seed)
         sets = PulseSets(*pulses, noise.noise, recipe, rng, noise.tails, job.continuum)
         fitter = Fitter(recipe.matching.training, listen)
