@@ -13,7 +13,6 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.training.chain_fit import POOR
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.file_translation import Counts
@@ -41,18 +40,17 @@ ONE_START = (
     "training.start_factors=[1]",
     "training.steps=14",
 )
-SHORT = ("training.steps=4",)
 RECIPE = load_recipe("fast", ONE_START)
 
 
-def charge(n: int, seed: int, slowest: float = 3.0, faster: float = 1.0) -> np.ndarray:
+def charge(n: int, seed: int) -> np.ndarray:
     """Charge of two sites with logistic edges, finely sampled."""
     rng = np.random.default_rng(seed)
-    time = 60 + faster * ((np.arange(225 * FINE) + 0.5) / FINE - 60)
+    time = (np.arange(225 * FINE) + 0.5) / FINE
 
     def site() -> np.ndarray:
         place = rng.uniform(60, 110, (n, 1))
-        return 1 / (1 + np.exp(-(time - place) / rng.uniform(1.5, slowest, (n, 1))))
+        return 1 / (1 + np.exp(-(time - place) / rng.uniform(1.5, 3.0, (n, 1))))
 
     return two_sites(rng, n, site)
 
@@ -160,25 +158,3 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     assert ren.tails.law.rate_khz == told["rate_khz"]
     # without tails the noise is that of empty baselines
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * PREPARED, rel=0.07)
-
-
-@pytest.mark.thorough
-def test_a_stretched_drift_is_told_and_translated(
-    run: Run, files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    sim = written(tmp_path / "sim.lh5", sampled(charge(N, seed=1, faster=1.25), FINE))
-    recipe = load_recipe("fast", [*ONE_START, *SHORT[1:], "training.drift_terms=1"])
-    made = train(sim, files.data, tmp_path / "run", recipe=recipe, device="cpu")
-    fit = made.fit.model_dump()
-    assert fit["chi_square"] < POOR * fit["moments"]
-    assert fit["parameters"]["drift_stretch"] == pytest.approx(0.25, abs=0.05)
-    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.05)
-    assert any("charges drift for" in note for note in caplog.messages)
-    assert "longer than simulated" in fit["verdict"]
-    # what is translated rises as the data do
-    clean = REN.load(tmp_path / "run").translate(
-        sampled(charge(N, 1, faster=1.25), FINE), noise=False
-    )
-    truth = REN.load(run.folder).translate(sampled(charge(N, 1), FINE), noise=False)
-    steps = [np.sort(np.diff(pulses).max(axis=1)) for pulses in (clean, truth)]
-    np.testing.assert_allclose(*steps, rtol=0.03)

@@ -380,9 +380,8 @@ def as_run(run: RunLike) -> Run:
 def used_run(run: RunLike) -> Run:
     """The same, with a warning if its fit is bad."""
     used = as_run(run)
-    checks = None if used.fit is None else used.fit.checks
-    if checks is not None and not checks.good:
-        log.warning(f"{used.name}: the fit of this run is bad: {checks.causes[0]}")
+    if used.fit is not None and not used.ok:
+        log.warning(f"{used.name}: the fit of this run is bad: {used.fit.causes[0]}")
     return used
 
 

@@ -119,17 +119,18 @@ class Verdict(InfoPart):
         return causes
 
     def __str__(self) -> str:
-        mean = f"within {_size(abs(self.z))}"
+        size = _size(abs(self.z))
+        mean = f"the mean pulse is within {size}"
         if self.beyond_ns:
             first, last = self.beyond_ns
             when = (
                 f"from {first:.0f} to {last:.0f} ns" if first < last else f"at {first:.0f} ns"
             )
-            mean = f"off by {_size(abs(self.z))}, {when} after the half height"
+            mean = f"the mean pulse is off by {size}, {when} after the half height"
         return (
-            f"{'good' if self.good else 'bad'}: the mean pulse is {mean}, chi-square of its "
-            f"slices is {self.chi_square:.2f} per sample, of the amplitude "
-            f"{self.amplitude:.2f}, a classifier has an AUC of {self.auc:.2f}"
+            f"{'good' if self.good else 'bad'}: {mean}, chi-square of its slices is "
+            f"{self.chi_square:.2f} per sample, of the amplitude {self.amplitude:.2f}, a "
+            f"classifier has an AUC of {self.auc:.2f}"
         )
 
 
