@@ -6,7 +6,7 @@ those of the responses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,10 +80,13 @@ class Noise:
 
     def of(self, rows: Samples | npt.NDArray[np.bool_] | slice) -> Noise:
         """Noise of some of the pulses."""
-        drawn = self.trace, self.start, self.factor
-        trace, start, factor = (np.ascontiguousarray(of[:, rows]) for of in drawn)
-        left = None if self.left is None else self.left[:, rows]
-        return Noise(self.traces, trace, start, factor, left, self.decay)
+        return replace(
+            self,
+            trace=np.ascontiguousarray(self.trace[:, rows]),
+            start=np.ascontiguousarray(self.start[:, rows]),
+            factor=np.ascontiguousarray(self.factor[:, rows]),
+            left=None if self.left is None else self.left[:, rows],
+        )
 
     def add(self, records: FloatArray, draw: int) -> FloatArray:
         """Records of the pulses with the noise of a draw."""
