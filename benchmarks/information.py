@@ -20,6 +20,7 @@ import numpy as np
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.electronics.measured import noise_of
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import load_pulses
@@ -29,7 +30,6 @@ from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.recipes import load_recipe
 from cpunet.training.chain_fit import Fitter
-from cpunet.training.job import known_response
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
 from cpunet.training.run import Run
@@ -68,7 +68,9 @@ def experiment(
 ) -> tuple[Pulses, Pulses, np.ndarray]:
     """Half of the pulses, the others with a known response as data, and true amplitudes."""
     half, config = len(sim) // 2, RECIPE.preparation
-    response = known_response(Run.load(run), RECIPE)
+    known = Run.load(run)
+    chain = ResponseGenerator(known.recipe.matching.generator, known.dt_ns)
+    response = known.fill("ren", chain).response
     kev = sim.energy_kev[half:]
 
     def records(pulses: np.ndarray) -> np.ndarray:

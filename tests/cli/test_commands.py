@@ -135,7 +135,6 @@ check | SIDES | D/data.lh5
 check | SIDES --data-energy D/hits.lh5:ch1/hit/energy | D/hits.lh5
 train | SIDES | D
 train | --sim sim.lh5 --data data.lh5 --data-energy D/hits.lh5:ch1/hit/energy | D
-train | --sim sim.lh5 --data data.lh5 --init RUN | RUN
 calibrate | SIDES | D
 translate | RUN D/sim.lh5 | D/sim.lh5
 translate | RUN sim.lh5 | RUN/weights.safetensors

@@ -1,11 +1,8 @@
-"""Checkpoints: the same bits after a crash as without one, and one line if one is damaged."""
+"""Checkpoints: what was stored comes back, and one line if it cannot be used."""
 
 from __future__ import annotations
 
 import io
-import json
-import shutil
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,25 +10,10 @@ import torch
 
 from cpunet import outputs
 from cpunet.errors import CpunetError
-from cpunet.training.adversarial import Game, train
-from cpunet.training.run import LOSSES, WEIGHTS
 from cpunet.training.unfinished import CHECKPOINT, UnfinishedRun, unfinished_folder
-from games import game_of
 from synthetic import nearly_full_disk
 
-N = 5
-
-
-def recipe_of(tiny, *overrides: str):
-    return tiny(f"training.iterations={N}", "training.checkpoint_interval=2", *overrides)
-
-
-def weights(game: Game) -> dict[str, bytes]:
-    return {name: v.numpy().tobytes() for name, v in game.average.state_dict().items()}
-
-
-def unfinished(folder: Path, **facts: object) -> UnfinishedRun:
-    return UnfinishedRun(folder, facts)
+FACTS = {"recipe": {"training": {"batch_size": 4}}, "seed": 3}
 
 
 def state(value: float = 0.0) -> dict:
@@ -46,7 +28,8 @@ def state(value: float = 0.0) -> dict:
 
 def kept(folder: Path, value: float = 0.0) -> UnfinishedRun:
     """A training that has stored a state."""
-    run = unfinished(folder)
+    run = UnfinishedRun(folder, FACTS)
+    run.records = [{"iteration": 6, "rate": 0.1, "losses": {}}]
     run.save(state(value))
     return run
 
@@ -54,7 +37,10 @@ def kept(folder: Path, value: float = 0.0) -> UnfinishedRun:
 def test_a_state_comes_back(tmp_path):
     run = kept(tmp_path, 1.0)
     run.save(state(2.0))
-    assert str(unfinished(tmp_path).begin(resume=True)) == str(state(2.0))
+    again = UnfinishedRun(tmp_path, FACTS)
+    assert str(again.begin(resume=True)) == str(state(2.0))
+    assert (again.records, again.started) == (run.records, run.started)
+    assert again.resumed_at == [7]
     assert [p.name for p in tmp_path.iterdir()] == [CHECKPOINT]
 
 
@@ -72,112 +58,61 @@ def test_a_damaged_checkpoint_is_told(tmp_path, damage):
     path = tmp_path / CHECKPOINT
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(CpunetError, match=rf"{CHECKPOINT}: damaged; begin again with `force`"):
-        unfinished(tmp_path).begin(resume=True)
+        UnfinishedRun(tmp_path, FACTS).begin(resume=True)
 
 
 class Interrupted(BaseException):
     """As if the process had died there."""
 
 
-def work(recipe, out: Path, *, resume=False, die=None, disk=None, seed=3):
-    """Train in a folder, as the job does; `die` after so many records."""
-    with unfinished_folder(out, resume=resume) as folder:
-        run = unfinished(folder, recipe=recipe.model_dump(mode="json"), seed=seed)
-        start = run.begin(resume=resume)
-
-        def listen(records):
-            run.records += records
-            if die is not None and records[-1]["iteration"] >= die:
-                raise Interrupted
-
-        def save(state):
-            with nearly_full_disk(disk if state["iteration"] == 4 and disk else 2**40):
-                run.save(state)
-
-        how = {"listener": listen, "save": save, "start": start}
-        game = train(partial(game_of, recipe), seed, **how)
-        out.mkdir()
-        (out / WEIGHTS).write_bytes(b"".join(weights(game).values()))
-        (out / LOSSES).write_text(json.dumps(run.records))
+def dying(out: Path, *, checkpoint: bool) -> None:
+    with unfinished_folder(out) as folder:
+        if checkpoint:
+            kept(folder)
+        raise Interrupted
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in folder.iterdir()}
-
-
-@pytest.fixture
-def recipe(tiny):
-    return recipe_of(tiny, "training.log_interval=1")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """Where trainings are that several tests begin with."""
-    return tmp_path_factory.mktemp("made")
-
-
-@pytest.fixture
-def whole(recipe, made) -> dict[str, bytes]:
-    """What a training in one go leaves."""
-    if not (made / "whole").exists():
-        work(recipe, made / "whole")
-        assert not (made / "whole.unfinished").exists()
-    return content(made / "whole")
-
-
-@pytest.fixture
-def out(recipe, made, tmp_path) -> Path:
-    """Of a training that died in its last iteration, after checkpoints at 2 and 4."""
-    if not beside(made / "died").exists():
-        with pytest.raises(Interrupted):
-            work(recipe, made / "died", die=4)
-    shutil.copytree(beside(made / "died"), beside(tmp_path / "run"))
-    return tmp_path / "run"
-
-
-def beside(out: Path) -> Path:
-    return out.with_name(f"{out.name}.unfinished")
-
-
-def test_a_training_that_died_is_finished(recipe, out, whole, caplog):
+def test_a_training_that_died_leaves_its_checkpoint_until_it_is_finished(tmp_path, caplog):
     caplog.set_level("INFO", "cpunet")
-    assert {CHECKPOINT, outputs.MARKER} == content(beside(out)).keys()
-    assert not out.exists()
-    work(recipe, out, resume=True)
-    assert caplog.messages == ["going on after 4 iterations"]
-    assert content(out) == whole
-    assert not beside(out).exists()
-
-
-def test_without_resume_nothing_is_lost(recipe, out):
-    before = content(beside(out))
-    with pytest.raises(CpunetError, match=r"run\.unfinished: an unfinished training; continue"):
-        work(recipe, out)
-    assert content(beside(out)) == before
-
-
-def test_another_recipe_or_seed(recipe, tiny, out):
-    before = content(beside(out)).keys()
-    other = recipe_of(tiny, "training.log_interval=1", "training.batch_size=5")
-    with pytest.raises(
-        CpunetError, match=r"^resumed with another recipe: training\.batch_size 4 → 5; give"
-    ):
-        work(other, out, resume=True)
-    with pytest.raises(CpunetError, match=r"^resumed with another seed: 3 → 4; give"):
-        work(recipe, out, resume=True, seed=4)
-    assert content(beside(out)).keys() == before
-
-
-def test_a_full_disk_does_not_stop_the_training(recipe, tmp_path, whole, caplog):
-    out = tmp_path / "run"
-    work(recipe, out, disk=3000)
-    (note,) = caplog.messages
-    assert note.startswith(f"{beside(out)}: no checkpoint after 4 iterations (")
-    assert note.endswith("; the previous remains")
-    assert content(out) == whole
-
-
-def test_what_never_had_a_checkpoint_leaves_nothing(recipe, tmp_path):
+    out, folder = tmp_path / "run", tmp_path / "run.unfinished"
     with pytest.raises(Interrupted):
-        work(recipe, tmp_path / "run", die=0)
+        dying(out, checkpoint=True)
+    left = {p.name: p.read_bytes() for p in folder.iterdir()}
+    assert left.keys() == {CHECKPOINT, outputs.MARKER}
+    message = r"run\.unfinished: an unfinished training; continue"
+    with pytest.raises(CpunetError, match=message), unfinished_folder(out):
+        pass
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == left
+    with unfinished_folder(out, resume=True):
+        assert UnfinishedRun(folder, FACTS).begin(resume=True) is not None
+    assert caplog.messages == ["going on after 7 iterations"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "difference"),
+    [
+        ({"recipe": {"training": {"batch_size": 5}}}, r"recipe: training\.batch_size 4 → 5"),
+        ({"seed": 4}, "seed: 3 → 4"),
+    ],
+)
+def test_another_recipe_or_seed(tmp_path, changed, difference):
+    kept(tmp_path)
+    with pytest.raises(CpunetError, match=rf"^resumed with another {difference}; give"):
+        UnfinishedRun(tmp_path, FACTS | changed).begin(resume=True)
+
+
+def test_a_full_disk_does_not_stop_the_training(tmp_path, caplog):
+    run = kept(tmp_path, 1.0)
+    with nearly_full_disk(300):
+        run.save(state(2.0))
+    (note,) = caplog.messages
+    assert note.startswith(f"{tmp_path}: no checkpoint after 7 iterations (")
+    assert note.endswith("; the previous remains")
+    assert str(UnfinishedRun(tmp_path, FACTS).begin(resume=True)) == str(state(1.0))
+
+
+def test_what_never_had_a_checkpoint_leaves_nothing(tmp_path):
+    with pytest.raises(Interrupted):
+        dying(tmp_path / "run", checkpoint=False)
     assert list(tmp_path.iterdir()) == []

@@ -77,9 +77,3 @@ def test_correlations_are_those_of_the_errors(made):
     # what comes late is not there early
     late, later = (names.index(f"missing_{ns}_ns") for ns in (500, 1000))
     assert matrix[late, later] > 0.5
-
-
-def test_one_run_has_no_page(made, tmp_path):
-    _, runs = made
-    response(runs[0], out=tmp_path / "one")
-    assert not (tmp_path / "one" / "response.html").exists()

@@ -16,7 +16,6 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
-from games import untrained
 from synthetic import (
     KEV,
     SMALL_NETWORK,
@@ -24,7 +23,6 @@ from synthetic import (
     load_recipe,
     write_files,
     write_pulses,
-    write_run,
 )
 
 RECIPE = load_recipe(
@@ -43,22 +41,6 @@ N = 30
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """Simulated and measured pulses, every third on the full-energy peak."""
     return write_files(tmp_path_factory.mktemp("files"), np.resize(KEV, N))
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder with untrained weights."""
-    folder = tmp_path_factory.mktemp("run")
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        info = {"recipe": "published", "peak": "FEP", "seed": 0, "dt_ns": 16.0}
-        write_run(
-            folder,
-            untrained(RECIPE),
-            RECIPE,
-            info | {"seconds": 1, "device": "cpu"},
-        )
-    return folder
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +31,6 @@ SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
 TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which tails are added
 
 
-class KnownDecay(NamedTuple):
-    """Decay time in us and its relative error."""
-
-    us: float
-    relative_error: float
-
-
 @dataclass(frozen=True, eq=False)
 class DrawnTails:
     """Tails to be drawn and added to records.
@@ -54,8 +47,6 @@ class DrawnTails:
         Sampling period in ns.
     passed
         Probability of passing the cuts of the data at `SIZES_KEV`. None if there are no cuts.
-    decay_error_us
-        Error in us of the decay time of the law, if it was measured from tails.
     """
 
     law: TailsLaw
@@ -63,14 +54,6 @@ class DrawnTails:
     lead_us: float
     dt_ns: float
     passed: tuple[float, ...] | None = None
-    decay_error_us: float | None = None
-
-    @property
-    def known_decay(self) -> KnownDecay | None:
-        """The decay time, if it was measured from tails."""
-        if self.decay_error_us is None:
-            return None
-        return KnownDecay(self.law.decay_us, self.decay_error_us / self.law.decay_us)
 
     def uncut(self, rate_khz: float | None = None) -> Self:
         """Copy without cuts, optionally with another rate in kHz."""
@@ -109,7 +92,6 @@ class DrawnTails:
     def describe(self) -> dict[str, float | list[float] | None]:
         """Serialise to a mapping that `of` reads."""
         values: dict[str, Any] = plain(asdict(self))
-        del values["decay_error_us"]
         return {**values.pop("law"), **values}
 
     @classmethod

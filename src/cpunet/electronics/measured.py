@@ -91,7 +91,6 @@ def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) ->
         lead_us=begins * data.dt_ns * 1e-3,
         dt_ns=data.dt_ns,
         passed=passed,
-        decay_error_us=tails.decay_error_us,
     )
 
 

@@ -192,9 +192,6 @@ class ElectronicsResponse(Stored):
     (0.98413, 0.98413)
     """
 
-    decay_known: float | None = None
-    """Relative error of the main decay, if baselines determine it."""
-
     def __init__(self, config: ResponseConfig, dt_ns: float) -> None:
         self.config, self.dt_ns = config, np.array(float(dt_ns))
         self.log_poles_ns = np.log(config.poles_ns)

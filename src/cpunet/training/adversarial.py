@@ -28,7 +28,7 @@ from torch.nn.functional import pad, softplus
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.recipes import schema
-from cpunet.training.judging import JUDGED, Judge, judged
+from cpunet.training.judging import JUDGED, Judge
 from cpunet.training.optimisers import Optimisers
 from cpunet.training.run import Record
 from cpunet.training.sides import Sides
@@ -263,6 +263,26 @@ class Game:
             new = own[name]
             value.copy_(new.lerp(value, keep) if value.is_floating_point() else new)
 
+    @torch.no_grad()
+    def judged(self) -> dict[str, float]:
+        """Part of pairs that critics order rightly: of the training, and of unseen pulses."""
+        results, n = dict(self.right), self.config.batch_size
+        if not self.judge.unseen:
+            return results
+        rows, others = (side.draw(n, unseen=True) for side in self.sides[:2])
+        x, y = self.sides.sim.pulses[rows], self.sides.data.pulses[others]
+        pairs = {
+            "data": (y, self.sides.noisy(self.ren(x), rows)),
+            "sim": (self.with_noise(rows), self.iren(y)),
+        }
+        for side, pair in pairs.items():
+            real, fake = (self.critics[side](self.views[side](pulses)) for pulses in pair)
+            results[f"{side}_unseen"] = right = float((real > fake).float().mean())
+            self.judge.add(side, right, self.iteration / self.config.iterations)
+        if self.judge.good("data"):
+            self.good.load_state_dict(self.average.state_dict())
+        return results
+
     def averaged(self, part: str) -> Generator:
         """The average of ``"ren"`` or ``"iren"``, for use."""
         network = self.average[part]
@@ -297,7 +317,7 @@ def train(
             stop = bool(waiting) and done < c.iterations
             keep = stop or done == c.iterations or done % c.checkpoint_interval == 0
             if done % JUDGED == 0:
-                records[-1]["accuracy"] = judged(game)
+                records[-1]["accuracy"] = game.judged()
             of_weights = [float(p.sum()) for p in game.average.parameters()] if keep else []
             if not all(map(math.isfinite, (*losses.values(), *of_weights))):
                 text = f"a loss or weight is not finite in iteration {done - 1} (seed {seed})"

@@ -147,7 +147,6 @@ def summary(run: Run) -> list[tuple[str, str]]:
             f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; "
             f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}",
         ),
-        ("from", run.init or ""),
         ("simulated", _side(run.sim)),
         ("measured", _side(run.data)),
         ("fit", fit.verdict),

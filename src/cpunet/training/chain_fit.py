@@ -22,7 +22,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import MatchingConfig
@@ -41,8 +40,6 @@ DAMPING, MORE, TRIES = 0.03, 8.0, 5
 # Chi-square per function above which a fit has missed its valley, or has none.
 POOR = 5.0
 SLOW = 0.03  # share by which a step must lower a chi-square that is as poor as that
-STRETCHED = 0.004  # change of the stretch of the drift, for its derivatives
-
 
 Listener = Callable[[int, float], None]
 
@@ -55,8 +52,6 @@ class Fitter:
     ----------
     training
         Settings of the fits.
-    decay
-        Main decay from pile-up tails, if these determine it.
     listener
         Called with the number of steps so far, and chi-square.
     steps
@@ -66,7 +61,6 @@ class Fitter:
     """
 
     training: MatchingConfig
-    decay: KnownDecay | None = None
     listener: Listener | None = None
     steps: int = 0
     gains: dict[str, str] = field(default_factory=dict)
@@ -164,8 +158,8 @@ def chi_square(
     """
     compared = []
     for sides in bands:
-        comparison = Comparison(sides.entering(response), width)
-        compared += comparison.differences(response.transfer(sides.padded))
+        transfer = response.transfer(sides.padded)
+        compared += Comparison(sides.entering(response), transfer, width).differences()
     shares = [(0.5 if d.sliced else 1.0) * len(d.values) for d in compared]
     return sum(n * d.chi_square for n, d in zip(shares, compared, strict=True)), sum(shares)
 
@@ -299,10 +293,7 @@ def _parabola(
 
 def differences(parameters: SmoothParameters, comparison: Joint) -> Difference:
     """Differences of both sides, with derivatives in the coordinates of a chain."""
-    response, padded = parameters.response, comparison.sides.padded
-    sim, changes = comparison.sides.sim, []
-    for low, high in parameters.stretches(STRETCHED):  # the last coordinates
-        change = (high.drifted(sim) - low.drifted(sim)) / (2 * STRETCHED)
-        changes.append(np.asarray(change, np.float32))
-    transfer, basis = response.transfer(padded), parameters.basis(padded)
-    return comparison.entering(response).difference(transfer, basis, changes)
+    response, sides = parameters.response, comparison.sides
+    transfer, basis = response.transfer(sides.padded), parameters.basis(sides.padded)
+    here = comparison.with_sides(sides.entering(response))
+    return here.difference(transfer, basis, parameters.changes(sides.sim))

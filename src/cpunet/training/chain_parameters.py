@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import scipy.fft
 
-from cpunet.electronics.drawn_pile_up import KnownDecay
 from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, deviation_lags
+from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Values
 from cpunet.training.derivatives import Basis
 
@@ -22,8 +22,9 @@ TIME_WIDTH = 1.0
 STRETCH, STRETCH_WIDTHS = "drift.stretch", (0.1, 0.05)
 # The same of what is no time: half of the charge may be slow, and the main decay dominates.
 SCALES = {DECAY_WEIGHTS: 0.03, "slow_weights": 0.1, "sharpness": 0.5}
-# Step of differences in widths of the priors, for what is computed in double precision.
-STEP = 1e-5
+# Step of differences in widths of the priors, for what is computed in double precision and
+# differs in proportion; change of the stretch of the drift for its derivatives.
+STEP, STRETCHED = 1e-5, 0.004
 
 
 class Parameters:
@@ -44,15 +45,13 @@ class Parameters:
         self._names = [f"{n}.{i}" for n, p in named for i in range(1, len(p) + 1)]
         self.centre = self.vector()
         self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
-        if response.decay_known is not None:
-            self.widths[self.labels.index(DECAY)] = response.decay_known
         self.longest = self.widths.copy()
         self.low = np.full(len(self.centre), -np.inf)
         self.high = -self.low
         of_samples = [label == "sharpness" for label in self.labels]
         self.low[of_samples], self.high[of_samples] = 0.0, 1.0  # from means to points
-        self.stretched = [i for i, label in enumerate(self.labels) if label == STRETCH]
-        self.widths[self.stretched] = STRETCH_WIDTHS[: len(self.stretched)]
+        stretched = [label == STRETCH for label in self.labels]
+        self.widths[stretched] = STRETCH_WIDTHS[: sum(stretched)]
 
     def vector(self) -> Values:
         """Parameters as a vector."""
@@ -69,10 +68,18 @@ class Parameters:
         """Widths of all parameters but a stretch, and how the spectrum changes with each."""
         slopes: list[tuple[float, Spectrum]] = []
         for i, label in enumerate(self.labels):
-            if label != STRETCH:
-                a, b, step = self.ends(i)
-                change = (b.transfer(padded) - a.transfer(padded)) / step
-                slopes.append((float(self.widths[i]), change))
+            if label == STRETCH:
+                continue
+            here, step, spectra = self.vector(), STEP * self.widths[i], []
+            low, high = max(here[i] - step, self.low[i]), here[i] + step
+            for end in (low, high):
+                moved = here.copy()
+                moved[i] = end
+                self.set(moved)
+                spectra.append(self.response.transfer(padded))
+            self.set(here)
+            change = (spectra[1] - spectra[0]) / (high - low)
+            slopes.append((float(self.widths[i]), change))
         return slopes
 
     def basis(self, padded: int) -> Basis:
@@ -82,31 +89,19 @@ class Parameters:
         steps = scipy.fft.irfft(changes, padded)
         return Basis(int(lags[0]), np.ascontiguousarray(steps[:, lags].T))
 
-    def stretches(self, step: float) -> list[tuple[ElectronicsResponse, ElectronicsResponse]]:
-        """Copies of the response with each term of a stretch smaller and larger by a step."""
-        pairs = []
-        for i in self.stretched:
-            ends = copy.deepcopy(self.response), copy.deepcopy(self.response)
-            for end, sign in zip(ends, (-1, 1), strict=True):
-                assert end.drift is not None
-                end.drift.stretch[i - self.stretched[0]] += sign * step
-            pairs.append(ends)
-        return pairs
-
-    def ends(self, i: int) -> tuple[ElectronicsResponse, ElectronicsResponse, float]:
-        """Copies of the response on both sides of it along a coordinate, and their distance.
-
-        What they compute in double precision differs in proportion.
-        """
-        here, step, ends = self.vector(), STEP * self.widths[i], []
-        low, high = max(here[i] - step, self.low[i]), here[i] + step
-        for end in (low, high):
-            moved = here.copy()
-            moved[i] = end
-            self.set(moved)
-            ends.append(copy.deepcopy(self.response))
-        self.set(here)
-        return ends[0], ends[1], high - low
+    def changes(self, sim: FloatArray) -> list[FloatArray]:
+        """Changes of simulated pulses with each term of a stretch, the last parameters."""
+        clock, changes = self.response.drift, list[FloatArray]()
+        for i in range(0 if clock is None else len(clock.stretch)):
+            ends = []
+            for sign in (-1, 1):
+                moved = copy.deepcopy(self.response)
+                assert moved.drift is not None
+                moved.drift.stretch[i] += sign * STRETCHED
+                ends.append(moved.drifted(sim))
+            change = (ends[1] - ends[0]) / (2 * STRETCHED)
+            changes.append(np.asarray(change, np.float32))
+        return changes
 
     def by_name(self, values: Values) -> dict[str, float]:
         """Values of the parameters by name and number."""
@@ -229,19 +224,9 @@ class SmoothParameters(Parameters):
         return float(1 - plain[self._shares].sum())
 
 
-# Minimum relative error of a main decay from pile-up tails: these are fitted
-# with an exponential, and a readout may have more.
-MIN_DECAY_ERROR = 0.01
-
-
-def with_decay(
-    response: ElectronicsResponse, slope: float, decay: KnownDecay | None = None
-) -> ElectronicsResponse:
-    """A response, its main decay set to that of the data: by pile-up, or by the tails."""
-    if decay is not None:
-        response.log_decay_us[:] = math.log(decay.us)
-        response.decay_known = max(decay.relative_error, MIN_DECAY_ERROR)
-    elif slope < 0:
+def with_decay(response: ElectronicsResponse, slope: float) -> ElectronicsResponse:
+    """A response, its main decay set to that of the data's tails."""
+    if slope < 0:
         response.log_decay_us[:] = math.log(-float(response.dt_ns) * 1e-3 / slope)
     return response
 
@@ -255,5 +240,4 @@ def with_settings(response: ElectronicsResponse, **settings: Any) -> Electronics
         if name in old:
             n = min(values.size, old[name].size)
             values.reshape(-1)[:n] = old[name].reshape(-1)[:n]
-    copied.decay_known = response.decay_known
     return copied

@@ -264,13 +264,12 @@ def compare_sides(
         findings += [Finding(Level.WARNING, note) for note in notes]
     except CpunetError as error:
         return [*findings, _refusal(error)]
-    too_short = [*_too_short(sim, preparation)]
-    findings += too_short
+    findings += (too_short := _too_short(sim, preparation))
     for inputs, side in ((sim, "simulated"), (data, "measured")):
         n = len(inputs.prepared)
         text = f"{inputs.path.name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
         remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
-        findings += [_judged(text, remedy, n >= FEW, n < MIN_PULSES)]
+        findings.append(_judged(text, remedy, n >= FEW, n < MIN_PULSES))
         findings += _lines(inputs, side, selection)
         if not too_short:  # else pulses in their own baselines would be blamed on others
             findings += _left_out(inputs, side)
@@ -279,11 +278,9 @@ def compare_sides(
     if not too_short:
         findings.append(_spread(sim, data))
     # no readout increases current amplitudes much
-    highest = [
-        float(np.nanquantile(current_amplitude(_of_height_one(inputs), inputs.dt_ns), 0.9))
-        for inputs in (sim, data)
-    ]
-    ratio = highest[1] / highest[0]
+    amplitudes = (current_amplitude(_of_height_one(of), of.dt_ns) for of in (sim, data))
+    simulated, measured = (float(np.nanquantile(of, 0.9)) for of in amplitudes)
+    ratio = measured / simulated
     text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
     remedy = (
         "electronics cannot make pulses sharper: another detector, too wide a cloud, or other "
@@ -303,16 +300,14 @@ def _refusal(error: CpunetError) -> Finding:
     return Finding(Level.ERROR, error.text, error.remedy)
 
 
+LONGER = (
+    "write longer ones, or allow more padding (preparation.padding_before_ns, padding_after_ns "
+    "in `settings`)"
+)
 REMEDIES = {
     Rejection.SATURATED: "saturated traces have lost their top; choose lower energies",
-    Rejection.WINDOW_OUTSIDE_RECORD: (
-        "the traces are shorter than the window; write longer ones, or allow more padding "
-        "(preparation.padding_before_ns, padding_after_ns in `settings`)"
-    ),
-    Rejection.PULSE_AT_EDGE: (
-        "the traces end too soon before or after the pulse; write longer ones, or allow more "
-        "padding (preparation.padding_before_ns, padding_after_ns in `settings`)"
-    ),
+    Rejection.WINDOW_OUTSIDE_RECORD: f"the traces are shorter than the window; {LONGER}",
+    Rejection.PULSE_AT_EDGE: f"the traces end too soon before or after the pulse; {LONGER}",
     Rejection.NO_PLATEAU: (
         "pulses still rise long after half of their height: drift is longer than the window; "
         "lengthen it (preparation.after_ns in `settings`)"
@@ -320,17 +315,18 @@ REMEDIES = {
     Rejection.SECOND_PULSE: "another pulse follows within the window: in-trace pile-up",
     Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
     Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
-    Rejection.BASELINE_SLOPE: ("baselines are not flat: pile-up tails (cpunet info --quality)"),
+    Rejection.BASELINE_SLOPE: "baselines are not flat: pile-up tails (cpunet info --quality)",
     Rejection.CHI2: "tails are no exponentials: pile-up",
     Rejection.COPIES: "these rows were written twice; write the file anew",
     Rejection.NO_AMPLITUDE: "the polarity may be reversed, or these are noise",
 }
 
 
-def _too_short(sim: InputSet, preparation: PreparationConfig) -> Iterator[Finding]:
+def _too_short(sim: InputSet, preparation: PreparationConfig) -> list[Finding]:
     """Warn if simulated pulses reach into the baseline or the tail of a window."""
+    findings = list[Finding]()
     if preparation.align_at != "half_height":
-        return
+        return findings
     waveforms, at = _of_height_one(sim), preparation.at(sim.dt_ns).samples_before
     begin = at - (waveforms > BEGUN).argmax(axis=1)
     end = waveforms.shape[1] - (waveforms[:, ::-1] < 1 - BEGUN).argmax(axis=1) - at
@@ -340,21 +336,22 @@ def _too_short(sim: InputSet, preparation: PreparationConfig) -> Iterator[Findin
     ):
         longest_ns = float(np.quantile(samples, LONGEST)) * sim.dt_ns
         if longest_ns > (room_ns := window_ns - taken_ns):
-            wanted = window_ns + longest_ns - room_ns
-            yield Finding(
-                Level.WARNING,
+            text = (
                 f"the window is shorter than the drift: pulses {what} up to "
                 f"{longest_ns:.0f} ns {where} half of their height, for which it has "
-                f"{room_ns:.0f} ns",
-                f"preparation.{where}_ns={100 * math.ceil(wanted / 100)} in `settings`",
+                f"{room_ns:.0f} ns"
             )
+            wanted = 100 * math.ceil((window_ns + longest_ns - room_ns) / 100)
+            remedy = f"preparation.{where}_ns={wanted} in `settings`"
+            findings.append(Finding(Level.WARNING, text, remedy))
+    return findings
 
 
 def _left_out(inputs: InputSet, side: str) -> Iterator[Finding]:
     """Warn of reasons for which a large share of the selected pulses is left out."""
-    counts = dict(inputs.prepared.rejections)
-    for reason in (Rejection.ENERGY_OUTSIDE_SELECTION, Rejection.ENERGY_UNKNOWN):
-        counts.pop(reason.label, None)
+    unselected = {Rejection.ENERGY_OUTSIDE_SELECTION.label, Rejection.ENERGY_UNKNOWN.label}
+    rejections = inputs.prepared.rejections.items()
+    counts = {label: n for label, n in rejections if label not in unselected}
     selected = len(inputs.prepared) + sum(counts.values())
     for label, n in counts.items():
         if n > LOST * selected or label == Rejection.COPIES.label:
@@ -364,21 +361,18 @@ def _left_out(inputs: InputSet, side: str) -> Iterator[Finding]:
 
 
 def _lines(inputs: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
-    """Check the position of the highest gamma line."""
-    # the highest line has no neighbours
+    """Check the position of the highest gamma line, which has no neighbours."""
     highest = sorted(selection.peaks.items(), key=lambda item: item[1].energy_kev)[-1:]
     for name, line in highest:
         line_kev = line_near(inputs.energies_kev, line.energy_kev)
         if line_kev is None:
             continue
-        off = line_kev - line.energy_kev
+        off, factor = line_kev - line.energy_kev, line.energy_kev / line_kev
         text = f"{inputs.path.name}: line {name} of the {side} pulses at {line_kev:.1f} keV"
-        fine = abs(off) <= OFF_LINE
-        text += "" if fine else f", {off:+.1f} keV from where it should be"
-        factor = line.energy_kev / line_kev
+        if not (fine := abs(off) <= OFF_LINE):
+            text += f", {off:+.1f} keV from where it should be"
         how = ", as by `kev_per_adc`," if side == "measured" else " in its file"
-        remedy = f"energies times {factor:.5f}{how} would put it right"
-        yield _judged(text, remedy, fine)
+        yield _judged(text, f"energies times {factor:.5f}{how} would put it right", fine)
 
 
 def _spread(sim: InputSet, data: InputSet) -> Finding:
@@ -403,14 +397,12 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
         simulated = rises(high)
 
     def range_(values: Values) -> float:
-        low, high = np.quantile(values, (0.05, 0.95))
-        return float(high - low)
+        return float(np.ptp(np.quantile(values, (0.05, 0.95))))
 
-    ranges = [range_(rise) for rise in (simulated, measured)]
-    errors = [
-        np.std([range_(rise[k::PARTS]) for k in range(PARTS)]) / PARTS**0.5
-        for rise in (simulated, measured)
-    ]
+    ranges, errors = [], []
+    for rise in (simulated, measured):
+        ranges.append(range_(rise))
+        errors.append(np.std([range_(rise[k::PARTS]) for k in range(PARTS)]) / PARTS**0.5)
     text = "drift times (10 to 50 %) spread over {:.0f} ns simulated, {:.0f} ns measured"
     ratio = ranges[1] / max(ranges[0], 1e-9)
     chance = float(np.hypot(SURE * np.hypot(*errors), ROUNDING * dt_ns))

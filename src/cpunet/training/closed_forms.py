@@ -188,11 +188,8 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     taus = moved_apart([*poles, *response.slow_ns.tolist(), 1e3 * main, *fast_ns])
     n, n_slow = len(poles), len(slow)
     slow_taus = taus[n : n + n_slow]
-    undecayed = Exponentials.of_real(
-        1 - sum(slow),
-        slow_taus,
-        [weight / tau for weight, tau in zip(slow, slow_taus, strict=True)],
-    )
+    rates = [weight / tau for weight, tau in zip(slow, slow_taus, strict=True)]
+    undecayed = Exponentials.of_real(1 - sum(slow), slow_taus, rates)
     for tau in taus[:n]:
         undecayed = undecayed * Exponentials.low_pass(tau)
     shares, decays = [1 - sum(fast), *fast], taus[n + n_slow :]
@@ -313,8 +310,8 @@ def error_ends(
         _, sizes, axes = np.linalg.svd(response.deviation_draws, full_matrices=False)
         for axis in (sizes[:, np.newaxis] * axes)[:MAX_AXES]:
             pair = copy.deepcopy(response), copy.deepcopy(response)
-            for end, sign in zip(pair, (1, -1), strict=True):
-                end.deviation += sign * axis
+            pair[0].deviation += axis
+            pair[1].deviation -= axis
             ends.append(pair)
         return ends
     moved = copy.deepcopy(response)

@@ -21,8 +21,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,12 +33,12 @@ from cpunet.networks.by_height import ByHeight
 from cpunet.networks.response_layer import ElectronicsResponse, padded_length
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Floats, Frame, Samples, Values, read
-from cpunet.training.derivatives import Basis, Derivatives
 from cpunet.training.drawn_noise import Noise
 
 Spectrum = npt.NDArray[np.complexfloating[Any, Any]]
-# Derivatives of pulses that are aligned, in coordinates of whatever moves these.
-Moved = Callable[["Sides", Aligned], Any]
+# Derivatives of aligned pulses, given the heights of their records before, in coordinates of
+# whatever moves these.
+Moved = Callable[["Sides", Aligned, Floats], Any]
 
 MOST = 4096  # pulses of each side that are compared
 PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
@@ -85,8 +84,11 @@ class Sides:
     ----------
     current, charge
         Of the simulated pulses within records.
-    data
-        Measured pulses that are single.
+    data, data_view
+        Measured pulses that are single, and their means over the stretches.
+    first, widths, time_ns
+        First sample and samples of each stretch that is compared, and its middle in ns from the
+        half height.
     left_out
         Number of the others.
     by_height
@@ -129,10 +131,23 @@ class Sides:
         self.spectra = scipy.fft.rfft(self.current, self.padded)
 
     def divide(self) -> None:
-        """Divide pulses into stretches, of which few pulses have few."""
-        self.first = _stretches(self.frame, min(len(self), len(self.data)))
-        self.widths = np.diff(np.append(self.first, self.frame.length))
-        self.__dict__.pop("time_ns", None)
+        """Divide pulses into stretches; the fewer pulses, the longer stretches."""
+        frame, most = self.frame, FEWEST * min(len(self), len(self.data))
+        fine, coarse = (max(1, round(ns / frame.dt_ns)) for ns in (FINEST_NS, COARSE_NS))
+        while True:
+            first, at = list[int](), 0
+            while at < frame.length:
+                first.append(at)
+                dense = DENSE_NS[0] <= (at - frame.before) * frame.dt_ns < DENSE_NS[1]
+                at += fine if dense else max(fine, coarse)
+            if len(first) <= most or fine > coarse:
+                break
+            fine *= 2
+        self.first = np.array(first)
+        self.widths = np.diff(np.append(self.first, frame.length))
+        middle = self.first + 0.5 * (self.widths - 1) - frame.before
+        self.time_ns: Values = np.asarray(middle * frame.dt_ns)
+        self.data_view = self.view(self.data.pulses)
 
     def __len__(self) -> int:
         return len(self.current)
@@ -189,12 +204,6 @@ class Sides:
         quiet: npt.NDArray[np.bool_] = np.abs(base) < QUIET
         return quiet & (self._late_rms(aligned) < self.widest)
 
-    @cached_property
-    def time_ns(self) -> Values:
-        """Middle of each stretch from the half height."""
-        middle = self.first + 0.5 * (self.widths - 1) - self.frame.before
-        return np.asarray(middle * self.frame.dt_ns)
-
     def view(self, aligned: Floats) -> Floats:
         """Means of aligned pulses over the stretches, shape (pulses, stretches)."""
         sums = np.add.reduceat(aligned, self.first, axis=1)
@@ -213,11 +222,8 @@ class Sides:
         change = np.diff(sim, axis=1, prepend=np.float32(0))
         spectra = scipy.fft.rfft(change, self.padded) * transfer.astype(np.complex64)
         records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)
-        behind = self.length - self.before
-        change_of_records = np.empty((len(sim), self.length), np.float32)
-        change_of_records[:, self.before :] = records[:, :behind]
-        change_of_records[:, : self.before] = records[:, self.padded - self.before :]
-        return np.asarray(change_of_records / heights[:, np.newaxis], np.float32)
+        inside = np.roll(records, self.before, axis=1)[:, : self.length]
+        return np.asarray(inside / heights[:, np.newaxis], np.float32)
 
     def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
         """Records with each draw of the noise, read."""
@@ -230,20 +236,6 @@ class Sides:
             charge = records * heights[:, np.newaxis].astype(np.float32)
             records = np.asarray(self.by_height(charge, self.energy_kev), np.float32)
         return read(records, self.frame)
-
-
-def _stretches(frame: Frame, pulses: int) -> npt.NDArray[np.intp]:
-    """First sample of each stretch; the fewer pulses, the longer stretches."""
-    fine, coarse = (max(1, round(ns / frame.dt_ns)) for ns in (FINEST_NS, COARSE_NS))
-    while True:
-        first, at = [], 0
-        while at < frame.length:
-            first.append(at)
-            dense = DENSE_NS[0] <= (at - frame.before) * frame.dt_ns < DENSE_NS[1]
-            at += fine if dense else max(fine, coarse)
-        if len(first) <= FEWEST * pulses or fine > coarse:
-            return np.array(first)
-        fine *= 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,159 +293,174 @@ class Difference:
         return self.name[-1].isdigit()
 
 
+class Slice(NamedTuple):
+    """Bounded functions of pulses in a slice, and what follows for their means.
+
+    Parameters
+    ----------
+    data, noisy, slopes
+        Functions of measured pulses, and of simulated ones with each draw of the noise, shape
+        (draws, pulses, functions); derivatives of those with the first.
+    rows, weights
+        The simulated pulses, and their weights, shape (draws, pulses).
+    shapes, noise
+        Covariances.
+    number, left
+        Effective number of simulated pulses, and what draws leave of the noise.
+    """
+
+    data: Values
+    noisy: Values
+    slopes: Values
+    rows: npt.NDArray[np.intp]
+    weights: Values
+    shapes: Values
+    noise: Values
+    number: float
+    left: float
+
+
 class Comparison:
-    """Differences of both sides for any response.
+    """Both sides behind a response.
 
     Parameters
     ----------
     sides
-        Pulses.
+        Pulses as they enter the readout.
+    transfer
+        Spectrum of its response.
     width
         Width of the bounded functions in robust standard deviations.
     least
         Least error of a quantile.
+
+    Attributes
+    ----------
+    noisy
+        Translated pulses with each draw of the noise.
     """
 
-    def __init__(self, sides: Sides, width: float, least: float = 1e-6) -> None:
+    def __init__(
+        self, sides: Sides, transfer: Spectrum, width: float, least: float = 1e-6
+    ) -> None:
         self.sides, self.width, self.least = sides, width, least
-        self.data = sides.view(sides.data.pulses)
+        clean, self.heights = sides.translated(transfer)
+        self.noisy = sides.noisy(clean, self.heights)
+        self._views = [sides.view(draw.pulses) for draw in self.noisy]
+        self._clean = sides.view(sides.read(clean, self.heights).pulses)
 
-    def entering(self, response: ElectronicsResponse) -> Comparison:
-        """The same of pulses after what stands before a readout."""
-        other = copy.copy(self)
-        other.sides = self.sides.entering(response)
-        return other
+    def differences(self, basis: Moved | None = None) -> list[Difference]:
+        """Differences of quantiles, then of slices, with derivatives in a basis if given."""
+        moves = None if basis is None else basis(self.sides, self.noisy[0], self.heights)
+        quantiles = [self._quantiles(by, moves) for by in RANKS]
+        return quantiles + [own for by in RANKS for own in self._slices(by, moves)]
 
-    def differences(
-        self, transfer: Spectrum, basis: Basis | Moved | None = None
-    ) -> list[Difference]:
-        """Compare the pulses translated by a response, with derivatives in a basis if given."""
-        sides = self.sides
-        clean, heights = sides.translated(transfer)
-        noisy = sides.noisy(clean, heights)
-        moves: Any = None
-        if callable(basis):
-            moves = basis(sides, noisy[0])
-        elif basis is not None:
-            moves = Derivatives(sides, sides.first, noisy[0], heights, basis)
-        views = [sides.view(draw.pulses) for draw in noisy]
-        clean_view = sides.view(sides.read(clean, heights).pulses)
-        return [
-            *(self._quantiles(by, noisy, moves) for by in RANKS),
-            *self._slices(AMPLITUDE, noisy, views, clean_view, moves),
-            *self._slices(RISE, noisy, views, clean_view, moves),
-        ]
-
-    def mean_pulse(self, transfer: Spectrum) -> Values:
+    def mean_pulse(self) -> Values:
         """Deviation of the mean of all pulses in its standard errors, by stretch.
 
         It is 0 within a sample of the half height, where all pulses are aligned.
         """
-        clean, heights = self.sides.translated(transfer)
-        noisy = self.sides.noisy(clean, heights)
-        single = self.sides.single(noisy[0])
+        single = self.sides.single(self.noisy[0])
         if single.sum() < 2:  # far from the data
             single[:] = True
-        views = [self.sides.view(draw.pulses)[single] for draw in noisy]
-        clean_view = self.sides.view(self.sides.read(clean, heights).pulses)[single]
-        n, ones = len(self.data), np.ones((len(views), int(single.sum())))
-        data, simulated, pulses, _ = self._bounded(
-            np.ones(n), views, clean_view, np.arange(len(clean_view)), _rms(views, clean_view)
+        n = len(self.sides.data)
+        whole = self._slice(
+            np.ones(n), np.ones((len(self.noisy), 1)) * single, self._rms(single)
         )
-        shapes, noise, n_sim, left = _covariances(simulated, pulses, ones)
-        variance = shapes.diagonal() * (1 / n_sim + 1 / n) + noise.diagonal() * (1 / n + left)
-        z = (pulses.mean(axis=(0, 1)) - data.mean(axis=0)) / np.sqrt(variance)
+        variance = whole.shapes.diagonal() * (1 / whole.number + 1 / n)
+        variance = variance + whole.noise.diagonal() * (1 / n + whole.left)
+        means = whole.noisy.mean(axis=(0, 1)), whole.data.mean(axis=0)
+        z = (means[0] - means[1]) / np.sqrt(variance)
         aligned = np.abs(self.sides.time_ns) <= self.sides.frame.dt_ns
         return np.where(aligned, 0.0, z)
 
-    def _quantiles(
-        self, by: str, noisy: list[Aligned], moves: Derivatives | None
-    ) -> Difference:
+    def _rms(self, rows: Any) -> Values:
+        """RMS of the noise in each stretch."""
+        noise = self._views[0][rows] - self._clean[rows]
+        return np.asarray(np.sqrt(np.mean(noise**2, axis=0, dtype=float)))
+
+    def _quantiles(self, by: str, moves: Any) -> Difference:
         """Quantiles of a quantity."""
         own = getattr(self.sides.data, by)
-        simulated = np.concatenate([getattr(draw, by) for draw in noisy])
-        quantiles = np.quantile(simulated, QUANTILES)
-        differences, slopes = quantiles - np.quantile(own, QUANTILES), NONE
+        simulated = np.concatenate([getattr(draw, by) for draw in self.noisy])
+        quantiles, slopes = np.quantile(simulated, QUANTILES), NONE
         errors = np.hypot(
             quantile_errors(own, len(own)), quantile_errors(simulated, len(self.sides))
         )
-        covariance = np.outer(errors, errors) * CORRELATION + self.least**2 * np.eye(
-            len(errors)
-        )
+        covariance = np.outer(errors, errors) * CORRELATION
+        covariance = covariance + self.least**2 * np.eye(len(errors))
         if moves is not None:
-            near, _ = hats(getattr(noisy[0], by), quantiles)
-            counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
-            slopes = near.T @ getattr(moves, by) / counts
+            near, _ = hats(getattr(self.noisy[0], by), quantiles)
+            slopes = _means(near, getattr(moves, by))
+        differences = quantiles - np.quantile(own, QUANTILES)
         return Difference(f"{by} quantiles", differences, covariance, slopes)
 
-    def _slices(
-        self,
-        by: str,
-        noisy: list[Aligned],
-        views: list[Floats],
-        clean: Floats,
-        moves: Derivatives | None,
-    ) -> list[Difference]:
+    def _slices(self, by: str, moves: Any) -> list[Difference]:
         """Means of bounded functions of every sample, in slices of a quantity."""
-        values = [getattr(draw, by) for draw in noisy]
-        of_data, _ = hats(own := getattr(self.sides.data, by), np.quantile(own, RANKS[by]))
-        centres = np.quantile(np.concatenate(values), RANKS[by])
-        weights, turned = zip(*(hats(value, centres) for value in values), strict=True)
-        moved = None
+        values = [getattr(draw, by) for draw in self.noisy]
+        every, own = np.concatenate(values), getattr(self.sides.data, by)
+        of_data, _ = hats(own, np.quantile(own, RANKS[by]))
+        centres = np.quantile(every, RANKS[by])
+        of_sim, turned = zip(*(hats(value, centres) for value in values), strict=True)
+        moved = NONE
         if moves is not None:  # relative to pulses of the same rank, with which slices move
-            near, _ = hats(values[0], np.quantile(np.concatenate(values), QUANTILES))
-            counts = np.maximum(near.sum(axis=0), 1e-9)[:, np.newaxis]
-            moved = getattr(moves, by) - near @ (near.T @ getattr(moves, by) / counts)
-        slices: list[Any] = []
-        rms = _rms(views, clean)
+            near, _ = hats(values[0], np.quantile(every, QUANTILES))
+            moved = getattr(moves, by) - near @ _means(near, getattr(moves, by))
+        slices, rms = list[Any](), self._rms(slice(None))
         for k in range(len(centres)):
-            own_data, own = of_data[:, k], np.array([of[:, k] for of in weights])
-            rows = np.flatnonzero(own.any(axis=0))
-            bounded = self._bounded(own_data, views, clean, rows, rms)
-            data, clean_own, noisy_own, slopes = bounded
-            w = own[:, rows]
-            parts = _covariances(clean_own, noisy_own, w)
-            mean = np.einsum("dp,dpf->f", w, noisy_own) / w.sum()
-            used = own_data[own_data > 0]
-            difference, derivatives = mean - used @ data / used.sum(), NONE
-            if moves is not None and moved is not None:
-                each = w[0] / w[0].sum()
-                derivatives = moves.mean(rows, each[:, np.newaxis] * slopes)
-                relative = noisy_own[0] - each @ noisy_own[0]
-                sliding = relative * (turned[0][rows, k] / w[0].sum())[:, np.newaxis]
-                derivatives += sliding.T.astype(np.float32) @ moved[rows]
-            slices.append((*parts, _effective(used), difference, derivatives))
-        shapes, noise = (sum(draw[i] for draw in slices) / len(slices) for i in (0, 1))
+            used = of_data[of_data[:, k] > 0, k]
+            own = self._slice(of_data[:, k], np.array([of[:, k] for of in of_sim]), rms)
+            mean = np.einsum("dp,dpf->f", own.weights, own.noisy) / own.weights.sum()
+            difference, slopes = mean - used @ own.data / used.sum(), NONE
+            if moves is not None:
+                total = own.weights[0].sum()
+                each = own.weights[0] / total
+                slopes = moves.mean(own.rows, each[:, np.newaxis] * own.slopes)
+                relative = own.noisy[0] - each @ own.noisy[0]
+                sliding = relative * (turned[0][own.rows, k] / total)[:, np.newaxis]
+                slopes += sliding.T.astype(np.float32) @ moved[own.rows]
+            parts = own.shapes, own.noise, own.number, own.left
+            slices.append((*parts, _effective(used), difference, slopes))
+        shapes, noise = (sum(part[i] for part in slices) / len(slices) for i in (0, 1))
         # the inverse of a covariance from n samples is too large (Hartlap, A&A 464 (2007) 399)
-        samples = max(1.0, 0.5 * len(views)) * len(clean)
+        samples = max(1.0, 0.5 * len(values)) * len(self.sides)
         noise *= samples / max(samples - len(noise), 0.2 * samples)
         differences = []
-        for k, (shape, _, n_sim, left, n_data, difference, derivatives) in enumerate(slices):
+        for k, (shape, _, n_sim, left, n_data, difference, slopes) in enumerate(slices):
             covariance = (1 - POOLED) * shape + POOLED * shapes
             covariance = covariance * (1 / n_sim + 1 / n_data) + noise * (1 / n_data + left)
-            differences.append(Difference(f"{by} {k}", difference, covariance, derivatives))
+            differences.append(Difference(f"{by} {k}", difference, covariance, slopes))
         return differences
 
-    def _bounded(
-        self,
-        own_data: Values,
-        views: list[Floats],
-        clean: Floats,
-        rows: npt.NDArray[np.intp],
-        rms: Values,
-    ) -> tuple[Values, Values, Values, Values]:
-        """Bounded functions of data, simulation without and with noise, and derivatives."""
-        data = self.data[own_data > 0].astype(float)
-        core = data[own_data[own_data > 0] > 0.3 * own_data.max()]
+    def _slice(self, of_data: Values, of_sim: Values, rms: Values) -> Slice:
+        """Bounded functions in a slice, given the weights of data and of each draw."""
+        rows, used = np.flatnonzero(of_sim.any(axis=0)), of_data > 0
+        data = self.sides.data_view[used].astype(float)
+        core = data[of_data[used] > 0.3 * of_data.max()]
         middle = np.median(core, axis=0)
         scale = self.width * np.maximum(1.4826 * np.median(np.abs(core - middle), axis=0), rms)
 
         def bounded(values: Floats) -> Values:
-            return np.asarray(scale * np.tanh((values - middle) / scale))
+            return np.asarray(scale * np.tanh((values.astype(float) - middle) / scale))
 
-        noisy = np.array([bounded(view[rows].astype(float)) for view in views])
-        slopes = 1 - (noisy[0] / scale) ** 2
-        return bounded(data), bounded(clean[rows].astype(float)), noisy, slopes
+        clean, noisy = (
+            bounded(self._clean[rows]),
+            np.array([bounded(v[rows]) for v in self._views]),
+        )
+        weights = of_sim[:, rows]
+        mean_weights = weights.mean(axis=0)
+        each = mean_weights / mean_weights.sum()
+        centred = (clean - each @ clean) * np.sqrt(each)[:, np.newaxis]
+        moved, total = noisy - clean, weights.sum()
+        root = np.sqrt(weights / total)[:, :, np.newaxis] * moved
+        root = root.reshape(-1, root.shape[-1])
+        noise = root.T @ root + 1e-14 * np.eye(root.shape[1])
+        # draws of opposite sign cancel as far as they are in the same slice
+        sums = np.einsum("dp,dpf->pf", weights, moved) / total
+        left = float((sums**2).sum() / noise.trace())
+        slopes, shapes = 1 - (noisy[0] / scale) ** 2, centred.T @ centred
+        number = _effective(mean_weights)
+        return Slice(bounded(data), noisy, slopes, rows, weights, shapes, noise, number, left)
 
 
 def quantile_errors(values: Values, n: int) -> Values:
@@ -467,34 +474,10 @@ def quantile_errors(values: Values, n: int) -> Values:
     return np.asarray(0.5 * (high - low))
 
 
-def _rms(views: list[Floats], clean: Floats) -> Values:
-    """RMS of the noise in each stretch."""
-    return np.asarray(np.sqrt(np.mean((views[0] - clean) ** 2, axis=0, dtype=float)))
-
-
-def _covariances(
-    clean: Values, noisy: Values, weights: Values
-) -> tuple[Values, Values, float, float]:
-    """Covariances of shapes and noise, effective number, and what is left of the noise.
-
-    Parameters
-    ----------
-    clean, noisy
-        Functions without noise, shape (pulses, functions), and with each draw.
-    weights
-        Of each draw, shape (draws, pulses).
-    """
-    mean_weights = weights.mean(axis=0)
-    each = mean_weights / mean_weights.sum()
-    centred = (clean - each @ clean) * np.sqrt(each)[:, np.newaxis]
-    moved, total = noisy - clean, weights.sum()
-    root = np.sqrt(weights / total)[:, :, np.newaxis] * moved
-    root = root.reshape(-1, root.shape[-1])
-    noise = root.T @ root + 1e-14 * np.eye(root.shape[1])
-    # draws of opposite sign cancel as far as they are in the same slice
-    sums = np.einsum("dp,dpf->pf", weights, moved) / total
-    left = float((sums**2).sum() / noise.trace())
-    return centred.T @ centred, noise, _effective(mean_weights), left
+def _means(weights: Values, values: Values) -> Values:
+    """Means by the weights of each column, shape (columns, ...)."""
+    counts = np.maximum(weights.sum(axis=0), 1e-9)[:, np.newaxis]
+    return np.asarray(weights.T @ values / counts)
 
 
 def _effective(weights: Values) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +19,7 @@ from cpunet.training.aligned import (
     cubic,
     stretch,
 )
-
-if TYPE_CHECKING:
-    from cpunet.training.comparison import Sides
+from cpunet.training.comparison import Sides
 
 SINGLE = np.float32  # derivatives need seven digits
 
@@ -42,6 +39,10 @@ class Basis:
     first: int
     changes: Values
 
+    def __call__(self, sides: Sides, aligned: Aligned, heights: Floats) -> Derivatives:
+        """Derivatives of pulses in these coordinates."""
+        return Derivatives(sides, aligned, heights, self)
+
     @property
     def last(self) -> int:
         """Last lag."""
@@ -60,8 +61,6 @@ class Derivatives:
     ----------
     sides
         Pulses.
-    first
-        First sample of each stretch that is compared.
     aligned, heights
         The translated pulses, and heights of their records before.
     basis
@@ -73,31 +72,27 @@ class Derivatives:
         Derivatives of what is read, shape (pulses, coordinates).
     """
 
-    def __init__(
-        self,
-        sides: Sides,
-        first: Samples,
-        aligned: Aligned,
-        heights: Floats,
-        basis: Basis,
-    ) -> None:
-        self.sides, self.first, self.basis = sides, first, basis
+    def __init__(self, sides: Sides, aligned: Aligned, heights: Floats, basis: Basis) -> None:
+        self.sides, self.basis = sides, basis
         self.reversed = basis.changes[::-1].astype(SINGLE)
-        self.changes = basis.changes.astype(SINGLE)
         self.values, self.slopes = (sides.view(of) for of in (aligned.pulses, aligned.slopes))
         level = slice(*(sides.frame.before + at for at in sides.frame.level))
         self.level = aligned.pulses[:, level].mean(axis=0)
         frame, rows = sides.frame, np.arange(len(aligned))
         height = (aligned.height * heights).astype(SINGLE)[:, np.newaxis]
         weights, _ = cubic(aligned.part)
+        lags = len(basis.changes)
 
         def mean(ends: tuple[int, int]) -> Floats:
-            low, high = (self._at(sides.charge, aligned.sample + end - 1) for end in ends)
+            first = aligned.sample - 1 - basis.last
+            low, high = (
+                stretch(sides.charge, first + end, lags) @ self.reversed for end in ends
+            )
             return np.asarray((high - low) / SINGLE(ends[1] - ends[0]) / height)
 
         def charge(sample: Samples) -> Floats:
             first = sample - 2 - basis.last
-            samples = stretch(sides.current, first, len(self.changes) + 3)
+            samples = stretch(sides.current, first, lags + 3)
             return np.asarray(between(samples, weights) @ self.reversed / height)
 
         def column(values: Floats) -> Floats:
@@ -124,18 +119,14 @@ class Derivatives:
         currents = stretch(sides.current, aligned.sample + self.begin - 2, length)
         self.currents = between(currents, weights) / height
 
-    def _at(self, source: Floats, sample: Samples) -> Floats:
-        """Change at a sample of each record whose current, or charge, is given."""
-        return stretch(source, sample - self.basis.last, len(self.changes)) @ self.reversed
-
     def _amplitude(self, aligned: Aligned) -> Floats:
         """Change of the highest smoothed current of a record."""
-        taps, reach, lags = self.sides.frame.taps, self.sides.frame.reach, len(self.changes)
-        change = np.zeros((len(aligned), self.changes.shape[1]), SINGLE)
-        for step, weights in enumerate(taps):
+        frame, (lags, coordinates) = self.sides.frame, self.basis.changes.shape
+        change = np.zeros((len(aligned), coordinates), SINGLE)
+        for step, weights in enumerate(frame.taps):
             rows = np.flatnonzero(aligned.step == step)
-            first = aligned.steepest[rows] - self.basis.last - reach
-            records = stretch(self.sides.current[rows], first, lags + 2 * reach + 1)
+            first = aligned.steepest[rows] - self.basis.last - frame.reach
+            records = stretch(self.sides.current[rows], first, lags + 2 * frame.reach + 1)
             current = np.diff(records, axis=1)
             smooth = sum(w * current[:, j : j + lags] for j, w in enumerate(weights))
             change[rows] = smooth @ self.reversed
@@ -157,7 +148,7 @@ class Derivatives:
         sums = np.zeros((len(currents), currents.shape[1] + 1))
         np.cumsum(currents, axis=1, out=sums[:, 1:])
         lags = np.arange(basis.first, basis.last + 1)
-        low = self.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
+        low = self.sides.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
         high = np.take_along_axis(sums, low + widths, axis=1)
         change = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ basis.changes
         change -= weights.T @ self.base[rows]
@@ -173,7 +164,7 @@ class Derivatives:
         matrix
             Weights of the stretches, shape (stretches, functions).
         """
-        widths, (n, m) = self.sides.widths, (matrix.shape[1], self.changes.shape[1])
+        widths, n, m = self.sides.widths, matrix.shape[1], self.basis.changes.shape[1]
         weights = np.repeat(matrix / widths[:, np.newaxis], widths, axis=0)
         kernel = fftconvolve(
             weights[:, :, np.newaxis], self.basis.changes[::-1, np.newaxis], axes=0
@@ -209,41 +200,32 @@ class Changes:
     """
 
     def __init__(self, sides: Sides, aligned: Aligned, records: Sequence[Floats]) -> None:
-        self.sides, self.aligned = sides, aligned
-        self.changes = [self._aligned(change) for change in records]
-        self.log_amplitude = np.column_stack([
-            self._amplitude(change, span)
-            for change, (_, span) in zip(records, self.changes, strict=True)
-        ])  # fmt: skip
-
-    def _aligned(self, record: Floats) -> tuple[Floats, Floats]:
-        """Change of the aligned pulses, and relative change of their height."""
-        frame, aligned = self.sides.frame, self.aligned
-        height = aligned.height.astype(SINGLE)[:, np.newaxis]
-        base, top = (
-            stretch(record, aligned.sample + first, last - first).mean(axis=1, keepdims=True)
-            for first, last in (frame.base, frame.level)
-        )
-        weights, _ = cubic(aligned.part)
-        around = stretch(record, aligned.sample - frame.before - 2, frame.length + 3)
-        moved = (between(around, weights) - base) / height
-        span = (top - base) / height
+        self.sides, self.changes, of_logs = sides, list[Floats](), []
+        frame, height = sides.frame, aligned.height.astype(SINGLE)[:, np.newaxis]
         slopes, middle = aligned.slopes, slice(frame.before, frame.before + 1)
-        time = (SINGLE(0.5) * span - moved[:, middle]) / slopes[:, middle]
-        # samples of the level follow the half height, by whole ones
         level = aligned.pulses[:, frame.before + frame.level[0] : frame.before + frame.level[1]]
-        span += time * SINGLE(np.gradient(level.mean(axis=0)).mean())
-        return moved - aligned.pulses * span + slopes * time, span[:, 0]
-
-    def _amplitude(self, record: Floats, span: Floats) -> Floats:
-        """Change of the logarithm of the current amplitude."""
-        taps, aligned = self.sides.frame.taps, self.aligned
-        first = aligned.steepest - self.sides.frame.reach
-        current = np.diff(stretch(record, first, taps.shape[1] + 1), axis=1)
-        smooth = (current * taps[aligned.step]).sum(axis=1) / aligned.height
-        return np.asarray(smooth / np.exp(aligned.log_amplitude) - span)
+        falling = SINGLE(np.gradient(level.mean(axis=0)).mean())
+        weights, _ = cubic(aligned.part)
+        taps, steepest = frame.taps, aligned.steepest - frame.reach
+        for record in records:
+            base, top = (
+                stretch(record, aligned.sample + first, last - first).mean(
+                    axis=1, keepdims=True
+                )
+                for first, last in (frame.base, frame.level)
+            )
+            around = stretch(record, aligned.sample - frame.before - 2, frame.length + 3)
+            moved = (between(around, weights) - base) / height
+            span = (top - base) / height
+            time = (SINGLE(0.5) * span - moved[:, middle]) / slopes[:, middle]
+            span += time * falling  # samples of the level follow the half height, by whole ones
+            self.changes.append(moved - aligned.pulses * span + slopes * time)
+            current = np.diff(stretch(record, steepest, taps.shape[1] + 1), axis=1)
+            smooth = (current * taps[aligned.step]).sum(axis=1) / aligned.height
+            of_logs.append(smooth / np.exp(aligned.log_amplitude) - span[:, 0])
+        self.log_amplitude = np.column_stack(of_logs)
 
     def each(self, matrix: Values) -> Floats:
         """Change of linear functions of each pulse, shape (pulses, functions, coordinates)."""
-        views = [self.sides.view(change) @ matrix.astype(SINGLE) for change, _ in self.changes]
+        views = [self.sides.view(change) @ matrix.astype(SINGLE) for change in self.changes]
         return np.stack(views, axis=2)

@@ -142,8 +142,14 @@ def posterior(information: Values, right: Values, covariance: Values) -> Posteri
     return Posterior(float(0.5 * g @ z - np.log(factor[0].diagonal()).sum()), root @ z)
 
 
-def best_prior(of: Callable[[Prior], float], starts: Sequence[Prior]) -> Prior:
+def best_prior(
+    information: Values, right: Values, knots: Knots, starts: Sequence[Prior]
+) -> Prior:
     """The prior of the highest evidence, its values changed in turn."""
+
+    def of(prior: Prior) -> float:
+        return posterior(information, right, knots.covariance(prior)).evidence
+
     followed = sorted(((of(prior), i) for i, prior in enumerate(starts)), reverse=True)
     candidates = []
     for best, i in followed[:FURTHER]:
@@ -267,7 +273,7 @@ def with_deviations(
     gauge = knots.between[inside].mean(axis=0)
     place, prior, first = np.zeros(len(knots.time_ns)), STARTS[0], None
     for width, most, gain in STAGES:
-        problem = Linearised([Comparison(side.of(most), width) for side in bands], basis)
+        problem = Linearised([side.of(most) for side in bands], basis, width)
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
             own.set_deviation(knots.between @ place)
@@ -280,14 +286,9 @@ def with_deviations(
                 continue
             gained, before, halved = before[0] - cost, (cost, place), 0
             information = problem.information + GAUGE * np.outer(gauge, gauge)
-
-            def of(
-                prior: Prior, problem: Linearised = problem, a: Values = information
-            ) -> float:
-                return posterior(a, problem.right, knots.covariance(prior)).evidence
-
             if far:
-                prior = best_prior(of, STARTS if first is None else [prior])
+                starts = STARTS if first is None else [prior]
+                prior = best_prior(information, problem.right, knots, starts)
             covariance = knots.covariance(prior)
             evidence, new = posterior(information, problem.right, covariance)
             if first is None and evidence < 0:
@@ -309,19 +310,11 @@ def with_deviations(
     if not cost < alone:
         return Deviated(response, first)
     own.set_deviation(knots.between @ place)
-    modes = _modes(information, covariance)
-    whole, along = [side.of(MOST) for side in bands], Basis(basis.first, knots.between @ modes)
-    place = place + modes @ _with_amplitude(own, whole, along)
-    own.set_deviation(knots.between @ place, knots.between @ _draws(information, covariance))
+    modes, draws = _widest(information, covariance)
+    along = Basis(basis.first, knots.between @ modes)
+    place = place + modes @ _with_amplitude(own, bands, along)
+    own.set_deviation(knots.between @ place, knots.between @ draws)
     return Deviated(own, first, knots.between @ _determined(problem.information, covariance))
-
-
-def _modes(information: Values, covariance: Values) -> Values:
-    """Directions of unit variance in which the posterior is the widest, (knots, modes)."""
-    root = np.linalg.cholesky(covariance)
-    inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ information @ root)
-    left, widths, _ = np.linalg.svd(root @ scipy.linalg.inv(inner).T)
-    return np.asarray(left[:, :MODES] * widths[:MODES])
 
 
 def _determined(information: Values, covariance: Values) -> Values:
@@ -329,6 +322,20 @@ def _determined(information: Values, covariance: Values) -> Values:
     root = np.linalg.cholesky(covariance)
     sizes, axes = np.linalg.eigh(root.T @ information @ root)
     return np.asarray(root @ axes[:, sizes > 1])
+
+
+def _widest(information: Values, covariance: Values) -> tuple[Values, Values]:
+    """Directions of unit variance in which the posterior is the widest, (knots, modes).
+
+    Also draws of it, whose outer products add up to its covariance, (knots, draws).
+    """
+    root = np.linalg.cholesky(covariance)
+    inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ information @ root)
+    left, widths, _ = np.linalg.svd(root @ scipy.linalg.inv(inner).T)
+    normal = np.random.default_rng(0).standard_normal((len(root), DRAWS)) / np.sqrt(DRAWS)
+    normal *= SHARED
+    draws = root @ scipy.linalg.solve_triangular(inner.T, normal)
+    return np.asarray(left[:, :MODES] * widths[:MODES]), np.asarray(draws)
 
 
 def _with_amplitude(own: ElectronicsResponse, bands: Sequence[Sides], modes: Basis) -> Values:
@@ -345,30 +352,25 @@ def _with_amplitude(own: ElectronicsResponse, bands: Sequence[Sides], modes: Bas
     return np.asarray(np.linalg.solve(information, right))
 
 
-def _draws(information: Values, covariance: Values) -> Values:
-    """Draws of the posterior whose outer products add up to its covariance, (knots, draws)."""
-    root = np.linalg.cholesky(covariance)
-    inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ information @ root)
-    normal = np.random.default_rng(0).standard_normal((len(root), DRAWS)) / np.sqrt(DRAWS)
-    normal *= SHARED
-    return np.asarray(root @ scipy.linalg.solve_triangular(inner.T, normal))
-
-
 class Linearised:
     """Chi-square of comparisons to second order in the coordinates."""
 
-    def __init__(self, comparisons: Sequence[Comparison], basis: Basis | Moved) -> None:
-        self.comparisons, self.basis = comparisons, basis
+    def __init__(
+        self, bands: Sequence[Sides], basis: Moved, width: float, least: float = 1e-6
+    ) -> None:
+        self.bands, self.basis, self.how = bands, basis, (width, least)
         self.white: list[tuple[Values, Values]] = []  # roots of covariances, slopes
 
     def evaluate(self, transfer: Spectrum, place: Values, *, anew: bool) -> float:
         """Chi-square; information and right side with derivatives at this place if `anew`."""
         basis = self.basis if anew else None
         with np.errstate(divide="ignore", invalid="ignore"):  # far away, pulses have no edge
-            differences = [d for c in self.comparisons for d in c.differences(transfer, basis)]
-        if not all(
-            np.isfinite(d.slopes).all() and np.isfinite(d.values).all() for d in differences
-        ):
+            here = (Comparison(sides, transfer, *self.how) for sides in self.bands)
+            differences = [d for comparison in here for d in comparison.differences(basis)]
+        finite = [
+            np.isfinite(d.slopes).all() & np.isfinite(d.values).all() for d in differences
+        ]
+        if not all(finite):
             return np.nan
         n, cost = len(place), 0.0
         self.right = np.zeros(n)

@@ -68,20 +68,15 @@ class Noise:
         trace = np.concatenate(
             [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
         )
+        trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
         sign = rng.choice((-1.0, 1.0), (pairs, n))
-        drawn = cls(
-            traces,
-            np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0),
-            np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0),
-            np.asarray(
-                np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev,
-                np.float32,
-            ),
-        )
-        if tails is None:
-            return drawn
-        left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
-        return replace(drawn, left=left, decay=np.asarray(tails.decay(length), np.float32))
+        start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
+        factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
+        left = decay = None
+        if tails is not None:
+            left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
+            decay = np.asarray(tails.decay(length), np.float32)
+        return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
 
     def of(self, rows: Samples | npt.NDArray[np.bool_] | slice) -> Noise:
         """Noise of some of the pulses."""

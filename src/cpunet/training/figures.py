@@ -53,18 +53,14 @@ def sides_figure(
         length = pulses.shape[1]
         aligned = align_half_maximum(np.asarray(some, np.float32), length, length)
         time_ns = (np.arange(2 * length) - length) * dt_ns
-        scales = {whole: 1e-3, edge: 1.0}  # µs, ns
         colour = COLOURS[side] if side != "data" else "0.35"
-        for axes, scale in scales.items():
-            lines = axes.plot(
-                scale * time_ns, aligned.T, color=colour, linewidth=0.7, alpha=0.8
-            )
+        look: dict[str, Any] = {"color": colour, "linewidth": 0.7, "alpha": 0.8}
+        for axes, scale in ((whole, 1e-3), (edge, 1.0)):  # µs, ns
+            lines = axes.plot(scale * time_ns, aligned.T, **look)
             lines[0].set_label(f"{label(side)}, {shown} of {counts[side]}")
-    whole.set_title("Pulses, aligned at half of their maximum")
-    edge.set_title("Their edges")
-    edge.set_xlim(*EDGE_NS)
-    whole.set(xlabel="Time [µs]", ylabel="Charge / its maximum")
-    edge.set(xlabel="Time [ns]", ylabel="Charge / its maximum")
+    title, height = "Pulses, aligned at half of their maximum", "Charge / its maximum"
+    whole.set(title=title, xlabel="Time [µs]", ylabel=height)
+    edge.set(title="Their edges", xlabel="Time [ns]", ylabel=height, xlim=EDGE_NS)
     for axes, (name, values) in zip(below, parameters.items(), strict=True):
         everything = np.concatenate([v[np.isfinite(v)] for v in values.values()])
         low, high = np.quantile(everything, (0.002, 0.998))

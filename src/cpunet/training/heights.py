@@ -9,6 +9,7 @@ stays linear.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -20,7 +21,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
 from cpunet.training.chain_fit import Fitted, Parabola, bounded_step, chi_square
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import Comparison, Sides
+from cpunet.training.comparison import Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
 
 # Stages: most pulses of a side, width of the bounded functions, and least error of a quantile,
@@ -37,29 +38,26 @@ PART, LAG_STEP, CURVE_STEP = 0.02, 0.01, 1e-4  # of the differences
 
 
 class Moves:
-    """Derivatives of aligned pulses by finite differences, as of `derivatives.Derivatives`.
+    """Derivatives of aligned pulses by finite differences, as of `derivatives.Derivatives`."""
 
-    Parameters
-    ----------
-    sides
-        Pulses.
-    aligned, moved
-        As they are, and after a step of each coordinate.
-    steps
-        Lengths of these.
-    """
-
-    def __init__(
-        self, sides: Sides, aligned: Aligned, moved: Sequence[Aligned], steps: Values
-    ) -> None:
+    def __init__(self, at: Unknowns, sides: Sides, aligned: Aligned, heights: Floats) -> None:
+        moved, (clean, _) = list[Aligned](), sides.translated(at.own.transfer(sides.padded))
+        for i, step in enumerate(at.steps):
+            at.put(at.place + step * (np.arange(len(at.place)) == i))
+            records = clean, heights
+            if i < at.n:
+                records = sides.translated(at.own.transfer(sides.padded))
+            moved.append(sides.read(sides.noise.add(records[0], 0), records[1]))
+        at.put(at.place)
         self.log_amplitude, self.rise = (
-            np.stack([getattr(after, by) - getattr(aligned, by) for after in moved], 1) / steps
+            np.stack([getattr(after, by) - getattr(aligned, by) for after in moved], 1)
+            / at.steps
             for by in ("log_amplitude", "rise")
         )
         view = sides.view(aligned.pulses)
         self.views = [
             (sides.view(after.pulses) - view) / np.float32(step)
-            for after, step in zip(moved, steps, strict=True)
+            for after, step in zip(moved, at.steps, strict=True)
         ]
 
     def mean(self, rows: npt.NDArray[np.intp], weights: Floats) -> Values:
@@ -90,8 +88,12 @@ def with_heights(
     by_height = own.by_height
     assert by_height is not None
     transfer = own.transfer(bands[0].padded)
-    steps = [_largest_step(sides, sides.translated(transfer)) for sides in bands]
-    by_height.step_kev[...] = max(steps)
+    largest = []
+    for sides in bands:
+        records, heights = sides.translated(transfer)
+        steps = np.diff(records, axis=1).max(axis=1) * heights * sides.energy_kev
+        largest.append(np.quantile(steps, 0.99))
+    by_height.step_kev[...] = max(largest)
     by_height.top_kev[...] = 1.02 * max(float(sides.energy_kev.max()) for sides in bands)
     behind = [sides.entering(own) for sides in bands]
     halves = [min(len(sides), len(sides.data), 2 * MOST) // 2 for sides in bands]
@@ -104,12 +106,6 @@ def with_heights(
     if before - after <= GAIN:
         return None, f"left out; {line}"
     return Fitted(own, after, round(functions), covariance), f"used; {line}"
-
-
-def _largest_step(sides: Sides, translated: tuple[Floats, Floats]) -> float:
-    records, heights = translated
-    steps = np.diff(records, axis=1).max(axis=1) * heights * sides.energy_kev
-    return float(np.quantile(steps, 0.99))
 
 
 class Unknowns:
@@ -125,12 +121,8 @@ class Unknowns:
         self.steps = np.concatenate([PART * self.chain.widths, *others])
         self.centre = np.r_[self.chain.centre, np.zeros(len(self.steps) - self.n)]
         self.place = np.r_[self.chain.vector(), self.by_height.vector]
-
-    @property
-    def bounds(self) -> tuple[Values, Values]:
-        """Lowest and highest values."""
         free = np.full(len(self.steps) - self.n, np.inf)
-        return np.r_[self.chain.low, -free], np.r_[self.chain.high, free]
+        self.bounds = np.r_[self.chain.low, -free], np.r_[self.chain.high, free]
 
     def covariance(self, of_lag: float, of_curve: float) -> Values:
         """Of the priors."""
@@ -146,19 +138,6 @@ class Unknowns:
         """Set chain, follower and curve."""
         self.chain.set(vector[: self.n])
         self.by_height.set(vector[self.n :])
-
-    def moves(self, sides: Sides, aligned: Aligned) -> Moves:
-        """Derivatives at the place."""
-        moved, (clean, heights) = [], sides.translated(self.own.transfer(sides.padded))
-        for i, step in enumerate(self.steps):
-            self.put(self.place + step * (np.arange(len(self.place)) == i))
-            if i < self.n:
-                new, of = sides.translated(self.own.transfer(sides.padded))
-                moved.append(sides.read(sides.noise.add(new, 0), of))
-            else:
-                moved.append(sides.read(sides.noise.add(clean, 0), heights))
-        self.put(self.place)
-        return Moves(sides, aligned, moved, self.steps)
 
     def limited(self, cost: Callable[[], float]) -> bool:
         """Go to the slew rate of the least cost; far from it, pulses are not linear in it."""
@@ -188,8 +167,7 @@ def _solve(
     bounds = unknowns.bounds
     best, damping, last = (LAGS[-1], CURVES[-1]), FIRST, width == STAGES[-1][1]
     precision = np.linalg.inv(unknowns.covariance(*best))
-    compared = [Comparison(sides, width, least) for sides in bands]
-    problem = Linearised(compared, unknowns.moves)
+    problem = Linearised(bands, partial(Moves, unknowns), width, least)
 
     def cost_at(place: Values, anew: bool = False) -> float:
         unknowns.put(place)
@@ -204,13 +182,10 @@ def _solve(
         cost = cost_at(place, anew=True)
         right = problem.right
         if last:  # near enough that the evidence says how much of each is needed
-            start = right - problem.information @ unknowns.centre
-            evidence = {
-                choice: posterior(
-                    problem.information, start, unknowns.covariance(*choice)
-                ).evidence
-                for choice in product(LAGS, CURVES)
-            }
+            start, evidence = right - problem.information @ unknowns.centre, {}
+            for choice in product(LAGS, CURVES):
+                prior = unknowns.covariance(*choice)
+                evidence[choice] = posterior(problem.information, start, prior).evidence
             best = max(evidence, key=lambda choice: evidence[choice])
             precision = np.linalg.inv(unknowns.covariance(*best))
         cost += of_prior(place)
@@ -241,5 +216,5 @@ def _solve(
         unknowns.by_height.curve[:] = 0
     n, chain = unknowns.n, unknowns.chain
     of_chain = SHARED**2 * np.linalg.inv(problem.information + precision)[:n, :n]
-    prior = np.diag(chain.widths**-2.0)
-    return chain.covariance(np.asarray(np.linalg.inv(of_chain) - prior))
+    of_prior_alone = np.diag(chain.widths**-2.0)
+    return chain.covariance(np.asarray(np.linalg.inv(of_chain) - of_prior_alone))

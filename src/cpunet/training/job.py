@@ -7,37 +7,34 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from cpunet.electronics.measured import trace_noise
-from cpunet.errors import CpunetError
 from cpunet.networks import require_torch
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.outputs import folder_written_aside
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
 from cpunet.progress import stage
-from cpunet.pulses.channels import Pair, own_folder
+from cpunet.pulses.channels import Pair
 from cpunet.pulses.loading import (
     InputSet,
     load_pulses,
     require_both_sides,
     require_same_sampling,
 )
-from cpunet.pulses.peaks import EnergySelection, parse_selection
-from cpunet.recipes.schema import PunetConfig, Recipe
+from cpunet.pulses.peaks import parse_selection
+from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import Fitter
-from cpunet.training.chain_parameters import with_settings
 from cpunet.training.check import Level, compare_sides
 from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import fit_response
-from cpunet.training.run import INFO, RUN, Record, Run, RunLike, as_run, versions
+from cpunet.training.run import INFO, RUN, Record, Run, versions
 from cpunet.training.verdict import FitInfo
 
 log = logging.getLogger(__name__)
@@ -53,8 +50,6 @@ class TrainingJob:
         Settings, energies, seed, and the device to train on.
     sim, data
         Prepared pulses of both sides.
-    init
-        Run to start from.
     checkpoints, resume
         Folder of the checkpoints of networks, and whether their training is to be resumed.
     continuum
@@ -67,13 +62,12 @@ class TrainingJob:
     device: str
     sim: InputSet
     data: InputSet
-    init: Run | None = None
     checkpoints: Path | None = None
     resume: bool = False
     continuum: Continuum | None = None
 
     @classmethod
-    def of(cls, pair: Pair, recipe: Recipe, peak: str, init: Run | None, **how: Any) -> Self:
+    def of(cls, pair: Pair, recipe: Recipe, peak: str, **how: Any) -> Self:
         """Read and prepare both sides, and warn of what makes a training on them doubtful."""
         selection = parse_selection(peak, recipe.peaks)
         data = load_pulses(pair[1], "measured", recipe, selection, shorten=True)
@@ -84,19 +78,16 @@ class TrainingJob:
         for finding in compare_sides(sim, data, selection, recipe.preparation):
             if finding.level != Level.FINE:
                 log.warning(finding)
-        if init is not None and not np.isclose(init.dt_ns, data.dt_ns):
-            kinds = f"trained on {init.dt_ns:g} ns, these pulses have {data.dt_ns:g} ns"
-            raise CpunetError(f"{init.name}: {kinds}; resample them")
 
-        def both(energies: EnergySelection) -> tuple[InputSet, InputSet]:
-            measured = load_pulses(pair[1], "measured", recipe, energies, tell=False)
-            return load_pulses(pair[0], "simulated", recipe, energies, tell=False), measured
+        def both() -> tuple[InputSet, InputSet]:
+            measured = load_pulses(pair[1], "measured", recipe, away, tell=False)
+            return load_pulses(pair[0], "simulated", recipe, away, tell=False), measured
 
         away = continuum(recipe)
         fewest = min(int(away.select(side.energies_kev).sum()) for side in (sim, data))
         if fewest >= MIN_PULSES and not selection.ranges_kev:
-            how["continuum"] = partial(both, away)
-        return cls(recipe.at(data.dt_ns), peak, sim=sim, data=data, init=init, **how)
+            how["continuum"] = both
+        return cls(recipe.at(data.dt_ns), peak, sim=sim, data=data, **how)
 
     def trained(self) -> Run:
         """Train what the recipe says."""
@@ -135,7 +126,6 @@ class TrainingJob:
             recipe,
             peak=self.peak,
             seed=self.seed,
-            init=None if self.init is None else self.init.name,
             device=self.device,
             started=started,
             seconds=round(seconds, 1),
@@ -148,25 +138,18 @@ class TrainingJob:
         return run.model_copy(update={"log": records})
 
 
-def of_channel(
-    name: str, pair: Pair, folder: Path, *, init: RunLike | None, **how: Any
-) -> Path:
+def of_channel(name: str, pair: Pair, folder: Path, **how: Any) -> Path:
     """The folder of the run of a channel, trained in a process of its own."""
     if how["resume"] and (folder / INFO).is_file():
         log.info(f"{name}: trained already")
         return folder
-    if isinstance(init, str | Path):
-        init = own_folder(Path(init), name, INFO)
-    trained_in(folder, pair, init, **how)
+    trained_in(folder, pair, **how)
     return folder
 
 
-def trained_in(
-    out: Path | None, pair: Pair, init: RunLike | None, force: bool, **how: Any
-) -> Run:
+def trained_in(out: Path | None, pair: Pair, force: bool, **how: Any) -> Run:
     """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes."""
-    start = None if init is None else as_run(init)
-    files = (*pair[0].files, *pair[1].files, None if start is None else start.folder)
+    files = *pair[0].files, *pair[1].files
     networks, folder = how["recipe"].networks, None
     if networks:
         require_torch()
@@ -178,32 +161,15 @@ def trained_in(
             how["checkpoints"] = stack.enter_context(unfinished)
         elif out is not None:
             folder = stack.enter_context(folder_written_aside(out, RUN, *files, force=force))
-        run = TrainingJob.of(pair, init=start, **how).trained()
+        run = TrainingJob.of(pair, **how).trained()
         if out is not None:
             folder = folder or stack.enter_context(folder_written_aside(out, RUN, force=force))
             run.write(folder)
     return run.model_copy(update={"folder": out})
 
 
-def known_response(run: Run, like: Recipe) -> ElectronicsResponse:
-    """The response of a run, as a starting point for a recipe.
-
-    Raises
-    ------
-    CpunetError
-        If the run has no response of the recipe's kind.
-    """
-    generator = run.recipe.generator
-    if generator.name != like.generator.name or isinstance(generator, PunetConfig):
-        raise CpunetError(
-            f"{run.name}: of recipe {run.recipe.name}, from which {like.name} cannot start; "
-            f"give a run of {like.name}"
-        )
-    return run.fill("ren", ResponseGenerator(generator, run.dt_ns)).response
-
-
 def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> Run:
-    """Fit a readout chain, starting from that of ``init`` or from `start`, if given.
+    """Fit a readout chain, starting from `start`, if given.
 
     Raises
     ------
@@ -211,9 +177,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
         If pulses or baselines are too few, or the fit diverges.
     """
     started, clock = datetime.now(UTC), time.perf_counter()
-    recipe, (sim, data) = job.recipe, (job.sim.prepared, job.data.prepared)
-    if job.init is not None:
-        start = known_response(job.init, recipe)
+    recipe, sim = job.recipe, job.sim.prepared.pulses
     records = list[Record]()
     with stage("Fitting") as bar:  # the number of steps is not foreseen
 
@@ -224,18 +188,12 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
             bar.set_postfix_str(f"chi-square {chi_square:.4g}", refresh=False)
 
         noise, tails = trace_noise(job.data, recipe.preparation)
-        if start is not None:  # its deviations are those of another readout
-            terms = min(start.config.drift_terms, recipe.matching.training.drift_terms)
-            start = with_settings(start, drift_terms=terms, deviations=False, by_height=False)
-            recipe = recipe.model_copy(update={"generator": start.config})
-        rng, drawn = np.random.default_rng(job.seed), noise.tails
-        pulses = sim.pulses, data.pulses
-        sets = PulseSets(*pulses, noise.noise, recipe, rng, drawn, job.continuum)
-        decay = None if drawn is None else drawn.known_decay
-        fitter = Fitter(recipe.matching.training, decay, listen)
+        pulses, rng = (sim, job.data.prepared.pulses), np.random.default_rng(job.seed)
+        sets = PulseSets(*pulses, noise.noise, recipe, rng, noise.tails, job.continuum)
+        fitter = Fitter(recipe.matching.training, listen)
         response, info = fit_response(sets, fitter, start)
     chain = ResponseGenerator(response.config, job.sim.dt_ns)
-    chain.response, chain.tails = response, drawn
+    chain.response, chain.tails = response, noise.tails
     chain.set_noise(noise.noise)
     n, rms, error = noise.noise.n_baselines, noise.noise.rms, noise.noise.rms_error
     of_noise = {"baselines": n, "rms": rms, "rms_error": error}
@@ -243,8 +201,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
     _say(info)
     # a stretch or deviations may have been added
     recipe = job.recipe.model_copy(update={"generator": response.config})
-    of_sim = sim.pulses.waveforms, sim.pulses.energy_kev
-    iren = fit_inverse(chain, *of_sim, recipe, seed=job.seed)
+    iren = fit_inverse(chain, sim.waveforms, sim.energy_kev, recipe, seed=job.seed)
     parts: dict[str, Any] = {"ren": chain, "iren": iren}
     if recipe.residual is not None:
         from cpunet.training.network_runs import learned_residuals

@@ -27,7 +27,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg
 
-from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Floats, Samples, Values
 from cpunet.training.comparison import Difference, Sides, Spectrum
@@ -65,7 +64,7 @@ class Joint:
     def __init__(self, sides: Sides, wider: float = 1.0, *, products: bool = True) -> None:
         self.sides, self.clipped = sides, CLIPPED * wider
         self.products = products and min(len(sides), len(sides.data)) >= FOR_PRODUCTS
-        views = sides.view(sides.data.pulses).astype(float)
+        views = sides.data_view.astype(float)
         self.middle, size = np.median(views, axis=0), views.shape[1]
         largest = (max(size - COMPONENTS, 0), size - 1)
         _, axes = scipy.linalg.eigh(np.cov(views.T), subset_by_index=largest)
@@ -90,23 +89,19 @@ class Joint:
         """Functions of the measured pulses, shape (pulses, functions)."""
         return self._functions(self.sides.data)
 
-    def entering(self, response: ElectronicsResponse) -> Joint:
-        """The same of pulses after what stands before a readout."""
+    def with_sides(self, sides: Sides) -> Self:
+        """The same functions of other simulated pulses."""
         other = copy.copy(self)
-        other.sides = self.sides.entering(response)
+        other.sides = sides
         return other
 
     def taking(self, sim: FloatArray) -> Self:
         """The same with other simulated pulses of the same events."""
-        other = copy.copy(self)
-        other.sides = self.sides.taking(sim)
-        return other
+        return self.with_sides(self.sides.taking(sim))
 
     def of_events(self, rows: slice | Samples | npt.NDArray[np.bool_]) -> Self:
         """The same of some of the simulated pulses, and all measured ones."""
-        other = copy.copy(self)
-        other.sides = self.sides.of_events(rows)
-        return other
+        return self.with_sides(self.sides.of_events(rows))
 
     def some(self, rows: slice) -> Self:
         """The same functions of some pulses of both sides."""
@@ -141,23 +136,17 @@ class Joint:
         values = np.mean(each, axis=0)
         off, moves = values.mean(axis=0) - self.data.mean(axis=0), list[Derivatives | Changes]()
         if basis is not None:
-            moves = [Derivatives(self.sides, self.sides.first, noisy[0], heights, basis)]
+            moves = [basis(self.sides, noisy[0], heights)]
         if changes:
             records = [self.sides.changed(draw, transfer, heights) for draw in changes]
             moves.append(Changes(self.sides, noisy[0], records))
         if not moves:
             return Difference("joint", off, covariance)
-        rows, drawn = np.flatnonzero(single), noisy[0]
-        of_each = np.concatenate([self._each(drawn, some) for some in moves], axis=2)
+        of_each = np.concatenate([self._each(noisy[0], some) for some in moves], axis=2)
         of_log = np.concatenate([some.log_amplitude for some in moves], axis=1)
-        folds = np.array_split(np.arange(len(rows)), PARTS)
-        slopes = np.array(
-            [
-                self._slopes(drawn[of], of_each[of], of_log[of])
-                for of in (rows[fold] for fold in folds)
-            ]
-        )
-        means = np.array([values[fold].mean(axis=0) for fold in folds])
+        parts = np.array_split(np.flatnonzero(single), PARTS)
+        slopes = np.array([self._slopes(noisy[0][of], of_each[of], of_log[of]) for of in parts])
+        means = np.array([part.mean(axis=0) for part in np.array_split(values, PARTS)])
         return Difference("joint", off, covariance, slopes.mean(axis=0), (slopes, means))
 
     def covariance(self, of_each: Values) -> Values:

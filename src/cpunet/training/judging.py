@@ -8,13 +8,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-
-if TYPE_CHECKING:
-    from cpunet.training.adversarial import Game
 
 log = logging.getLogger(__name__)
 
@@ -74,25 +69,3 @@ class Judge:
     def load_state_dict(self, state: dict[str, dict[str, object]]) -> None:
         """Continue from a state."""
         vars(self).update({name: dict(state[name]) for name in ("values", "over")})
-
-
-@torch.no_grad()
-def judged(game: Game) -> dict[str, float]:
-    """Part of pairs that critics order rightly: of the training, and of unseen pulses."""
-    results, n, sides = dict(game.right), game.config.batch_size, game.sides
-    if not game.judge.unseen:
-        return results
-    rows, others = (side.draw(n, unseen=True) for side in sides[:2])
-    x, y = sides.sim.pulses[rows], sides.data.pulses[others]
-    pairs = {
-        "data": (y, sides.noisy(game.ren(x), rows)),
-        "sim": (game.with_noise(rows), game.iren(y)),
-    }
-    for side, pair in pairs.items():
-        real, fake = (game.critics[side](game.views[side](pulses)) for pulses in pair)
-        results[f"{side}_unseen"] = float((real > fake).float().mean())
-        done = game.iteration / game.config.iterations
-        game.judge.add(side, results[f"{side}_unseen"], done)
-    if game.judge.good("data"):
-        game.good.load_state_dict(game.average.state_dict())
-    return results

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,19 +76,10 @@ def train_networks(job: TrainingJob) -> Run:
                 "without it (training.noise=none in `settings`)"
             ) from error
         info = FitInfo(tails=tails)
-    if job.init is not None:
-        require_same_kind(job.init, recipe)
     late = job.data.prepared.pulses.waveforms[:, -own.decay_fit_samples :].mean(axis=0)
     decay = -np.polyfit(np.arange(len(late)), np.log(np.maximum(late, 1e-3)), 1)[0]
 
-    def make() -> dict[str, Generator]:
-        made = generators(recipe, float(decay))
-        if job.init is not None:
-            for part, network in made.items():
-                fill_generator(job.init, part, network)
-        return made
-
-    game, run = _played(job, recipe, make, noise)
+    game, run = _played(job, recipe, partial(generators, recipe, float(decay)), noise)
     parts: dict[str, Any] = {}
     for part, side in (("ren", "sim"), ("iren", "data")):
         network = game.averaged(part)
@@ -110,22 +102,6 @@ def fill_generator(run: Run, part: str, network: Generator, device: str = "cpu")
     return network
 
 
-def require_same_kind(init: Run, recipe: Recipe) -> None:
-    """Raise a `CpunetError` if the networks of a run cannot be a start for a recipe."""
-    if init.recipe.generator.name != "punet":
-        raise CpunetError(
-            f"{init.name}: a readout chain ({init.recipe.name}), from which no network can "
-            "start; give a run of networks"
-        )
-    theirs, own = init.recipe.preparation, recipe.preparation
-    if (theirs.length, theirs.samples_before) != (own.length, own.samples_before):
-        raise CpunetError(
-            f"{init.name}: its networks know windows of {theirs.samples_before} + "
-            f"{theirs.samples_after} samples, this recipe has {own.samples_before} + "
-            f"{own.samples_after}; start from a run of the same windows"
-        )
-
-
 def _played(
     job: TrainingJob,
     recipe: Recipe,
@@ -141,7 +117,6 @@ def _played(
             "recipe": recipe.model_dump(mode="json", exclude=exclude),
             "peak": job.peak,
             "seed": job.seed,
-            "init": None if job.init is None else job.init.weights_sha256,
             "simulation": job.sim.fingerprint(),
             "data": job.data.fingerprint(),
         },

@@ -32,8 +32,6 @@ PUBLISHED_DT_NS = 16.0  # of the windows of 800 samples
 # Facts on the training for a report; its pulses were not published.
 UNKNOWN = SideInfo(file="not published with the weights", used="an unknown number of")
 
-State = dict[str, Tensor]
-
 
 def import_weights(
     out: str | Path | None = None,
@@ -115,13 +113,20 @@ def import_weights(
     return run if out is None else run.save(out, force)
 
 
-def _load_state(path: Path) -> State:
-    """Read a state dict with torch's loader of plain tensors.
+def _generator(path: Path, length: int) -> PositionalUNet:
+    """Load a published generator, ``fep_REN.pt`` or ``fep_IREN.pt``, as plain tensors.
+
+    Parameters
+    ----------
+    path
+        File of the state dict.
+    length
+        Samples per pulse.
 
     Raises
     ------
     CpunetError
-        If the file cannot be read or is not a mapping of names to tensors.
+        If the file cannot be read, is not a published generator, or of another architecture.
     """
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -135,25 +140,6 @@ def _load_state(path: Path) -> State:
     pairs = state.items() if isinstance(state, dict) else [(None, state)]
     if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
         raise CpunetError(f"{path}: no state dict; give a file such as fep_REN.pt")
-    return dict(state)
-
-
-def _generator(path: Path, length: int) -> PositionalUNet:
-    """Load a published generator, ``fep_REN.pt`` or ``fep_IREN.pt``.
-
-    Parameters
-    ----------
-    path
-        File of the state dict.
-    length
-        Samples per pulse.
-
-    Raises
-    ------
-    CpunetError
-        If the file is not a published generator, or of another architecture.
-    """
-    state = _load_state(path)
     first = state.get("inc.double_conv.0.weight")
     width = 0 if first is None or first.ndim == 0 else len(first)
     if width < 2 or width % 2:
@@ -163,7 +149,7 @@ def _generator(path: Path, length: int) -> PositionalUNet:
         )
     config = PunetConfig(name="punet", width=width, dropout=0.1, linear="none")
     network = PositionalUNet(config, length)
-    named: State = {}
+    named: dict[str, Tensor] = {}
     for name, value in state.items():
         if name in MAPS:
             continue

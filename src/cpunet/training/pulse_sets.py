@@ -122,9 +122,8 @@ def _continuum(
     while min(map(len, rows)):
         top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
         rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
-        counts = [
-            int((e[r] >= top / widest).sum()) for r, e in zip(rows, energies, strict=True)
-        ]
+        inside = (e[r] >= top / widest for r, e in zip(rows, energies, strict=True))
+        counts = [int(of.sum()) for of in inside]
         left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
         if min(counts) >= MIN_PULSES and min(left) < MIN_PULSES and max(left) < 2 * MIN_PULSES:
             counts = [len(r) for r in rows]  # include a small remainder
@@ -207,13 +206,13 @@ class PulseSets:
     continuum: Continuum | None = None
 
     def __post_init__(self) -> None:
-        sim_kev, data_kev, rng = self.sim.energy_kev, self.data.energy_kev, self.rng
-        require_energies(sim_kev)
-        parted = energy_bands(sim_kev, data_kev, self.recipe.peaks)
+        require_energies(self.sim.energy_kev)
         # in random order, so that any first part is representative
         self.parted = [
-            (band, [rng.permutation(len(rows)) for rows in (band.sim, band.data)])
-            for band in parted
+            (band, [self.rng.permutation(len(rows)) for rows in (band.sim, band.data)])
+            for band in energy_bands(
+                self.sim.energy_kev, self.data.energy_kev, self.recipe.peaks
+            )
         ]
 
     @property
@@ -232,12 +231,11 @@ class PulseSets:
 
     def sides(self) -> list[Sides]:
         """Pulses of both sides in each band, for the comparison at every sample."""
-        pairs = []
+        sides = []
         for band, (of_sim, of_data) in self.parted:
-            data = self.data.waveforms[band.data[of_data[:MOST]]]
-            some = of_sim[:MOST]
-            pairs.append(self._sides(self.sim, band.sim[some], data, band.weights[some]))
-        return pairs
+            data, some = self.data.waveforms[band.data[of_data[:MOST]]], of_sim[:MOST]
+            sides.append(self._sides(self.sim, band.sim[some], data, band.weights[some]))
+        return sides
 
     def single_sites(self) -> list[Sides]:
         """Pulses of the continuum, whose single sites are compared; none if they are few."""
@@ -256,11 +254,10 @@ class PulseSets:
             share = np.cumsum(weights) / weights.sum()
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
         sim, data = sim[rows], data[np.isfinite(data).all(axis=1)]
-        length = record_length(sim.waveforms.shape[1], sim.dt_ns)
+        length, kev = record_length(sim.waveforms.shape[1], sim.dt_ns), sim.energy_kev
         pairs = max(1, round(NOISES / len(sim)))
-        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng, self.tails)
-        frame = Frame.of(training)
-        level, kev = preparation.tail_level, sim.energy_kev
+        noise = Noise.draw(self.noise, kev, length, pairs, self.rng, self.tails)
+        frame, level = Frame.of(training), preparation.tail_level
         return Sides(sim.waveforms, data, noise, frame, level, kev, rows)
 
 

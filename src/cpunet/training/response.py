@@ -14,9 +14,9 @@ import numpy as np
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
+from cpunet.electronics.stand import Stand
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
-from cpunet.settings import checked, read_json
 from cpunet.tables import text_table, with_std
 from cpunet.training.chain_description import DescribedChain, describe_chain
 from cpunet.training.closed_forms import Numbers, chain_numbers, true_chain_of, true_parameters
@@ -171,18 +171,19 @@ class Response:
             scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
             cells = [f"{label} [{unit}]" if unit else label]
             for pair in sources:
-                cells.append(
-                    with_std(*(scale * of[name] if name in of else None for of in pair))
-                )
+                scaled = (scale * of[name] if name in of else None for of in pair)
+                cells.append(with_std(*scaled))
             if self.truth is not None and alone:
-                difference, true = self.difference.get(name), self.true_values.get(name)
-                text = ""
+                difference, true, text = (
+                    self.difference.get(name),
+                    self.true_values.get(name),
+                    "",
+                )
                 if difference is not None and unit == "%":  # of shares in percentage points
                     text = f"{100 * difference:+.2f} pp"
                 elif difference is not None and true:
                     text = f"{100 * difference / true:+.1f} %"
-                sigma = self.sigma.get(name)
-                cells += [text, "" if sigma is None else f"{sigma:+.1f}"]
+                cells += [text, f"{self.sigma[name]:+.1f}" if name in self.sigma else ""]
             rows.append(cells)
         return text_table(head, rows, title="Readout response")
 
@@ -241,14 +242,8 @@ def response(
         refuse_existing(Path(out), place, *(run.folder for run in opened), force=force)
     electronics = truth
     if isinstance(truth, str | Path):
-        if Path(truth).is_dir():
-            path = Path(truth) / "stand.json"
-            content = read_json(path, "give the folder of a test stand, as of `cpunet stand`")
-            electronics = checked(
-                Electronics, content.get("electronics"), f"{path}: electronics"
-            )
-        else:
-            electronics = read_electronics(truth)
+        folder = Path(truth).is_dir()
+        electronics = Stand.load(truth).electronics if folder else read_electronics(truth)
     assert electronics is None or isinstance(electronics, Electronics)
     result = Response([describe_chain(run) for run in opened], electronics)
     if electronics is not None and not np.isclose(electronics.dt_ns, opened[0].dt_ns):

@@ -78,7 +78,7 @@ def _starts(
 ) -> Iterator[ElectronicsResponse]:
     """Where fits start: the response given, then chains of the recipe with the data's decay."""
     if start_from is not None:
-        yield with_decay(copy.deepcopy(start_from), sets.tail_slope, fitter.decay)
+        yield with_decay(copy.deepcopy(start_from), sets.tail_slope)
     config, training = sets.recipe.matching
     for factor in training.start_factors:
         start = ElectronicsResponse(config, sets.noise.dt_ns)
@@ -174,31 +174,29 @@ def described(
     best: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: Fitter
 ) -> FitInfo:
     """Describe the fit of a response."""
-    response, pulls, quantiles = best.response, dict[str, float](), []
+    response, pulls, quantiles = best.response, dict[str, float](), list[Difference]()
+    compared: dict[str, list[int]] = {}
     parameters, covariance = Parameters(best.chain.response), best.chain.covariance
     for name, sides in zip(sets.names, bands, strict=True):
-        comparison = Comparison(sides.entering(response), WIDTH)
         transfer = response.transfer(sides.padded)
-        z = comparison.mean_pulse(transfer).tolist()
+        here = Comparison(sides.entering(response), transfer, WIDTH)
         band = f"{name}: " if len(bands) > 1 else ""
-        pulls |= {f"{band}{t:.0f} ns": z for t, z in zip(sides.time_ns, z, strict=True)}
-        differences = comparison.differences(transfer)
-        quantiles += [d for d in differences if d.name == f"{AMPLITUDE} quantiles"]
+        z = zip(sides.time_ns, here.mean_pulse().tolist(), strict=True)
+        pulls |= {f"{band}{t:.0f} ns": value for t, value in z}
+        of_amplitude = f"{AMPLITUDE} quantiles"
+        quantiles += [d for d in here.differences() if d.name == of_amplitude]
+        compared[name] = [len(sides), len(sides.data)]
     total, functions = chi_square(response, bands)
     fitter.count(total)
     shift, error = amplitude_shift(quantiles)
-    verdict = str(best.checks)
+    values, parts, amplitude = response.describe(), [str(best.checks)], "the current amplitude"
     if abs(shift) >= 2 * error:
-        verdict += f"; the current amplitude is off by {100 * shift:+.2f} ± {100 * error:.2f} %"
+        parts.append(f"{amplitude} is off by {100 * shift:+.2f} ± {100 * error:.2f} %")
     elif best.checks.good:  # else, that the shift is small does not make the shape right
-        verdict += (
-            f"; the current amplitude has a statistical error of {100 * error:.2g} % (1σ)"
-        )
-    values = response.describe()
-    compared = zip(sets.names, bands, strict=True)
+        parts.append(f"{amplitude} has a statistical error of {100 * error:.2g} % (1σ)")
     return FitInfo(
         checks=best.checks,
-        verdict="; ".join([verdict, *stretched(values, fitter.gains)]),
+        verdict="; ".join(parts + stretched(values, fitter.gains)),
         chi_square=total,
         moments=round(functions),
         steps=fitter.steps,
@@ -208,7 +206,7 @@ def described(
         delay_ns=response.delay_ns(),
         pulls=pulls,
         gains=fitter.gains,
-        bands={name: [len(sides), len(sides.data)] for name, sides in compared},
+        bands=compared,
         in_no_band={
             "sim": len(sets.sim) - sum(len(band.sim) for band, _ in sets.parted),
             "data": len(sets.data) - sum(len(band.data) for band, _ in sets.parted),

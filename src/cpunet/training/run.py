@@ -83,8 +83,8 @@ class Run(InfoPart):
         Arrays of all parts by name.
     folder
         Folder of the run; None if it is in memory only.
-    peak, seed, device, init
-        Energies trained on, seed, device, and the run started from.
+    peak, seed, device
+        Energies trained on, seed, and device.
     dt_ns
         Sampling period in ns.
     started, seconds
@@ -110,7 +110,6 @@ class Run(InfoPart):
     seed: Annotated[int, Field(ge=0)] | None
     device: str
     seconds: Annotated[float, Field(ge=0, le=1e15)] | None
-    init: str | None = None
     started: str = ""
     sim: SideInfo = SideInfo()
     data: SideInfo = SideInfo()
@@ -381,9 +380,8 @@ def as_run(run: RunLike) -> Run:
 def used_run(run: RunLike) -> Run:
     """The same, with a warning if its fit is bad."""
     used = as_run(run)
-    checks = None if used.fit is None else used.fit.checks
-    if checks is not None and not checks.good:
-        log.warning(f"{used.name}: the fit of this run is bad: {checks.causes[0]}")
+    if used.fit is not None and not used.ok:
+        log.warning(f"{used.name}: the fit of this run is bad: {used.fit.causes[0]}")
     return used
 
 

@@ -16,9 +16,9 @@ from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 
 if TYPE_CHECKING:
     from cpunet.recipes.schema import Recipe
-    from cpunet.training.run import Run, RunLike
+    from cpunet.training.run import Run
 else:  # as the command line reads them
-    Recipe, Run, RunLike = str, Any, str | Path
+    Recipe, Run = str, Any
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ def train(
     recipe: str | Path | Recipe = "fast",
     settings: Sequence[str] | Mapping[str, Any] = (),
     peak: str = "FEP",
-    init: RunLike | None = None,
     seed: int = 0,
     device: str = "auto",
     resume: bool = False,
@@ -58,8 +57,6 @@ def train(
         Override a value of the recipe, as ``training.batch_size=64`` (repeatable).
     peak
         Energies to train on: FEP, SEP, DEP or a range in keV, as ``300-``, or several.
-    init
-        Run of the same kind to start from, as of another detector or period.
     seed
         Seed of all random numbers.
     device
@@ -107,8 +104,8 @@ def train(
     device = resolve_device(device, chosen)
     sides = read.files(sim, data)
 
-    how: dict[str, Any] = {"init": init, "force": force, "recipe": chosen, "peak": peak}
-    how |= {"seed": seed, "device": device, "resume": resume}
+    how: dict[str, Any] = {"force": force, "recipe": chosen, "peak": peak, "seed": seed}
+    how |= {"device": device, "resume": resume}
     trained: Run | Outcome[Run]
     of_all: list[str] = []
     if sides[1].table != ALL:

@@ -124,7 +124,7 @@ class Verdict(InfoPart):
         if self.beyond_ns:
             first, last = self.beyond_ns
             when = (
-                f"at {first:.0f} ns" if first == last else f"from {first:.0f} to {last:.0f} ns"
+                f"from {first:.0f} to {last:.0f} ns" if first < last else f"at {first:.0f} ns"
             )
             mean = f"the mean pulse is off by {size}, {when} after the half height"
         return (
@@ -200,68 +200,49 @@ class FitInfo(InfoPart):
 
 
 def _size(z: float) -> str:
-    return (
-        f"{z:.1f} standard errors"
-        if z < LARGEST
-        else f"more than {LARGEST:.0f} standard errors"
-    )
+    few = f"{z:.1f} standard errors"
+    return few if z < LARGEST else f"more than {LARGEST:.0f} standard errors"
 
 
 def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
     """Compare translated and measured pulses of all bands; the worst of each counts."""
-    verdicts = [_of_band(response, sides) for sides in bands]
-    worst = max(verdicts, key=lambda each: abs(each.z))
-    distinct = max(verdicts, key=lambda each: each.auc - each.auc_null)
+    chi_squares, amplitudes, means, scores = list[float](), list[float](), [], []
     off: dict[str, float] = {}
-    for each in verdicts:
-        off |= {part: max(size, off.get(part, 0.0)) for part, size in each.off.items()}
-    return worst.model_copy(
-        update={
-            "chi_square": max(each.chi_square for each in verdicts),
-            "amplitude": max(each.amplitude for each in verdicts),
-            "auc": distinct.auc,
-            "auc_null": distinct.auc_null,
-            "auc_error": distinct.auc_error,
-            "off": off,
-            "pulses": np.sum([each.pulses for each in verdicts], axis=0).tolist(),
-            "left_out": sum(each.left_out for each in verdicts),
-        }
-    )
-
-
-def _of_band(response: ElectronicsResponse, sides: Sides) -> Verdict:
-    comparison = Comparison(sides, WIDTH)
-    transfer = response.transfer(sides.padded)
-    z, differences = comparison.mean_pulse(transfer), comparison.differences(transfer)
-    time, worst = sides.time_ns, int(np.abs(z).argmax())
-    beyond = time[np.abs(z) > MAX_Z]
-    off, since = {}, -np.inf
-    for part, (until, _) in PARTS.items():
-        largest = float(np.abs(z[(time >= since) & (time < until)]).max(initial=0.0))
-        since = until
-        if largest > MAX_Z:
-            off[part] = round(largest, 1)
-    translated = sides.noisy(*sides.translated(transfer))[0]
-    translated = translated[sides.single(translated)]
+    for sides in bands:
+        here = Comparison(sides, response.transfer(sides.padded), WIDTH)
+        z, time = here.mean_pulse(), sides.time_ns
+        means.append((z, time))
+        since = -np.inf
+        for part, (until, _) in PARTS.items():
+            inside = (time >= since) & (time < until)
+            largest, since = float(np.abs(z[inside]).max(initial=0.0)), until
+            if largest > MAX_Z:
+                off[part] = max(round(largest, 1), off.get(part, 0.0))
+        differences = here.differences()
+        sliced = [d.chi_square for d in differences if d.sliced]
+        chi_squares.append(float(np.median(sliced)))
+        amplitudes += [d.chi_square for d in differences if d.name == f"{AMPLITUDE} quantiles"]
+        translated = here.noisy[0]
+        both = sides.data, translated[sides.single(translated)]
+        if min(map(len, both)) >= MIN_PULSES:
+            more = [{"log": of.log_amplitude, "rise": of.rise} for of in both]
+            pulses = (of.pulses for of in both)
+            scores.append(classifier_auc(*pulses, seed=0, features=(more[0], more[1])))
+    z, time = max(means, key=lambda mean: np.abs(mean[0]).max())
+    worst, beyond = int(np.abs(z).argmax()), time[np.abs(z) > MAX_Z].tolist()
     auc = {}
-    if min(len(translated), len(sides.data)) >= MIN_PULSES:
-        both = sides.data, translated
-        more = [{"log": of.log_amplitude, "rise": of.rise} for of in both]
-        pulses = (of.pulses for of in both)
-        classified = classifier_auc(*pulses, seed=0, features=(more[0], more[1]))
-        auc = {
-            "auc": classified.auc,
-            "auc_null": classified.null_mean,
-            "auc_error": classified.null_std,
-        }
+    if scores:
+        distinct = max(scores, key=lambda score: score.auc - score.null_mean)
+        auc = {"auc": distinct.auc, "auc_null": distinct.null_mean}
+        auc["auc_error"] = distinct.null_std
     return Verdict(
-        chi_square=float(np.median([d.chi_square for d in differences if d.sliced])),
-        amplitude=next(d.chi_square for d in differences if d.name == f"{AMPLITUDE} quantiles"),
+        chi_square=max(chi_squares),
+        amplitude=max(amplitudes),
         z=float(z[worst]),
         z_ns=float(time[worst]),
-        beyond_ns=[float(beyond[0]), float(beyond[-1])] if len(beyond) else [],
+        beyond_ns=[beyond[0], beyond[-1]] if beyond else [],
         off=off,
-        pulses=[len(sides), len(sides.data)],
-        left_out=sides.left_out,
+        pulses=[sum(map(len, bands)), sum(len(sides.data) for sides in bands)],
+        left_out=sum(sides.left_out for sides in bands),
         **auc,
     )
