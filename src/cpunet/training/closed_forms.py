@@ -122,8 +122,9 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
         Values by name, with the unit as suffix.  ``rise_…_ns``: rise times of the step
         response between fractions of its maximum.  ``missing_…_ns``: fraction of the charge
         that has not arrived so long after half of the rise (how late a response is as a whole
-        cannot be seen in unpaired pulses), and ``overshoot``, both after the decay of its part from 4 to 6 µs
-        is taken off: how much is a decay and how much late charge cannot be seen earlier.
+        cannot be seen in unpaired pulses), and ``overshoot``, both after the decay of its part
+        from 4 to 6 µs is taken off: how much is a decay and how much late charge cannot be seen
+        earlier.
         ``effective_decay_us``: from the slope of the logarithm over the fitted tail.
         ``noise_rms_kev`` and ``noise_corner_mhz``, the frequency at which the noise power falls
         to half.
