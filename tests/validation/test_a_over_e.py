@@ -7,6 +7,7 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 from cpunet.validation.a_over_e import (
+    SurvivalRow,
     ae_survival,
     peak_survival,
     sideband_survival,
@@ -244,3 +245,10 @@ def test_too_few_events_are_told() -> None:
     nothing = np.full(500, np.nan)
     assert against_energy({"data": nothing}, {"data": 2000 + 0 * nothing}, LINES).missing
     assert site_fit(np.full(500, 0.1)) is None
+
+
+def test_bootstraps_that_do_not_differ_are_no_error() -> None:
+    row = SurvivalRow()
+    row.compare({"data": (40.0, 3.0), "raw": (0.0, 4.0)}, {"raw": 0.0})
+    assert row.difference_std == {"raw": 5.0}
+    assert row.sigma == {"raw": -8.0}

@@ -80,7 +80,8 @@ class SurvivalRow(Result):
         others = {m: estimate for m, estimate in estimates.items() if m != "data"}
         off = {method: survival - data for method, (survival, _) in others.items()}
         std = {m: float(np.hypot(error, data_std)) for m, (_, error) in others.items()}
-        std.update(spread)
+        # no bootstrap differs if no event is near the cut: that is no error
+        std |= {m: error for m, error in spread.items() if error > 0}
         self.difference, self.difference_std = off, std
         self.sigma = {method: off[method] / std[method] for method in others}
 
