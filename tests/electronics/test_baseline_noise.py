@@ -215,6 +215,14 @@ def test_noise_has_the_power_of_baselines_of_which_some_are_quiet() -> None:
     assert ratios == pytest.approx(1, abs=0.02)
 
 
+def test_constant_baselines_are_left_out() -> None:
+    baselines = np.random.default_rng(5).normal(size=(1000, 1200))
+    baselines[::20] = 0
+    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
+    assert noise.n_baselines <= 950
+    assert noise.rms / TO_PREPARED == pytest.approx(1, abs=0.02)
+
+
 def test_traces_without_noise_are_refused() -> None:
     with pytest.raises(CpunetError, match="most baselines are constant"):
         BaselineNoise.of(Baselines.of([on_baselines(np.zeros((100, 1200)))], CONFIG))

@@ -136,15 +136,15 @@ class BaselineNoise:
         samples = baselines.first.waveforms[used.index, :length].astype(float)
         kev, dt_ns = used.pulses.energy_kev / used.scale, baselines.first.dt_ns
         values = (samples - used.baseline[:, np.newaxis]) * kev[:, np.newaxis]
+        if len(values) and not np.median(np.ptp(values, axis=1)):
+            raise CpunetError(
+                "most baselines are constant: there is no noise to learn; give measured traces"
+            )
         flat = values[_flat(values)] if len(values) else values
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more "
                 f"traces (at least {MIN_BASELINES} with known energy)"
-            )
-        if not np.ptp(flat, axis=1).any():
-            raise CpunetError(
-                "most baselines are constant: there is no noise to learn; give measured traces"
             )
         continuum, lines = spectrum(flat, record_samples(dt_ns))
         mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
@@ -319,11 +319,11 @@ def _band_powers(baselines: Values) -> Values:
 
 
 def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
-    """Select baselines that neither slope nor contain another pulse."""
+    """Select baselines that neither slope nor contain another pulse, nor are constant."""
     n = baselines.shape[1]
     slope = baselines @ line_slope(n)
     width = (baselines - slope[:, np.newaxis] * (np.arange(n) - 0.5 * (n - 1))).std(axis=1)
-    flat = np.ones(len(baselines), bool)
+    flat = np.ptp(baselines, axis=1) > 0
     for _ in range(CLIPS):
         for off in (np.abs(slope - np.median(slope[flat])), width - np.median(width[flat])):
             sigma = 1.4826 * np.median(np.abs(off[flat]))
