@@ -90,6 +90,8 @@ def outcomes(
 def _in_processes(
     make: Callable[[], Callable[[T], R]], tasks: Sequence[T], jobs: int, once: bool
 ) -> Generator[tuple[T, R | CpunetError]]:
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise CpunetError(f"a process runs the script that began it; {_GUARD}")
     context = multiprocessing.get_context("spawn")  # threads do not survive a fork
     others, noted = {*multiprocessing.active_children()}, set[str]()
     left: dict[Future[tuple[Any, list[logging.LogRecord]]], T] = {}
@@ -111,8 +113,7 @@ def _in_processes(
             script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
             if script.is_file() and b"__main__" not in script.read_bytes():
                 raise CpunetError(
-                    f"{script}: processes run this script again; put its calls under "
-                    'if __name__ == "__main__":'
+                    f"{script}: processes run this script again; {_GUARD}"
                 ) from error
             raise CpunetError(
                 "a process was ended, perhaps for lack of memory; use fewer processes "
@@ -123,6 +124,9 @@ def _in_processes(
                 for process in {*multiprocessing.active_children()} - others:
                     process.terminate()
                 pool.shutdown(cancel_futures=True)
+
+
+_GUARD = 'put its calls under if __name__ == "__main__":'
 
 
 def _outcome(work: Callable[[T], R], task: T) -> R | CpunetError:

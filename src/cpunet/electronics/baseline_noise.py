@@ -323,7 +323,7 @@ def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
     n = baselines.shape[1]
     slope = baselines @ line_slope(n)
     width = (baselines - slope[:, np.newaxis] * (np.arange(n) - 0.5 * (n - 1))).std(axis=1)
-    flat = np.ptp(baselines, axis=1) > 0
+    flat = np.asarray(np.ptp(baselines, axis=1) > 0)
     for _ in range(CLIPS):
         for off in (np.abs(slope - np.median(slope[flat])), width - np.median(width[flat])):
             sigma = 1.4826 * np.median(np.abs(off[flat]))
