@@ -40,15 +40,30 @@ def test_a_follower_is_its_recursion() -> None:
     assert np.diff(found, axis=1).max() < LIMIT < np.diff(KEV * records, axis=1).max()
 
 
-def test_a_curve_adds_what_the_height_says() -> None:
+def curved() -> ByHeight:
+    """A curve whose slope at a height of 0 is 10 %."""
     circuit = ByHeight()
     circuit.top_kev[...] = KEV
     place = np.linspace(0, 1, len(circuit.curve))
-    circuit.curve[:] = 0.01 * place * (1 - place)
+    circuit.curve[:] = 0.1 * place * (1 - place)
+    return circuit
+
+
+def test_a_curve_adds_what_the_height_says() -> None:
+    """Below zero, a line goes on."""
     records = np.linspace(-0.1, 1.1, 50)[np.newaxis]
-    inside = records.clip(0, 1)
-    expected = records + 0.01 * inside * (1 - inside)
-    np.testing.assert_allclose(circuit(records, np.array([KEV])), expected, atol=1e-6)
+    slope = np.where(records < 0, 1, 1 - records.clip(0, 1))
+    expected = records + 0.1 * records * slope
+    np.testing.assert_allclose(curved()(records, np.array([KEV])), expected, atol=1e-4)
+
+
+def test_noise_of_baselines_has_passed_the_curve() -> None:
+    """So it is the same behind it at a height of zero, and less where the curve is flat."""
+    noise = 1e-3 * np.random.default_rng(1).normal(size=(4, 5000))
+    for height, slope in ((0.0, 1.0), (0.5, 1 / 1.1)):
+        records = np.full(noise.shape, height)
+        behind = curved()(records, np.full(4, KEV), noise)
+        assert behind.std() == pytest.approx(slope * noise.std(), rel=0.01)
 
 
 def test_energies_decide_what_an_amplifier_does() -> None:

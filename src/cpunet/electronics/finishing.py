@@ -85,7 +85,8 @@ def with_room(
 
 
 RecordNoise = BaselineNoise | TraceNoise
-ByHeight = Callable[[npt.NDArray[Any], npt.NDArray[np.float64]], npt.NDArray[Any]]
+# records in units of the charge, energies, and noise as in baselines
+ByHeight = Callable[[npt.NDArray[Any], npt.NDArray[np.float64], Any], npt.NDArray[Any]]
 
 
 class Finished(NamedTuple):
@@ -145,8 +146,8 @@ def finish(
     added
         Added together with the noise, in prepared units, shape ``(n, samples)``.
     by_height
-        What the electronics do to records in units of the charge with their noise, given the
-        energies.
+        What the electronics do to records in units of the charge, given the energies and the
+        noise of the records.
 
     Raises
     ------
@@ -168,7 +169,7 @@ def finish(
         block = records[rows]
         if by_height is not None:
             assert energy_kev is not None  # what a height is
-            block = by_height(block, energy_kev[rows])
+            block = by_height(block, energy_kev[rows], 0.0)
         clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
         codes[rows] = clean.codes
         places = np.arange(n)[rows][clean.index]
@@ -181,11 +182,12 @@ def finish(
             drawn = noise.draw(energy_kev[places], block.shape[1], rng)
             if added is not None:
                 drawn += added[places]
-            noisy_records = np.asarray(level + drawn, np.float32)
-            if by_height is not None:
-                charge = records[rows][clean.index] + drawn * height
-                noisy_records = np.asarray(by_height(charge, energy_kev[places]), np.float32)
-            raw = Pulses.of(noisy_records, dt_ns=dt_ns)
+            if by_height is None:
+                noisy_records = level + drawn
+            else:
+                charge = records[rows][clean.index]
+                noisy_records = by_height(charge, energy_kev[places], drawn * height)
+            raw = Pulses.of(np.asarray(noisy_records, np.float32), dt_ns=dt_ns)
             prepared = prepare(raw, config, "measured")
             codes[places] = prepared.codes
             noisy[places[prepared.index]] = prepared.pulses.waveforms

@@ -65,7 +65,12 @@ class ByHeight(Stored):
         """Set the values at the knots."""
         self.lag[1:], self.curve[1:-1] = np.split(vector, [LAG_KNOTS - 1])
 
-    def __call__(self, records: Floats, energy_kev: npt.NDArray[np.float64]) -> Floats:
+    def __call__(
+        self,
+        records: Floats,
+        energy_kev: npt.NDArray[np.float64],
+        noise: Floats | float = 0.0,
+    ) -> Floats:
         """Pulses as they leave the electronics.
 
         Parameters
@@ -74,9 +79,13 @@ class ByHeight(Stored):
             In units of the charge, shape (pulses, samples).
         energy_kev
             Energy of each pulse.
+        noise
+            As it is in baselines, in units of the charge, shape (pulses, samples).  Baselines
+            have passed the curve at a height of zero, whose slope is taken out.
         """
         kev = np.asarray(energy_kev, np.float32)[:, np.newaxis]
-        signal = np.asarray(records * kev, np.float32)
+        entering = records + noise / np.float32(1 + self._slope_at_zero)
+        signal = np.asarray(entering * kev, np.float32)
         if self.lag.any():
             moved = np.exp(-_fine(self.lag))
             _follow(signal, moved, PER_STEP * FINE / float(self.step_kev))
@@ -84,6 +93,12 @@ class ByHeight(Stored):
             added = self.top_kev * _fine(self.curve)
             _add(signal, added.astype(np.float32), (len(added) - 1) / float(self.top_kev))
         return np.asarray(signal / kev, records.dtype)
+
+    @property
+    def _slope_at_zero(self) -> float:
+        """Of the curve."""
+        fine = _fine(self.curve)
+        return float(fine[1] - fine[0]) * (len(fine) - 1)
 
     def describe(self, dt_ns: float) -> dict[str, float]:
         """Rate to which `SLEWED` times the largest step is limited, and largest part added."""
@@ -104,13 +119,13 @@ def _fine(knots: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 @kernel
 def _add(signal: Any, added: Any, per_kev: float) -> None:  # pragma: no cover - compiled
-    """Add what depends on the height alone, in place; nothing beyond the ends."""
+    """Add what depends on the height alone, in place: a line below 0, nothing beyond the top."""
     last = len(added) - 1
     for row in range(len(signal)):
         for i in range(signal.shape[1]):
             place = signal[row, i] * per_kev
-            if 0 < place < last:
-                k = int(place)
+            if place < last:
+                k = max(int(place), 0)
                 signal[row, i] += added[k] + (place - k) * (added[k + 1] - added[k])
 
 

@@ -228,13 +228,15 @@ class Sides:
     def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
         """Records with each draw of the noise, read."""
         draws = range(len(self.noise.factor))
-        return [self.read(self.noise.add(clean, draw), heights) for draw in draws]
+        return [self.read(clean, heights, draw) for draw in draws]
 
-    def read(self, records: FloatArray, heights: Floats) -> Aligned:
-        """Records of prepared height, read as they leave the electronics."""
+    def read(self, clean: FloatArray, heights: Floats, draw: int | None = None) -> Aligned:
+        """Records of prepared height with a draw of noise, or none, read behind the electronics."""
+        records = clean if draw is None else self.noise.add(clean, draw)
         if self.by_height is not None:
-            charge = records * heights[:, np.newaxis].astype(np.float32)
-            records = np.asarray(self.by_height(charge, self.energy_kev), np.float32)
+            height = heights[:, np.newaxis].astype(np.float32)
+            charge, noise = clean * height, (records - clean) * height
+            records = np.asarray(self.by_height(charge, self.energy_kev, noise), np.float32)
         return read(records, self.frame)
 
 

@@ -24,12 +24,13 @@ from cpunet.training.chain_parameters import SmoothParameters, with_settings
 from cpunet.training.comparison import Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
 
-# Stages: most pulses of a side, width of the bounded functions, and least error of a quantile,
-# since those of a limited current are all but equal.
-STAGES = ((512, 60.0, 3e-3), (512, 6.0, 1e-3), (1024, 1.5, 2e-4))
+# Stages: most pulses of a side, width of the bounded functions, least error of a quantile (those
+# of a limited current are all but equal), and share by which a step must lower the cost.
+STAGES = ((512, 60.0, 3e-3, 0.03), (512, 6.0, 1e-3, 0.03), (1024, 1.5, 2e-4, 0.003))
 MOST = 2048  # pulses that are fitted, and as many that are held out
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
-STEPS, SETTLED, FIRST, TRIES = 10, 3.0, 1e-3, 5  # gain that ends a stage; damping, and tries
+STEPS, FIRST, TRIES = 10, 1e-3, 5  # of a stage; damping, and tries
+WELL = 1.5  # chi-square per function, with which no slew rate is searched for
 GAIN = 20.0  # in chi-square of pulses that were held out
 # Priors: variances of the follower's logarithm per largest step, widths of the curve in parts
 # of its height, and its correlation length in knots.
@@ -47,7 +48,7 @@ class Moves:
             records = clean, heights
             if i < at.n:
                 records = sides.translated(at.own.transfer(sides.padded))
-            moved.append(sides.read(sides.noise.add(records[0], 0), records[1]))
+            moved.append(sides.read(*records, 0))
         at.put(at.place)
         self.log_amplitude, self.rise = (
             np.stack([getattr(after, by) - getattr(aligned, by) for after in moved], 1)
@@ -98,13 +99,23 @@ def with_heights(
     behind = [sides.entering(own) for sides in bands]
     halves = [min(len(sides), len(sides.data), 2 * MOST) // 2 for sides in bands]
     fitted = [sides.of(n) for sides, n in zip(behind, halves, strict=True)]
-    for most, width, least in STAGES:
-        covariance = _solve(own, [sides.of(most) for sides in fitted], width, least, count)
+    *first, (most, *last) = STAGES
+    for limited in False, True:
+        if limited:
+            _limit(own, [sides.of(first[0][0]) for sides in fitted])
+        for few, *stage in first:
+            _solve(own, [sides.of(few) for sides in fitted], *stage, count)
+        near, functions = chi_square(own, fitted)
+        if near < WELL * functions:
+            break  # a slew rate would make up for what is a curve
+    _solve(own, [sides.of(most) for sides in fitted], *last, count)
     held = [sides.some(slice(n, 2 * n)) for sides, n in zip(bands, halves, strict=True)]
     (before, _), (after, functions) = chi_square(response, held), chi_square(own, held)
     line = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
     if before - after <= GAIN:
         return None, f"left out; {line}"
+    whole = [sides.of(2 * MOST) for sides in behind]
+    covariance = _solve(own, whole, *last, count)
     return Fitted(own, after, round(functions), covariance), f"used; {line}"
 
 
@@ -139,17 +150,18 @@ class Unknowns:
         self.chain.set(vector[: self.n])
         self.by_height.set(vector[self.n :])
 
-    def limited(self, cost: Callable[[], float]) -> bool:
-        """Go to the slew rate of the least cost; far from it, pulses are not linear in it."""
-        rates = [np.log(self.lag / limit / np.tanh(self.lag / limit)) for limit in LIMITS]
-        costs = [cost()]
-        for rate in rates:
-            self.by_height.lag[1:] = rate
-            costs.append(cost())
-        if best := int(np.argmin(costs)):
-            self.place[self.n : self.n + len(self.lag)] = rates[best - 1]
-        self.put(self.place)
-        return best > 0
+
+def _limit(own: ElectronicsResponse, bands: Sequence[Sides]) -> None:
+    """Go to the slew rate of the least chi-square; far from it, pulses are not linear in it."""
+    at = np.arange(1, LAG_KNOTS) / PER_STEP
+    by_height, costs = own.by_height, list[float]()
+    assert by_height is not None
+    rates = [np.log(at / limit / np.tanh(at / limit)) for limit in LIMITS]
+    by_height.curve[:] = 0
+    for rate in rates:
+        by_height.lag[1:] = rate
+        costs.append(chi_square(own, bands, STAGES[0][1])[0])
+    by_height.lag[1:] = rates[int(np.argmin(costs))]
 
 
 def _solve(
@@ -157,6 +169,7 @@ def _solve(
     bands: Sequence[Sides],
     width: float,
     least: float,
+    share: float,
     count: Callable[[float], None],
 ) -> Values:
     """Set chain, follower and curve to their minimum of chi-square with priors.
@@ -193,10 +206,6 @@ def _solve(
         information = problem.information + precision
         gradient = information @ place - precision @ unknowns.centre - right
         here = Parabola(place, cost, 0, problem.information, cost, gradient)
-        if not unknowns.by_height.lag.any() and unknowns.limited(
-            lambda: problem.evaluate(own.transfer(padded), unknowns.place, anew=False)
-        ):
-            continue
         for _ in range(TRIES):
             damped = precision + damping * np.diag(information.diagonal())
             tried = np.clip(place + bounded_step(here, damped, *bounds), *bounds)
@@ -208,7 +217,7 @@ def _solve(
             unknowns.put(place)
             break
         unknowns.place, damping = tried, 0.1 * damping
-        if cost - new < SETTLED:
+        if cost - new < share * cost:
             break
     if best[0] == LAGS[0]:
         unknowns.by_height.lag[:] = 0

@@ -202,15 +202,18 @@ class ResponseBackend(Backend):
         n_pre, length = batch.trace
         assert energies is not None  # those of the pulses
         levels, codes, begin, charge = self._levels(windows, n_pre, length)
+        noise = np.zeros_like(levels)
         if batch.noise and self.noise is not None:
-            levels += self.noise.draw(energies, length, batch.generator)
+            noise += self.noise.draw(energies, length, batch.generator)
         if piled is not None and len(piled.row):
             # early piled-up pulses need longer traces
             reached = length + piled.reach(self.dt_ns)
             shapes = self._levels(windows[piled.partner], n_pre, reached)[0]
             levels += piled.added(np.nan_to_num(shapes), energies, self.dt_ns, length)
-        if self.by_height is not None:
-            levels = self.by_height(levels * charge, energies) / charge
+        if self.by_height is None:
+            levels += noise
+        else:
+            levels = self.by_height(levels * charge, energies, noise * charge) / charge
         return Translated(levels, codes, begin)
 
     def _levels(
