@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--detector", default="icpc")
     given = parser.parse_args()
-    generator = REN.load(given.run).backend.chain
+    generator = REN.load(given.run).backend.network
     assert generator is not None, "a run of a readout chain"
     chain = learned_chain(generator.response, "run").undecayed
     detector = read_detector(given.detector)

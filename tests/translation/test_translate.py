@@ -24,10 +24,10 @@ from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile, open_pulses
 from cpunet.translation import file_translation
-from cpunet.translation.file_translation import Counts, noise_seed
 from cpunet.translation.options import Adc
-from cpunet.translation.translate import expanded, translate
-from cpunet.translation.translator import REN
+from cpunet.translation.translate import translate
+from cpunet.translation.translation import Counts
+from cpunet.translation.translator import REN, noise_seed
 from synthetic import (
     edges,
     load_recipe,

@@ -51,6 +51,7 @@ from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.writing import written_hdf5
 from cpunet.training.run import RunLike, used_run
+from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import BATCH, REN
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ class TemplateTranslator:
     """
 
     def __init__(self, ren: REN, dt_ns: float) -> None:
-        if ren.backend.chain is None:
+        if not isinstance(ren.backend, ResponseBackend):
             raise CpunetError(
                 "the run's network translates whole pulses, not the templates that they are "
                 "summed from; give a run of the recipe fast"
@@ -86,7 +87,7 @@ class TemplateTranslator:
                 "templates are summed, and get the linear part of the readout alone: its slew "
                 "rate and curve act on the sums"
             )
-        self._chain = copy.deepcopy(ren.backend.chain)
+        self._chain = copy.deepcopy(ren.backend.network)
         self._chain.response.dt_ns[...] = dt_ns
         if self._chain.response.drift is not None:
             self._chain.response.drift.keeps_begin = True  # templates are summed by time

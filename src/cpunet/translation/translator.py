@@ -11,7 +11,6 @@ import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -19,11 +18,11 @@ import numpy.typing as npt
 
 from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejections_of
 from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
-from cpunet.training.run import Run
+from cpunet.training.run import RunLike, as_run
 from cpunet.translation.backends import Backend, Batch, Energies, Translated, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], Pulses)
@@ -67,27 +66,17 @@ class TranslatedPulses:
         """Mask of the translated rows."""
         return np.asarray(self.codes == Rejection.ACCEPTED)
 
-    @property
-    def rejections(self) -> dict[str, int]:
-        """Numbers of rejected rows by reason."""
-        return rejections_of(self.codes)
-
-    @property
-    def columns(self) -> Columns:
-        """Columns to be stored with the pulses."""
-        return {"rejection": (self.codes, ""), **self.truth}
-
     @classmethod
-    def joined(cls, blocks: Sequence[Self]) -> Self:
+    def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all blocks."""
-        masks = [block.saturated for block in blocks if block.saturated is not None]
+        masks = [part.saturated for part in parts if part.saturated is not None]
         return cls(
-            Pulses.concatenate([block.pulses for block in blocks]),
-            np.concatenate([block.codes for block in blocks]),
+            Pulses.concatenate([part.pulses for part in parts]),
+            np.concatenate([part.codes for part in parts]),
             np.concatenate(masks) if masks else None,
             {
-                name: (np.concatenate([block.truth[name][0] for block in blocks]), units)
-                for name, (_, units) in blocks[0].truth.items()
+                name: (np.concatenate([part.truth[name][0] for part in parts]), units)
+                for name, (_, units) in parts[0].truth.items()
             },
         )
 
@@ -126,27 +115,19 @@ class Translator:
         self.tails: DrawnTails | None = backend.tails
 
     @classmethod
-    def of(cls, run: Run, device: str = "cpu") -> Self:
-        """Make a translator of a run.
-
-        Raises
-        ------
-        CpunetError
-            If the weights of the run do not match its recipe.
-        """
-        delay_ns = 0.0 if run.fit is None else cls.sign * run.fit.delay_ns
-        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns, delay_ns)
-
-    @classmethod
-    def load(cls, run: str | Path, device: str = "cpu") -> Self:
-        """Load a translator from the folder of a training run.
+    def of(cls, run: RunLike, device: str = "cpu") -> Self:
+        """Make a translator of a run, or load it from the run's folder.
 
         Raises
         ------
         CpunetError
             If the folder is not a finished run, or its weights do not match its recipe.
         """
-        return cls.of(Run.load(run), device)
+        run = as_run(run)
+        delay_ns = 0.0 if run.fit is None else cls.sign * run.fit.delay_ns
+        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns, delay_ns)
+
+    load = of
 
     def translate(
         self,
@@ -196,8 +177,6 @@ class Translator:
         else:
             array = np.asarray(waveforms)
             ndim, pulses = array.ndim, Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
-        if not ndim:
-            raise CpunetError("waveforms is a single number; expected (pulses, samples)")
         self._by_energy(energy_kev, noise)
         kev: dict[str, Energies] = {}
         for name, values in {"energy_kev": energy_kev, "tails_kev": tails_kev}.items():
@@ -213,21 +192,19 @@ class Translator:
         left = kev.get("tails_kev")
         if seed is None:
             seed = int(np.random.default_rng().integers(2**63))
-        blocks: list[TranslatedPulses] = []
-        for first in range(0, max(len(pulses), 1), NOISE_ROWS):
-            rows = slice(first, first + NOISE_ROWS)
-            block = self.translate_pulses(
+        parts = [
+            self.translate_pulses(
                 pulses[rows],
                 noise=noise,
-                generator=np.random.default_rng(noise_seed(seed, None, len(blocks))),
+                generator=np.random.default_rng(noise_seed(seed, None, number)),
                 tails_kev=None if left is None else left[rows],
             )
-            blocks.append(block)
-        done = TranslatedPulses.joined(blocks)
-        reasons = counted(done.rejections)
-        if ndim == 1 and reasons:
-            raise CpunetError(f"the pulse cannot be translated: {reasons}")
-        if reasons:
+            for number, rows in enumerate(blocks(max(len(pulses), 1), NOISE_ROWS))
+        ]
+        done = TranslatedPulses.joined(parts)
+        if reasons := counted(rejections_of(done.codes)):
+            if ndim < 2:
+                raise CpunetError(f"the pulse cannot be translated: {reasons}")
             warnings.warn(
                 f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
                 f"translated and are rows of NaN: {reasons}",
@@ -321,13 +298,14 @@ class Translator:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
         n, length = whole.windows.shape
         length = length if whole.trace is None else whole.trace[1]
-        result = np.empty((n, length), np.float32)
-        codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
-        for first in range(0, n, BATCH):
-            rows = np.arange(first, min(first + BATCH, n))
-            done = self.backend.translate(whole.of_rows(rows))
-            result[rows], codes[rows], begin[rows] = done
-        return Translated(result, codes, begin)
+        done = Translated(
+            np.empty((n, length), np.float32), np.zeros(n, np.uint8), np.zeros(n, np.int64)
+        )
+        for rows in blocks(n, BATCH):
+            of_batch = self.backend.translate(whole.of_rows(np.arange(n)[rows]))
+            for values, translated in zip(done, of_batch, strict=True):
+                values[rows] = translated
+        return done
 
     def _by_energy(self, energy_kev: npt.ArrayLike | None, noise: bool) -> bool:
         """Whether a translation depends on the energies, which then must be given."""
