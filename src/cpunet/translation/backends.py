@@ -196,13 +196,13 @@ class ResponseBackend(Backend):
         # early piled-up pulses need longer records
         reach = 0 if piled is None else piled.reach(self.dt_ns)
         if batch.trace is None:
-            shapes = None
+            shapes: Floats | None = None
             if piled is not None:
                 others = np.pad(windows[piled.partner], ((0, 0), (0, reach)), mode="edge")
-                shapes, clean = self._clean(others)
-                scale = np.full(len(shapes), np.median(clean.scale))
+                records, clean = self._clean(others)
+                scale = np.full(len(records), np.median(clean.scale))
                 scale[clean.index] = clean.scale
-                shapes = shapes / scale[:, np.newaxis]
+                shapes = records / scale[:, np.newaxis]
             return self.finished(self.network(windows), batch, shapes)
 
         n_pre, length = batch.trace

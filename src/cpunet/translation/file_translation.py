@@ -16,7 +16,7 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.outputs import refuse_existing
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
@@ -107,7 +107,8 @@ class FileTranslation:
             If source or output cannot be used, no pulse can be translated, the source changes
             meanwhile, or another process writes the same output.
         """
-        refuse_inputs(out, self.run.folder, *source.files)
+        resume = self.resume and not self.force
+        refuse_existing(out, self.run.folder, *source.files, force=self.force or resume)
         before = source_print(source)
         made_by = f"{self.run.weights_sha256}{self.run.recipe!r}"
         provenance = {
@@ -115,9 +116,8 @@ class FileTranslation:
             "run": hashlib.sha256(made_by.encode()).hexdigest(),
             "options": asdict(self.options) | {"noise_key": noise_key},
         }
-        if self.resume and not self.force and out.exists():
+        if resume and out.exists():
             return self.result(replace(finished(out, provenance), skipped=1), path=out)
-        refuse_existing(out, force=self.force)
         counts = Counts()
         give_back_large_arrays()
         with source.open() as pulses, self.writer(out, force=self.force) as writer:
@@ -196,27 +196,15 @@ class FileTranslation:
 
 
 def source_print(source: PulseFile) -> str:
-    """Digest of names, sizes and times of the input files, and of how they are read.
-
-    Raises
-    ------
-    CpunetError
-        If a file does not exist.
-    """
+    """Digest of names, sizes and times of the input files, and of how they are read."""
     if source.pulses is not None:
         content = source.pulses.waveforms, source.pulses.energy_kev
         return hashlib.sha256(b"".join(values.tobytes() for values in content)).hexdigest()
-    paths = [source.path]
-    elsewhere = (source.energy or "").rpartition(":")[0]
-    if elsewhere and Path(elsewhere).is_file():
-        paths.append(Path(elsewhere))
     facts: list[Any] = [source.table, source.energy, source.kev_per_adc, source.dt_ns]
-    for path in paths:
-        try:
+    for path in (source.path, Path((source.energy or "").rpartition(":")[0])):
+        if path.is_file():
             stat = path.stat()
-        except OSError:
-            raise CpunetError(f"{path}: no such file; check the name") from None
-        facts.append((path.name, stat.st_size, stat.st_mtime_ns))
+            facts.append((path.name, stat.st_size, stat.st_mtime_ns))
     return hashlib.sha256(repr(facts).encode(errors="surrogateescape")).hexdigest()
 
 

@@ -67,8 +67,8 @@ class Form:
         if tails is None and (options.tails != NONE or options.pile_up_khz):
             name = "tails" if options.tails != NONE else "pile_up_khz"
             raise CpunetError(
-                f"`{name}` {getattr(options, name)}: the run tells nothing of pile-up tails and "
-                "of other pulses (a network, or trained without raw traces)",
+                f"`{name}` {getattr(options, name)}: the run tells nothing of pile-up tails "
+                "and of other pulses (a network, or trained without raw traces)",
                 "train a readout chain on raw traces, or leave it out",
             )
         if tails is not None and options.tails == LEARNED:
@@ -78,13 +78,13 @@ class Form:
         self.tails = tails if tails is not None and tails.law.rate_khz > 0 else None
         self.n_pre, self.length = config.samples_before, config.length
         self.scale: tuple[float, float] | None = None
-        self.ends, self.samples = (0, HIGHEST), np.dtype(np.float32)
+        self.ends, self.samples = (0, HIGHEST), "f4"
         if adc is None:
             return
         self.scale, self.ends = adc_scale(run, translator, adc), adc_ends(run, adc)
-        kinds = [np.iinfo(kind) for kind in ("u2", "i2", "u4", "i4")]
+        kinds = {kind: np.iinfo(kind) for kind in ("u2", "i2", "u4", "i4")}
         low, high = self.ends
-        self.samples = next(k.dtype for k in kinds if k.min <= low and high <= k.max)
+        self.samples = next(k for k, of in kinds.items() if of.min <= low and high <= of.max)
         self.length = self.length if adc.length is None else adc.length
         self.n_pre = self.n_pre if adc.n_pre is None else adc.n_pre
         if not 0 <= self.n_pre < self.length:
@@ -145,7 +145,7 @@ class Form:
         per_kev, baseline = self.scale
         counts = np.rint(levels * (per_kev * energies)[:, np.newaxis] + baseline)
         counts[~np.isfinite(counts).all(axis=1)] = 0
-        saturated = ((counts < self.ends[0]) | (counts > self.ends[1])).any(axis=1)
+        saturated = np.asarray((counts != counts.clip(*self.ends)).any(axis=1))
         # single precision represents these integers exactly
         traces = done.pulses.with_waveforms(counts.clip(*self.ends).astype(np.float32))
         return TranslatedPulses(traces, done.codes, saturated, truth)

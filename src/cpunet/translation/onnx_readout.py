@@ -60,11 +60,9 @@ class Graph:
         from onnx import helper
 
         self.nodes.append(helper.make_node("Identity", [output], [name]))
-        ends = [
-            [helper.make_tensor_value_info(value, FLOAT, ["batch", n])]
-            for value, n in (("windows", self.length), (name, samples))
-        ]
-        graph = helper.make_graph(self.nodes, "cpunet", *ends, self.constants)
+        windows = helper.make_tensor_value_info("windows", FLOAT, ["batch", self.length])
+        made = helper.make_tensor_value_info(name, FLOAT, ["batch", samples])
+        graph = helper.make_graph(self.nodes, "cpunet", [windows], [made], self.constants)
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
 
 

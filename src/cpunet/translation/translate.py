@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import logging
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -16,16 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.outputs import refuse_existing
 from cpunet.processes import outcomes
 from cpunet.progress import stage
 from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own_folder
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run, used_run
-from cpunet.translation.file_translation import Counts, FileTranslation
+from cpunet.translation.file_translation import FileTranslation
 from cpunet.translation.options import NONE, Adc, TranslateOptions
-from cpunet.translation.translation import Translation
+from cpunet.translation.translation import Counts, Translation
 
 log = logging.getLogger(__name__)
 
@@ -198,41 +197,35 @@ def _several(
         Before the translation, if the run cannot be used, or outputs exist (without
         `resume` or `force`) or would have the same names; at the end, if files failed.
     """
-    tasks: list[Task] = []
-    for source in sources:
-        to = out / source.path.name
-        to = to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5")
-        tasks.append((source, to, to.name))
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-    twice = [name for name, n in Counter(name for *_, name in tasks).items() if n > 1]
-    if twice:
-        raise CpunetError(
-            f"{len(twice)} names occur twice among the files, as {twice[0]}; "
-            "translate these into folders of their own"
-        )
-    shared = next((s.energy for s in sources if s.energy and ":" in s.energy), None)
-    if shared is not None and len(tasks) > 1:
-        raise CpunetError(
-            f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
-            "translate them one by one"
-        )
-    job = make(run)
+    job, tasks = make(run), dict[Path, Task]()
     # thousands of files are compared by their identity, and not each with each other
     stats = [source.path.stat() for source in sources if source.path.exists()]
     inputs = {(stat.st_dev, stat.st_ino) for stat in stats}
-    for source, to, _ in tasks:
-        refuse_inputs(to, run.folder, *source.files)
+    for source in sources:
+        to = out / source.path.name
+        to = to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5")
+        if to in tasks:
+            raise CpunetError(
+                f"names occur twice among the files, as {to.name}; translate these into "
+                "folders of their own"
+            )
+        if len(sources) > 1 and ":" in (source.energy or ""):
+            raise CpunetError(
+                f"`energy` {source.energy} belongs to one file of pulses, not to "
+                f"{len(sources)}; translate them one by one"
+            )
+        refuse_existing(to, run.folder, *source.files, force=job.force or job.resume)
         if to.exists() and (to.stat().st_dev, to.stat().st_ino) in inputs:
             raise CpunetError(f"{to}: is the input; choose another `out`")
-        if not job.resume:
-            refuse_existing(to, force=job.force)
+        tasks[to] = source, to, to.name
     counts, failed = Counts(), list[str]()
     # what the job says is said once: others make theirs in processes of their own
     begin = partial(_worker, partial(make, run) if jobs > 1 else lambda: job)
     with (
         stage("Translating", len(tasks)) as bar,
-        closing(outcomes(begin, tasks, jobs, once=True)) as results,
+        closing(outcomes(begin, [*tasks.values()], jobs, once=True)) as results,
     ):
         for (source, to, _), outcome in results:
             bar.update()

@@ -11,6 +11,7 @@ import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -22,7 +23,7 @@ from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejections_of
 from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
-from cpunet.training.run import RunLike, as_run
+from cpunet.training.run import Run
 from cpunet.translation.backends import Backend, Batch, Energies, Translated, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], Pulses)
@@ -115,19 +116,27 @@ class Translator:
         self.tails: DrawnTails | None = backend.tails
 
     @classmethod
-    def of(cls, run: RunLike, device: str = "cpu") -> Self:
-        """Make a translator of a run, or load it from the run's folder.
+    def of(cls, run: Run, device: str = "cpu") -> Self:
+        """Make a translator of a run.
+
+        Raises
+        ------
+        CpunetError
+            If the weights of the run do not match its recipe.
+        """
+        delay_ns = 0.0 if run.fit is None else cls.sign * run.fit.delay_ns
+        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns, delay_ns)
+
+    @classmethod
+    def load(cls, run: str | Path, device: str = "cpu") -> Self:
+        """Load a translator from the folder of a training run.
 
         Raises
         ------
         CpunetError
             If the folder is not a finished run, or its weights do not match its recipe.
         """
-        run = as_run(run)
-        delay_ns = 0.0 if run.fit is None else cls.sign * run.fit.delay_ns
-        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns, delay_ns)
-
-    load = of
+        return cls.of(Run.load(run), device)
 
     def translate(
         self,
@@ -298,14 +307,12 @@ class Translator:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
         n, length = whole.windows.shape
         length = length if whole.trace is None else whole.trace[1]
-        done = Translated(
-            np.empty((n, length), np.float32), np.zeros(n, np.uint8), np.zeros(n, np.int64)
-        )
+        windows = np.empty((n, length), np.float32)
+        codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
         for rows in blocks(n, BATCH):
-            of_batch = self.backend.translate(whole.of_rows(np.arange(n)[rows]))
-            for values, translated in zip(done, of_batch, strict=True):
-                values[rows] = translated
-        return done
+            batch = whole.of_rows(np.arange(n)[rows])
+            windows[rows], codes[rows], begin[rows] = self.backend.translate(batch)
+        return Translated(windows, codes, begin)
 
     def _by_energy(self, energy_kev: npt.ArrayLike | None, noise: bool) -> bool:
         """Whether a translation depends on the energies, which then must be given."""
