@@ -13,26 +13,15 @@ import pytest
 from lgdo import Array, Scalar, Struct
 
 from cpunet.errors import CpunetError
-from cpunet.legend.currents import (
-    PEAK,
-    continued,
-    currents_about_peak,
-    most_frequent,
-    with_rings,
-)
-from cpunet.legend.library_files import (
+from cpunet.legend.currents import PEAK, add_rings, currents_about_peak, most_frequent
+from cpunet.legend.library_files import make_library, merge_libraries
+from cpunet.legend.translate_library import (
+    TemplateTranslator,
     chosen_libraries,
     known_detector,
-    make_library,
-    merge_libraries,
+    translate_library,
 )
-from cpunet.legend.translate_library import TemplateTranslator, translate_library
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.pulses.container import Pulses
-from cpunet.pulses.loading import load_pulses
-from cpunet.pulses.peaks import parse_selection
-from cpunet.pulses.reading.files import PulseFile
-from cpunet.recipes import load_recipe
 from cpunet.simulation import simulator
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
@@ -40,7 +29,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator
 from cpunet.training.run import Run
 from cpunet.translation.translator import REN
-from synthetic import after_pole_and_decay, one_line, sampled, write_chain, write_pulses
+from synthetic import after_pole_and_decay, one_line, sampled, write_chain
 
 R, Z = np.arange(6.0), np.arange(8.0)
 WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")
@@ -109,36 +98,36 @@ def test_currents_about_their_maximum() -> None:
     shifted = currents_about_peak(0.25 * templates + 0.75 * later)
     assert shifted[1][0] - times[0] == pytest.approx(0.75, abs=0.02)
     np.testing.assert_allclose(shifted[0][0], found[0], atol=3e-4 * found[0].max())
-    short, when = currents_about_peak(np.array([[0, 1]], np.float32))
-    assert np.isnan(short).all()
-    assert np.isnan(when).all()
-    nothing, when = currents_about_peak(np.full((2, 300), [[0], [np.nan]], np.float32))
-    assert np.isnan(nothing).all()
-    assert np.isnan(when).all()
     templates[1, -50] = np.nan  # long after the maximum
-    found, times = currents_about_peak(templates)
-    assert np.isnan(found).all(axis=1).tolist() == [False, True, False]
-    assert np.isnan(times).tolist() == [False, True, False]
+    constant = np.full((2, 300), [[0], [np.nan]], np.float32)
+    for nothing, wanted in (
+        (np.array([[0, 1]], np.float32), [True]),
+        (constant, [True, True]),
+        (templates, [False, True, False]),
+    ):
+        found, times = currents_about_peak(nothing)
+        assert np.isnan(found).all(axis=1).tolist() == wanted
+        assert np.isnan(times).tolist() == wanted
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_the_mode_of_equal_amplitudes_is_their_value(n: int) -> None:
-    assert most_frequent(np.full(n, 0.0081)) == 0.0081
+def test_the_mode_of_equal_amplitudes_is_their_value() -> None:
+    for n in (1, 3):
+        assert most_frequent(np.full(n, 0.0081)) == 0.0081
 
 
 def test_rings_go_on_from_the_crystal() -> None:
     r, z = np.meshgrid(np.arange(9.0), np.arange(10.0), indexing="ij")
     plane = 100 + 7 * r - 3 * z
     there = np.hypot(r, z - 5) < 5
-    known = np.where(there, plane, np.nan)
-    on = continued(known, 3)
-    reached = np.isfinite(on)
+    times = np.where(there, plane, np.nan)
+    templates = times[..., None].astype(np.float32)
+    add_rings(templates, times, 3)
+    reached = np.isfinite(times)
     # three rings beyond, on the slope, and all within as it was
-    np.testing.assert_allclose(on[reached], plane[reached])
+    np.testing.assert_allclose(times[reached], plane[reached])
     assert reached.sum() > there.sum()
-    filled = with_rings(known[..., None].astype(np.float32).copy(), 3)[..., 0]
-    np.testing.assert_array_equal(filled[there], known[there])
-    np.testing.assert_array_equal(np.isfinite(filled), reached)
+    np.testing.assert_array_equal(templates[there, 0], plane[there])
+    np.testing.assert_array_equal(np.isfinite(templates[..., 0]), reached)
 
 
 def test_the_layout_is_that_of_production(chain: Path, ideal: Path, tmp_path: Path) -> None:
@@ -227,7 +216,10 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns (dt in 'ns')"),
         ({"dt": Scalar(1.0, attrs={"units": "furlong"})}, "dt in 'furlong'"),
         ({"dt": None}, "no dt with the waveforms"),
-        ({"z": Array(np.empty((0, 2)))}, "z is no column of numbers"),
+        (
+            {"z": Array(np.empty((0, 2)), attrs={"units": "mm"})},
+            "z does not ascend",
+        ),
         (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
         (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),
         ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
@@ -266,21 +258,11 @@ def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path)
             chosen_libraries(file, ideal, (), "B02")
         with pytest.raises(CpunetError, match="no library of V03; the file has V01"):
             chosen_libraries(file, ideal, ("V03",), None)
-
-
-def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
-    sim, known = tmp_path / "sim.lh5", Run.load(chain)
-    assert known_detector(known) is None
-    recipe = load_recipe("fast")
-    edges = np.repeat([[0.0, 1.0]], [300, 300], axis=1) + np.linspace(0, 1e-6, 60)[:, None]
-    pulses = Pulses.of(edges, dt_ns=16, energy_kev=np.full(60, 2614.5))
-    for told, name in (("no JSON", None), (json.dumps({"detector": {"name": "V01"}}), "V01")):
-        write_pulses(sim, pulses, attrs={"simulation": told}, force=True)
-        fep = parse_selection("FEP", recipe.peaks)
-        side = load_pulses(PulseFile(sim), "simulated", recipe, fep).provenance()
-        sim.unlink()  # what was trained is stored with the run, wherever its file is now
-        run = known.model_copy(update={"sim": side, "folder": tmp_path})
-        assert known_detector(run) == name
+    run = Run.load(chain)
+    assert known_detector(run) is None
+    side = run.sim.model_copy(update={"detector": "V01"})
+    run = run.model_copy(update={"sim": side, "folder": tmp_path})
+    assert known_detector(run) == "V01"
     (tmp_path / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
     assert known_detector(run) == "V02"
 
@@ -298,18 +280,20 @@ def test_single_places_within_are_filled(chain: Path, tmp_path: Path) -> None:
 
 def test_a_library_is_made(tmp_path: Path) -> None:
     short = {"grid_mm": 12, "settings": {"length_ns": 2400}}
-    maps, made_maps = simulator.drift_maps, []
+    made_maps = []
+
+    def counted(*given: Any) -> Any:
+        made_maps.append(maps(*given))
+        return made_maps[-1]
+
+    maps, path = simulator.drift_maps, str(tmp_path / "psl.lh5")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            simulator,
-            "drift_maps",
-            lambda *given: made_maps.append(maps(*given)) or made_maps[0],
-        )
-        done = make_library("ppc", tmp_path / "psl.lh5", **short)
+        patch.setattr(simulator, "drift_maps", counted)
+        done = make_library("ppc", path, **short)
     assert len(made_maps) == 1  # whatever the number of places
     assert "places have a template" in str(done)
-    (name,) = lh5.ls(str(tmp_path / "psl.lh5"))
-    made = lh5.read(name, str(tmp_path / "psl.lh5"))
+    (name,) = lh5.ls(path)
+    made = lh5.read(name, path)
     assert {"waveform_000_deg", "drift_time_045_deg"} <= set(made)
     assert made["dt"].value == 1
     assert made["waveform_000_deg"].nda.shape[2] == 2400

@@ -340,13 +340,12 @@ class IdealLibrary:
 
 def _axis(column: h5py.Dataset, where: str) -> Values:
     """Grid points in mm."""
-    if not is_column(column) or column.ndim != 1:
-        raise CpunetError(f"{where} is no column of numbers; complete the library")
     units = units_of(column)
     if (mm_per_unit := factor(units, "mm")) is None:
         raise CpunetError(f"{where} is in {units!r}; expected one of {unit_names('mm')}")
-    values = np.asarray(column[()], np.float64) * mm_per_unit
-    if len(values) < 2 or not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
+    numbers = is_column(column) and column.ndim == 1 and len(column) > 1
+    values = np.asarray(column[()] if numbers else [0, 0], np.float64) * mm_per_unit
+    if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
         raise CpunetError(f"{where} does not ascend from node to node; write the library again")
     if np.abs(values).max() > LARGEST_MM:
         raise CpunetError(
