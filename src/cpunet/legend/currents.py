@@ -32,22 +32,20 @@ def currents_about_peak(charge: FloatArray) -> tuple[Floats, Values]:
     Parameters
     ----------
     charge
-        Charge sampled every nanosecond, 0 before the first sample, shape ``(n, samples)``.
+        Charge sampled every nanosecond, 0 before the first sample, shape ``(n, samples)`` with
+        3 samples or more.
 
     Returns
     -------
     currents
         Currents in units of the charge per ns, shape ``(n, LENGTH)``; 0 outside the record,
-        rows of NaN for templates that contain NaN, have no maximum above 0, or have fewer
-        than 3 samples.
+        rows of NaN for templates that contain NaN or have no maximum above 0.
     times_ns
         Times of the maxima after the first sample, shape ``(n,)``, including the delay of the
         backward averages, which is the same for all templates; NaN for rows of NaN.
     """
     n, n_samples = charge.shape
     currents, times = np.full((n, LENGTH), np.nan, np.float32), np.full(n, np.nan)
-    if n_samples < 3:  # no sample has two neighbours
-        return currents, times
     for row, template in enumerate(charge):
         current = averaged(template.astype(np.float64))
         peak = 1 + int(current[1:-1].argmax())

@@ -116,7 +116,7 @@ def merge_libraries(
     return sorted(first)
 
 
-@dataclass
+@dataclass(frozen=True)
 class MadeLibrary:
     """A library of charge pulses that was made.
 
@@ -132,10 +132,10 @@ class MadeLibrary:
     """
 
     path: Path
-    templates: int = 0
-    written: int = 0
-    outside: int = 0
-    late: int = 0
+    templates: int
+    written: int
+    outside: int
+    late: int
 
     def __str__(self) -> str:
         return (
@@ -212,9 +212,9 @@ def make_library(
         np.arange(int(axis[-1] / grid_mm + 1e-6) + 1) * grid_mm
         for axis in (simulator.fields.r_mm, simulator.fields.z_mm)
     )
-    counts = MadeLibrary(out, templates=len(ANGLES_DEG) * len(r_mm) * len(z_mm))
-    shape = (len(r_mm), len(z_mm))
-    with written_hdf5(out) as (made, _), stage("Templates", counts.templates) as bar:
+    shape, counts = (len(r_mm), len(z_mm)), np.zeros(3, int)
+    templates = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
+    with written_hdf5(out) as (made, _), stage("Templates", templates) as bar:
         library = made.create_group(detector.name or "detector")
         put(library, "r", r_mm, "mm")
         put(library, "z", z_mm, "mm")
@@ -223,22 +223,20 @@ def make_library(
         waveforms = np.empty((*shape, wanted.n_samples), np.float32)
         drift_times = np.empty(shape)
         for angle_deg in ANGLES_DEG:
-            waveforms.fill(np.nan)
-            drift_times.fill(np.nan)
             phi = math.radians(angle_deg)
             for i, r in enumerate(r_mm):
                 x, y = r * math.cos(phi), r * math.sin(phi)
                 signals = simulator.signals(x, y, z_mm, ENERGY_KEV)
+                late = signals.valid & ~signals.collected
                 good = signals.valid & signals.collected
-                waveforms[i, good] = signals.waveforms[good]
-                drift_times[i, good] = signals.collection_time_ns[good]
-                counts.written += int(good.sum())
-                counts.outside += int((~signals.valid).sum())
-                counts.late += int((signals.valid & ~signals.collected).sum())
+                waveforms[i] = np.where(good[:, np.newaxis], signals.waveforms, np.nan)
+                drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
+                counts += [good.sum(), (~signals.valid).sum(), late.sum()]
                 bar.update(len(z_mm))
             put(library, f"waveform_{angle_deg:03d}_deg", waveforms, "")
             put(library, f"drift_time_{angle_deg:03d}_deg", drift_times, "ns")
         describe(library)
-        if not counts.written:
-            raise CpunetError(f"{counts}; give a finer grid or longer records")
-    return counts
+        done = MadeLibrary(out, templates, *counts.tolist())
+        if not done.written:
+            raise CpunetError(f"{done}; give a finer grid or longer records")
+    return done

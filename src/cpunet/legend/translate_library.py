@@ -329,7 +329,7 @@ class IdealLibrary:
             values = group[name]
             numbers = isinstance(values, h5py.Dataset) and values.dtype.kind in "iuf"
             shape: tuple[int, ...] = values.shape if numbers else ()
-            if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 2:
+            if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 3:
                 raise CpunetError(
                     f"{where}/{name}: shape {shape} with r and z of {len(r_mm)} and "
                     f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
