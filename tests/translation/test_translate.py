@@ -21,7 +21,6 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile, open_pulses
-from cpunet.translation import file_translation
 from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
 from cpunet.translation.translation import Counts
@@ -191,18 +190,6 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
 
 
 # --- noise and bytes
-
-
-def test_bytes_do_not_depend_on_blocks(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(file_translation, "NOISE_ROWS", 16)
-    source, out = PulseFile(sim_file(tmp_path / "sim.lh5", n=50)), tmp_path / "out.lh5"
-    written = set()
-    for size, samples in ((4096, 1 << 24), (1, 1 << 24), (23, 1 << 24), (60, 225 * 17)):
-        monkeypatch.setattr(file_translation, "BLOCK_SIZE", size)
-        monkeypatch.setattr(file_translation, "BLOCK_SAMPLES", samples)
-        translate(run, source, out, force=True)
-        written.add(out.read_bytes())
-    assert len(written) == 1
 
 
 def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,6 @@ from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_existing
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import stage
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import rejections_of
 from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, require_side
 from cpunet.pulses.reading.files import PulseFile
@@ -41,8 +40,6 @@ from cpunet.translation.translator import (
 
 log = logging.getLogger(__name__)
 
-BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
-BLOCK_SAMPLES = 1 << 24
 OWN_COLUMNS = frozenset(
     {"waveform", "energy", "event_number", "rejection", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
@@ -177,10 +174,9 @@ class FileTranslation:
         if pulses.attrs.get(TRANSLATED_BY):
             remedy = f"translate the {takes} ones that they were made of"
         require_side(pulses, takes, remedy, insist=source.insist)
-        size = max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))  # fits in memory
         counts = Counts()
         with stage("Translating", pulses.n_pulses) as bar:
-            for number, block in enumerate(regrouped(pulses.blocks(size), NOISE_ROWS)):
+            for number, block in enumerate(pulses.blocks(NOISE_ROWS)):
                 seed = noise_seed(self.options.seed, noise_key, number)
                 done = self.form(block, np.random.default_rng(seed))
                 saturated = 0 if done.saturated is None else int(done.saturated.sum())
@@ -206,24 +202,6 @@ def source_print(source: PulseFile) -> str:
             stat = path.stat()
             facts.append((path.name, stat.st_size, stat.st_mtime_ns))
     return hashlib.sha256(repr(facts).encode(errors="surrogateescape")).hexdigest()
-
-
-def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:
-    """The same pulses in blocks of `size`, the last one shorter.
-
-    Examples
-    --------
-    >>> pulses = Pulses.of(np.zeros((7, 2)), dt_ns=16)
-    >>> [len(block) for block in regrouped([pulses[:2], pulses[2:3], pulses[3:]], 3)]
-    [3, 3, 1]
-    """
-    waiting: list[Pulses] = []
-    for block in blocks:
-        waiting = [Pulses.concatenate([*waiting, block])]
-        while len(waiting[0]) >= size:
-            yield waiting[0][:size]
-            waiting = [waiting[0][size:]]
-    yield from (rest for rest in waiting if len(rest))
 
 
 def finished(out: Path, wanted: dict[str, Any]) -> Counts:

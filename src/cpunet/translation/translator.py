@@ -31,7 +31,7 @@ Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], Pulses)
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
-NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
+NOISE_ROWS = 512  # pulses read at a time, which have a common seed of the noise
 
 
 class RejectionWarning(UserWarning):
@@ -54,7 +54,7 @@ class TranslatedPulses:
     truth
         What was drawn for each pulse, arrays of shape (n,) with their units: ``tails_kev``
         with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
-        pulses, see `InTracePileUp.largest`.
+        pulses, see `InTracePileUp.columns`.
     """
 
     pulses: Pulses
