@@ -50,13 +50,10 @@ class Counts:
     skipped: int = 0
 
     def __add__(self, other: Counts) -> Counts:
-        return Counts(
-            self.read + other.read,
-            self.translated + other.translated,
-            dict(Counter(self.rejections) + Counter(other.rejections)),
-            self.saturated + other.saturated,
-            skipped=self.skipped + other.skipped,
-        )
+        names = ("read", "translated", "saturated", "skipped")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        rejections = Counter(self.rejections) + Counter(other.rejections)
+        return Counts(**sums, rejections=dict(rejections))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
