@@ -22,6 +22,11 @@ from cpunet.legend.translate_library import (
     translate_library,
 )
 from cpunet.networks.generators import ResponseGenerator
+from cpunet.pulses.container import Pulses
+from cpunet.pulses.loading import load_pulses
+from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.reading.files import PulseFile
+from cpunet.recipes import load_recipe
 from cpunet.simulation import simulator
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
@@ -29,7 +34,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator
 from cpunet.training.run import Run
 from cpunet.translation.translator import REN
-from synthetic import after_pole_and_decay, one_line, sampled, write_chain
+from synthetic import after_pole_and_decay, one_line, sampled, write_chain, write_pulses
 
 R, Z = np.arange(6.0), np.arange(8.0)
 WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")
@@ -242,7 +247,7 @@ def test_other_libraries_are_refused_in_one_line(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ideal.lh5"]
 
 
-def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path) -> None:
+def test_a_library_of_another_detector(ideal: Path) -> None:
     with h5py.File(ideal) as file:
         assert chosen_libraries(file, ideal, (), None) == ["V01"]
         assert chosen_libraries(file, ideal, ("V01",), "B02") == ["V01"]
@@ -250,11 +255,21 @@ def test_a_library_of_another_detector(chain: Path, ideal: Path, tmp_path: Path)
             chosen_libraries(file, ideal, (), "B02")
         with pytest.raises(CpunetError, match="no library of V03; the file has V01"):
             chosen_libraries(file, ideal, ("V03",), None)
-    run = Run.load(chain)
-    assert known_detector(run) is None
-    side = run.sim.model_copy(update={"detector": "V01"})
-    run = run.model_copy(update={"sim": side, "folder": tmp_path})
-    assert known_detector(run) == "V01"
+
+
+def test_what_a_run_tells_of_its_detector(chain: Path, tmp_path: Path) -> None:
+    sim, known = tmp_path / "sim.lh5", Run.load(chain)
+    assert known_detector(known) is None
+    edges = np.repeat([[0.0, 1.0]], [300, 300], axis=1) + np.linspace(0, 1e-6, 60)[:, None]
+    pulses = Pulses.of(edges, dt_ns=16, energy_kev=np.full(60, 2614.5))
+    recipe = load_recipe("fast")
+    fep = parse_selection("FEP", recipe.peaks)
+    for told, name in (("no JSON", None), (json.dumps({"detector": {"name": "V01"}}), "V01")):
+        write_pulses(sim, pulses, attrs={"simulation": told}, force=True)
+        side = load_pulses(PulseFile(sim), "simulated", recipe, fep).provenance()
+        sim.unlink()  # what was trained is stored with the run, wherever its file is now
+        run = known.model_copy(update={"sim": side, "folder": tmp_path})
+        assert known_detector(run) == name
     (tmp_path / "detector.yaml").write_text("name: V02\n")  # of a calibrated run
     assert known_detector(run) == "V02"
 

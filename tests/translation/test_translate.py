@@ -257,6 +257,12 @@ def require_same(folder, expected):
         assert (folder / path.name).read_bytes() == path.read_bytes()
 
 
+def test_no_output_is_the_input_of_another(run, many, tmp_path):
+    (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
+    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
+        translate(run, many, tmp_path, force=True)
+
+
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     run, many, sequential, tmp_path, caplog, jobs

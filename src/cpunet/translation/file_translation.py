@@ -232,7 +232,7 @@ def finished(out: Path, wanted: dict[str, Any]) -> Counts:
             continue
         other = f"another {what}"
         if what == "options":
-            names = ", ".join(n for n in value if record[what].get(n, ...) != value[n])
-            other = f"other options ({names})"
+            names = (name for name in value if record[what].get(name, ...) != value[name])
+            other = f"other options ({', '.join(names)})"
         raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
     return Counts(**record["counts"])

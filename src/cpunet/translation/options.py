@@ -76,18 +76,14 @@ class TranslateOptions:
                 raise CpunetError(f"`{name}` is {given}; expected {expected}")
         if self.table is not None and not self.table.strip("/ "):
             raise CpunetError("`out_table` is empty; leave it out, or give a name as geds/ren")
-        asked = {
-            "tails": self.tails != NONE,
-            "pile_up_khz": self.pile_up_khz > 0,
-            "adc": self.adc is not None,
-        }
-        for name in (name for name in asked if asked[name]):
-            if self.inverse:
+        others = {"tails": self.tails != NONE, "pile_up_khz": self.pile_up_khz > 0}
+        for name, asked in {**others, "adc": self.adc is not None}.items():
+            if asked and self.inverse:
                 raise CpunetError(
                     f"`{name}`: the inverse gives charge, without other pulses and ADC counts; "
                     f"leave out `{name}`"
                 )
-            if not self.noise and name != "adc":
+            if asked and name in others and not self.noise:
                 raise CpunetError(
                     f"`{name}`: other pulses are drawn with the noise; leave out `{name}`, or "
                     "translate with noise"
