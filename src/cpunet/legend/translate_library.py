@@ -249,20 +249,16 @@ def chosen_libraries(
             "struct{r, z, dt, t0, waveform_000_deg}"
         )
     held = ", ".join(path or "/" for path in names)
-    for name in wanted:
-        if name not in names:
-            raise CpunetError(f"{source}: no library of {name}; the file has {held}")
-    if wanted:
-        return list(dict.fromkeys(wanted))
-    if name is None:
-        return names
-    if name not in names:
+    chosen = list(dict.fromkeys(wanted)) or ([name] if name else names)
+    for missing in (path for path in chosen if path not in names):
+        if wanted:
+            raise CpunetError(f"{source}: no library of {missing}; the file has {held}")
         raise CpunetError(
             f"{source}: a library of {held}, but the run was trained with a simulation of "
             f"{name}; give the library of {name}, or `detector` {names[0]} to use this one "
             "all the same"
         )
-    return [name]
+    return chosen
 
 
 def known_detector(run: Run) -> str | None:
