@@ -30,7 +30,6 @@ from synthetic import (
     load_recipe,
     nearly_full_disk,
     write_chain,
-    write_pulses,
     write_table,
 )
 
@@ -80,13 +79,19 @@ def busy(tmp_path_factory):
     return write_chain(folder, noise_kev=NOISE_KEV, data=DATA, fit={"tails": TAILS})
 
 
+def energies(n=N, seed=1):
+    return np.random.default_rng(seed).uniform(500, 2600, n)
+
+
 def sim_file(path, n=N, seed=1, **others):
     """An LH5 file by the LH5 library, with columns of many kinds."""
-    rng = np.random.default_rng(seed)
-    numbers = {"event_number": 7 + 2 * np.arange(n)}
-    return write_table(
-        path, "geds/sim", charge(n, seed), rng.uniform(500, 2600, n), **numbers | others
-    )
+    numbers = {"event_number": 7 + 2 * np.arange(n)} | others
+    return write_table(path, "geds/sim", charge(n, seed), energies(n, seed), **numbers)
+
+
+def simulated(n=N):
+    """The same pulses in memory."""
+    return Pulses.of(charge(n), dt_ns=DT_NS, energy_kev=energies(n))
 
 
 def many_columns(n=N):
@@ -328,9 +333,8 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     np.testing.assert_allclose(end / energy, 8.0, atol=5 * 20 / np.sqrt(5) / energy.min())
     # prepared again they are what translation gives without ADC
     config = load_recipe("fast").preparation
-    clean = tmp_path / "clean.lh5"
-    translate(run, source, clean, adc=True, scale=adc, noise=False)
-    back = prepare(Pulses.of(values(clean), dt_ns=DT_NS), config, "measured")
+    clean = translate(run, source, adc=True, scale=adc, noise=False)
+    back = prepare(clean.pulses, config, "measured")
     assert set(np.abs(back.align_sample - n_pre)) <= {0, 1}
     windows = REN.load(run).translate(charge(), noise=False)
     same = back.align_sample == n_pre
@@ -341,35 +345,28 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
 
 
 def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
-    run, network, tmp_path, caplog
+    run, network, caplog
 ):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    translate(run, source, tmp_path / "chain.lh5", adc=True, scale=ADC)
-    traces = values(tmp_path / "chain.lh5").astype(float)
+    traces = translate(run, simulated(), adc=True, scale=ADC).waveforms.astype(float)
     for part in (slice(0, 250), slice(1150, 1400)):
         steps = np.diff(traces[:, part], axis=1).std(axis=1) / np.sqrt(2)
         assert steps.mean() == pytest.approx(10 * NOISE_KEV, rel=0.05)
     given = Adc(adc_per_kev=8.0, baseline=14_000, length=1000, n_pre=500)
-    told = translate(
-        network, source, tmp_path / "unet.lh5", adc=True, scale=given, noise=False
-    ).counts
-    assert told.read == N
+    of_network = translate(network, simulated(), adc=True, scale=given, noise=False)
+    assert len(of_network) == N
     assert any("beyond them stand baseline and decay" in note for note in caplog.messages)
-    assert (values(tmp_path / "unet.lh5")[:, :100] == 14_000).all()
+    assert (of_network.waveforms[:, :100] == 14_000).all()
 
 
-def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
+def test_saturated_and_lost_pulses_are_counted(run):
     waveforms, kev = charge(6), np.array([1000.0, 6500.0, np.nan, 1000.0, 6500.0, 1000.0])
     waveforms[3] = 0.5
-    path = tmp_path / "sim.lh5"
-    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
-    told = translate(run, path, tmp_path / "out.lh5", adc=True, scale=ADC).counts
-    assert told == Counts(6, 4, {"constant": 1, "energy_unknown": 1}, saturated=2)
-    table = lh5.read("geds/ren", tmp_path / "out.lh5")
-    traces = table.waveform.values.nda
-    assert (traces[[2, 3]] == 0).all()
-    assert traces.max(axis=1)[[1, 4]].tolist() == [65535, 65535]
-    codes = [Rejection(code).label for code in table.rejection.nda]
+    pulses = Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev)
+    done = translate(run, pulses, adc=True, scale=ADC)
+    assert done.counts == Counts(6, 4, {"constant": 1, "energy_unknown": 1}, saturated=2)
+    assert (done.waveforms[[2, 3]] == 0).all()
+    assert done.waveforms.max(axis=1)[[1, 4]].tolist() == [65535, 65535]
+    codes = [Rejection(code).label for code in done.codes]
     assert codes == ["accepted", "accepted", "energy_unknown", "constant"] + 2 * ["accepted"]
 
 
@@ -399,78 +396,75 @@ def test_counts_are_clipped_where_the_digitisers_end(tmp_path, counts, bits, end
     np.testing.assert_allclose((traces.max(axis=1)[:2] - 100.0) / kev[:2], 4.0, rtol=0.01)
 
 
-def column(out, name):
-    return lh5.read(f"geds/ren/{name}", out).nda
+def truth(done, *names):
+    """What was drawn for each pulse."""
+    return [done.in_memory.truth[name][0] for name in names]
 
 
 def test_learned_tails_are_those_behind_the_cuts(busy, tmp_path):
-    source, out = sim_file(tmp_path / "sim.lh5", n=40 * N), tmp_path / "out.lh5"
-    translate(busy, source, out, tails="learned")
-    left = column(out, "tails_kev")
+    done = translate(busy, simulated(40 * N), tails="learned")
+    (left,) = truth(done, "tails_kev")
     assert len(left) == 40 * N
     assert left.max() < 40
     assert (left > 5).mean() == pytest.approx(0.13, abs=0.04)
     # behind a baseline that falls tails lie lower, and are scaled up to the same level
-    higher = values(out)[:, 430:460].mean(axis=1)
-    share = left / column(out, "energy")
-    assert np.corrcoef(share, higher)[0, 1] > 0.4
-    translate(busy, source, tmp_path / "rate.lh5", tails="1")
-    assert column(tmp_path / "rate.lh5", "tails_kev").max() > 100
+    higher = done.waveforms[:, 430:460].mean(axis=1)
+    assert np.corrcoef(left / done.pulses.energy_kev, higher)[0, 1] > 0.4
+    translate(busy, simulated(40 * N), tmp_path / "out.lh5", tails="1")
+    assert lh5.read("geds/ren/tails_kev", tmp_path / "out.lh5").nda.max() > 100
 
 
-def test_tails_lift_the_baselines_of_raw_traces(busy, tmp_path):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    for tails in ("none", "3"):
-        out = tmp_path / f"{tails}.lh5"
-        translate(busy, source, out, adc=True, scale=ADC, tails=tails, seed=3)
-    left = column(tmp_path / "3.lh5", "tails_kev")
-    none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
+def test_tails_lift_the_baselines_of_raw_traces(busy):
+    none, lifted = (
+        translate(busy, simulated(), adc=True, scale=ADC, tails=tails, seed=3)
+        for tails in ("none", "3")
+    )
+    (left,) = truth(lifted, "tails_kev")
     assert (left > 20).sum() > 5
     # 9 ADC per keV of height 0.9
     wanted = left * 0.9 * 26145.11 / 2614.511
-    begin = lifted[:, :300].mean(axis=1) - none[:, :300].mean(axis=1)
+    begin = (lifted.waveforms - none.waveforms)[:, :300].mean(axis=1)
     assert begin == pytest.approx(wanted * np.exp(-2.4 / 50), abs=25)
 
 
-def piled(out):
-    return [column(out, name) for name in ("n_piled", "piled_kev", "piled_ns")]
+PILED = ("n_piled", "piled_kev", "piled_ns")
 
 
-def test_piled_up_pulses_are_within_raw_traces_and_told(busy, tmp_path):
-    source = sim_file(tmp_path / "sim.lh5", n=5 * N)
-    options = {"adc": True, "scale": ADC, "seed": 3}
-    translate(busy, source, tmp_path / "none.lh5", **options)
-    translate(busy, source, tmp_path / "some.lh5", pile_up_khz=20, **options)
-    with h5py.File(tmp_path / "none.lh5") as file:
-        assert "n_piled" not in file["geds/ren"]
-    count, kev, after_ns = piled(tmp_path / "some.lh5")
+def test_piled_up_pulses_are_within_raw_traces_and_told(busy):
+    none, some = (
+        translate(busy, simulated(5 * N), adc=True, scale=ADC, seed=3, pile_up_khz=rate)
+        for rate in (0, 20)
+    )
+    assert not none.in_memory.truth
+    count, kev, after_ns = truth(some, *PILED)
     assert 0 < (count > 0).sum() < 5 * N
     assert np.array_equal(np.isnan(kev), count == 0)
-    clean, more = (values(tmp_path / f"{name}.lh5").astype(float) for name in ("none", "some"))
+    added = some.waveforms - none.waveforms
     # away from the pulse, the trace rises by the piled-up pulse's energy where it is said
     single = (count == 1) & (np.abs(after_ns) > 1500) & (np.abs(after_ns) < 7000)
     assert single.sum() >= 3
     for row in np.flatnonzero(single):
-        added = more[row] - clean[row]
         at = ADC.n_pre + int(after_ns[row] / DT_NS)
-        assert added[at - 100 : at - 60].mean() == pytest.approx(0, abs=15)
+        assert added[row, at - 100 : at - 60].mean() == pytest.approx(0, abs=15)
         wanted = kev[row] * 0.9 * 26145.11 / 2614.511
-        assert added[at + 40 : at + 50].mean() == pytest.approx(wanted, rel=0.1, abs=40)
+        assert added[row, at + 40 : at + 50].mean() == pytest.approx(wanted, rel=0.1, abs=40)
 
 
 def test_piled_up_pulses_are_within_windows(busy, tmp_path):
-    source, out = sim_file(tmp_path / "sim.lh5", n=10 * N), tmp_path / "some.lh5"
-    translate(busy, source, out, pile_up_khz=20, seed=3)
-    count, kev, after_ns = piled(out)
+    out = tmp_path / "some.lh5"
+    translate(busy, simulated(10 * N), out, pile_up_khz=20, seed=3)
+    table = lh5.read("geds/ren", out)
+    count, kev, after_ns = (table[name].nda for name in PILED)
     assert len(count) == 10 * N
     # 20 kHz for a record of 1,400 samples of 16 ns
     assert count.mean() == pytest.approx(0.448, abs=0.1)
     # baselines are flat but behind a piled-up pulse, or on its edge
-    tilt = np.abs(values(out)[:, :50].mean(axis=1) - values(out)[:, 100:150].mean(axis=1))
+    windows = values(out)
+    tilt = np.abs(windows[:, :50].mean(axis=1) - windows[:, 100:150].mean(axis=1))
     assert tilt[count == 0].max() < 0.03
     inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)
     assert inside.sum() >= 3
-    heights = values(out)[inside].max(axis=1)
+    heights = windows[inside].max(axis=1)
     # those within the tail are rejected, as they are in data
     assert (heights[np.isfinite(heights)] > 0.05).all()
     assert np.isfinite(heights).any()
@@ -497,18 +491,16 @@ def test_piled_up_pulses_are_within_windows(busy, tmp_path):
     ],
 )
 def test_options_that_cannot_be(busy, tmp_path, options, said):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=said):
-        translate(busy, source, tmp_path / "out.lh5", **options)
+        translate(busy, simulated(), tmp_path / "out.lh5", **options)
 
 
-def test_runs_that_tell_of_no_tails(run, network, tmp_path):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
+def test_runs_that_tell_of_no_tails(run, network):
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of pile-up tails"):
-            translate(folder, source, tmp_path / "o.lh5", tails="1")
+            translate(folder, simulated(), tails="1")
         with pytest.raises(CpunetError, match=r"tells nothing of .* other pulses"):
-            translate(folder, source, tmp_path / "o.lh5", pile_up_khz=1)
+            translate(folder, simulated(), pile_up_khz=1)
 
 
 # --- what can go wrong

@@ -7,6 +7,7 @@ its Fourier transforms, which few runtimes have.
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ FLOAT, INT64, DOUBLE = 1, 7, 11  # types of ONNX
 CUBICS = np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]], np.float32) / 2
 
 
+@dataclass
 class Graph:
     """A graph in the making, with ``windows`` (batch, samples) as input.
 
@@ -27,12 +29,13 @@ class Graph:
     ----------
     length
         Samples of a window.
+    nodes, constants
+        Objects of ONNX.
     """
 
-    def __init__(self, length: int) -> None:
-        self.length = length
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
+    length: int
+    nodes: list[Any] = field(default_factory=list)
+    constants: list[Any] = field(default_factory=list)
 
     def __call__(self, operator: str, *inputs: Any, **attributes: Any) -> str:
         """Add a node, and return the name of its output.
