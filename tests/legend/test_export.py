@@ -17,9 +17,13 @@ from cpunet.legend.export import equivalent_kernel, export_legend, kernel_step
 from cpunet.networks.generators import ResponseGenerator
 from synthetic import write_chain
 
-MEAN = {"a": -1.5e-6, "b": 1.0024, "per_mev_percent": -0.15, "per_mev_error_percent": 0.02}
+MEAN = {
+    **{"a": -1.5e-6, "b": 1.0024, "a_error": 2e-7, "chi_square": 3.0, "degrees": 4},
+    **{"per_mev_percent": -0.15, "per_mev_error_percent": 0.02},
+}
 LAW = {"a": 2e-5, "b": 6.0, "c": 2.0}
-METHOD = {"mean": MEAN, "resolution": LAW, "points": [], "scale": 0.08}
+WIDTH = LAW | {"at_reference_percent": 0.6}
+METHOD = {"mean": MEAN, "resolution": WIDTH, "points": [], "scale": 0.08, "scale_error": 0.01}
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +48,7 @@ def test_a_stretched_drift_is_not_in_the_parameters(
 def report(folder: Path, **changes: Any) -> Path:
     folder.mkdir()
     metrics = {
+        "peaks": {},
         "training": {"recipe": "fast", "peak": "FEP", "seed": 0},
         "ae_energy": {"multi_site": False, "methods": {"data": METHOD, "ren": METHOD}},
     }
@@ -88,7 +93,7 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
 
 
 def test_a_width_without_noise_is_not_exported(chain, tmp_path, caplog) -> None:
-    silent = METHOD | {"resolution": LAW | {"b": 0.0}}
+    silent = METHOD | {"resolution": WIDTH | {"b": 0.0}}
     found = {"multi_site": True, "methods": {"data": silent, "ren": METHOD}}
     given = report(tmp_path / "report", ae_energy=found)
     export_legend(chain, tmp_path / "pars", report=given)
@@ -102,8 +107,8 @@ def test_a_width_without_noise_is_not_exported(chain, tmp_path, caplog) -> None:
     [
         ({"training": {"recipe": "fast", "peak": "SEP", "seed": 0}}, "of a run with peak SEP"),
         ({"ae_energy": {"missing": "two few events"}}, "no A/E against energy: two few"),
-        ({"ae_energy": 3, "training": None}, "give the folder that `cpunet validate` made"),
-        ({"ae_energy": None}, "give the folder that `cpunet validate` made"),
+        ({"ae_energy": 3}, "holds no scores by peak; give a report of cpunet validate"),
+        ({"ae_energy": {}}, "no A/E against energy: give the folder that `cpunet validate`"),
         (
             {"ae_energy": {"methods": {"data": METHOD}}},
             "give the folder that `cpunet validate`",

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,12 @@ from cpunet.legend.currents import WINDOW, WINDOWS, averaged
 from cpunet.legend.translate_library import known_detector
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
-from cpunet.settings import plain, read_json, yaml_text
+from cpunet.settings import plain, yaml_text
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.closed_forms import StepResponse
 from cpunet.training.response_tables import as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
+from cpunet.validation.report import METRICS, read_metrics
 
 Values = npt.NDArray[np.float64]
 
@@ -264,32 +265,27 @@ def _against_energy(
     report: Path, trained: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """A/E against energy of a report on this run, and the entries of production for it."""
-    path = report / "metrics.json"
-    metrics = read_json(path, "give the folder that `cpunet validate` made")
-    try:
-        for key, value in trained.items():
-            if (other := metrics["training"][key]) != value:
-                raise CpunetError(
-                    f"{report}: of a run with {key} {other}, this one has {value}; validate "
-                    "this run"
-                )
-        if missing := metrics["ae_energy"].get("missing"):
-            raise CpunetError(f"{report}: no A/E against energy: {missing}")
-        methods = dict(metrics["ae_energy"]["methods"])
-        # the mean of the translation, and the width of the data
-        mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
-        line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
-        noisy = law["b"] > 0
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CpunetError(
-            f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
-        ) from error
-    pars: dict[str, Any] = {"aoemeanmod": {"psl": {"expression": "x*a+b", "pars": line}}}
-    if noisy:
-        pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
+    metrics = read_metrics(report / METRICS, "give the folder that `cpunet validate` made")
+    for key, value in trained.items():
+        if (other := metrics.training.get(key)) != value:
+            raise CpunetError(
+                f"{report}: of a run with {key} {other}, this one has {value}; validate "
+                "this run"
+            )
+    methods = metrics.ae_energy.methods
+    if not {"ren", "data"} <= methods.keys():
+        missing = metrics.ae_energy.missing or "give the folder that `cpunet validate` made"
+        raise CpunetError(f"{report}: no A/E against energy: {missing}")
+    # the mean of the translation, and the width of the data
+    line, law = methods["ren"].mean, methods["data"].resolution
+    pars = {"a": line.a, "b": line.b}
+    of_ae: dict[str, Any] = {"aoemeanmod": {"psl": {"expression": "x*a+b", "pars": pars}}}
+    if law.b > 0:
+        width = {"a": law.a, "b": law.b, "c": law.c}
+        of_ae["aoeresmod"] = {"expression": "SigmaFit", "parameters": width}
     else:
         log.warning(
             f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
             "aoeresmod.yaml is not written: give events of more energies"
         )
-    return methods, pars
+    return {name: asdict(course) for name, course in methods.items()}, of_ae
