@@ -71,10 +71,12 @@ class Form:
                 "and of other pulses (a network, or trained without raw traces)",
                 "train a readout chain on raw traces, or leave it out",
             )
-        if tails is not None and options.tails == LEARNED:
-            tails = tails if adc is None else tails.uncut()
-        elif tails is not None:
-            tails = tails.uncut(0.0 if options.tails == NONE else float(options.tails))
+        if options.tails == NONE:
+            tails = None
+        elif tails is not None and options.tails != LEARNED:
+            tails = tails.uncut(float(options.tails))
+        elif tails is not None and adc is not None:
+            tails = tails.uncut()
         self.tails = tails if tails is not None and tails.law.rate_khz > 0 else None
         self.n_pre, self.length = config.samples_before, config.length
         self.scale: tuple[float, float] | None = None

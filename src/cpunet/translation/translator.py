@@ -251,7 +251,7 @@ class Translator:
         tails_kev
             Pile-up tails under each pulse in keV, shape ``(n,)``.
         piled, trace
-            See `Batch`; a chain alone gives raw traces.
+            See `Batch`.
 
         Raises
         ------
