@@ -207,20 +207,24 @@ class ResponseBackend(Backend):
 
         n_pre, length = batch.trace
         assert energies is not None  # those of the pulses
-        levels, codes, begin, charge = self._levels(windows, n_pre, length)
+        levels, clean, first = self._levels(windows, n_pre, length)
         if batch.noise and self.noise is not None:
             levels += self.noise.draw(energies, length, batch.generator)
         if piled is not None:
             others = self._levels(windows[piled.partner], n_pre, length + reach)[0]
             levels += piled.added(np.nan_to_num(others), energies, self.dt_ns, length)
         if self.by_height is not None:
+            charge = np.ones((len(windows), 1), np.float32)
+            charge[clean.index] = clean.scale[:, np.newaxis]
             levels = self.by_height(levels * charge, energies) / charge
-        return Translated(levels, codes, begin)
+        begin = np.zeros(len(windows), np.int64)
+        begin[clean.index] = clean.align_sample - first
+        return Translated(levels, clean.codes, begin)
 
     def _levels(
         self, windows: FloatArray, n_pre: int, length: int
-    ) -> tuple[FloatArray, Codes, npt.NDArray[np.int64], FloatArray]:
-        """Noise-free traces, aligned at sample `n_pre`, their codes, begins and charge."""
+    ) -> tuple[FloatArray, Prepared, int]:
+        """Noise-free traces, aligned at sample `n_pre`, how, and where the windows begin."""
         before = max(0, n_pre - self.config.samples_before)
         after = max(0, length - n_pre - self.config.samples_after)
         # before the window no charge has moved, after it all charge has been collected
@@ -229,13 +233,9 @@ class ResponseBackend(Backend):
         source = source.clip(0, records.shape[1] - 1)
         level = np.take_along_axis(records[clean.index], source, axis=1)
         levels = np.full((len(windows), length), np.nan, np.float32)
-        height = clean.scale[:, np.newaxis]
-        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / height
-        begin = np.zeros(len(windows), np.int64)
-        begin[clean.index] = clean.align_sample - n_pre - before - padding(self.dt_ns)[0]
-        charge = np.ones((len(windows), 1), np.float32)
-        charge[clean.index] = height
-        return levels, clean.codes, begin, charge
+        baseline, scale = clean.baseline[:, np.newaxis], clean.scale[:, np.newaxis]
+        levels[clean.index] = (level - baseline) / scale
+        return levels, clean, n_pre + before + padding(self.dt_ns)[0]
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
         """Records without noise, and the same prepared; flat tops do not count as saturated."""

@@ -179,9 +179,8 @@ class FileTranslation:
             for number, block in enumerate(pulses.blocks(NOISE_ROWS)):
                 seed = noise_seed(self.options.seed, noise_key, number)
                 done = self.form(block, np.random.default_rng(seed))
-                saturated = 0 if done.saturated is None else int(done.saturated.sum())
                 numbers = len(block), int(done.valid.sum()), rejections_of(done.codes)
-                counts += Counts(*numbers, saturated)
+                counts += Counts(*numbers, done.saturated)
                 yield done, counts
                 bar.update(len(block))
         if not counts.translated:

@@ -147,9 +147,10 @@ class Form:
         per_kev, baseline = self.scale
         counts = np.rint(levels * (per_kev * energies)[:, np.newaxis] + baseline)
         counts[~np.isfinite(counts).all(axis=1)] = 0
-        saturated = np.asarray((counts != counts.clip(*self.ends)).any(axis=1))
+        clipped = counts.clip(*self.ends)
+        saturated = int((clipped != counts).any(axis=1).sum())
         # single precision represents these integers exactly
-        traces = done.pulses.with_waveforms(counts.clip(*self.ends).astype(np.float32))
+        traces = done.pulses.with_waveforms(clipped.astype(np.float32))
         return TranslatedPulses(traces, done.codes, saturated, truth)
 
 

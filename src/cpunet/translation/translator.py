@@ -50,7 +50,7 @@ class TranslatedPulses:
     codes
         A `Rejection` for each row.
     saturated
-        Mask of the traces that reach an end of the digitiser's range; None for windows.
+        Number of traces that reach an end of the digitiser's range.
     truth
         What was drawn for each pulse, arrays of shape (n,) with their units: ``tails_kev``
         with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
@@ -59,7 +59,7 @@ class TranslatedPulses:
 
     pulses: Pulses
     codes: Codes
-    saturated: npt.NDArray[np.bool_] | None = None
+    saturated: int = 0
     truth: Columns = field(default_factory=dict)
 
     @property
@@ -70,11 +70,10 @@ class TranslatedPulses:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all blocks."""
-        masks = [part.saturated for part in parts if part.saturated is not None]
         return cls(
             Pulses.concatenate([part.pulses for part in parts]),
             np.concatenate([part.codes for part in parts]),
-            np.concatenate(masks) if masks else None,
+            sum(part.saturated for part in parts),
             {
                 name: (np.concatenate([part.truth[name][0] for part in parts]), units)
                 for name, (_, units) in parts[0].truth.items()
