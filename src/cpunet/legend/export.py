@@ -34,6 +34,8 @@ from cpunet.training.response_tables import as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
 from cpunet.validation.report import METRICS, read_metrics
 
+log = logging.getLogger(__name__)
+
 Values = npt.NDArray[np.float64]
 
 AROUND_NS = 500  # compared range on either side of the maximum
@@ -41,6 +43,12 @@ START_NS = (40.0, 60.0)  # initial sigma and tau
 LONGEST_NS = 500.0
 LENGTH, BEGIN = 8192, 1500  # number of 1 ns samples, and the one at which charge moves
 WIDTHS_NS = (1, 20, 50, 100, 150, 200, 300)  # of constant currents, as in a detector
+LEGEND_PARS = FolderKind(
+    name="legend-pars",
+    command="cpunet export legend",
+    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
+)
+EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
 
 
 def equivalent_kernel(undecayed: StepResponse) -> dict[str, float]:
@@ -126,16 +134,6 @@ def _about_peak(current: Values) -> Values:
     time = peak + 0.5 * (low - high) / (low - 2 * mid + high)
     at = time + np.arange(-AROUND_NS, AROUND_NS + 1)
     return np.asarray(np.interp(at, np.arange(len(current)), current), np.float64)
-
-
-log = logging.getLogger(__name__)
-
-LEGEND_PARS = FolderKind(
-    name="legend-pars",
-    command="cpunet export legend",
-    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
-)
-EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,11 @@ from cpunet.units import factor, unit_names
 
 log = logging.getLogger(__name__)
 
+LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
+ROWS = 16  # rows of r read at a time
+MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
+STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
+
 
 class TemplateTranslator:
     """Translates templates without noise; sample k of the result is at the time of sample k.
@@ -96,12 +101,6 @@ class TemplateTranslator:
         for rows in blocks(len(templates), BATCH):
             results[rows] = self._chain(templates[rows].astype(np.float32))[:, inside]
         return results
-
-
-LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
-ROWS = 16  # rows of r read at a time
-MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
-STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
 @dataclass(frozen=True)

@@ -105,8 +105,8 @@ def export_onnx(
         for n in CHECKED:
             given = examples(n, length, latent)
             (output,) = session.run(None, given)
-            apart = np.abs(output - expected(*given.values())).max()
-            difference = max(difference, float(apart))
+            wrong = np.abs(output - expected(*given.values()))
+            difference = max(difference, float(wrong.max()))
         if not difference <= TOLERANCE:
             raise CpunetError(
                 f"{out}: the exported graph differs from the run by {difference:.1e}"
