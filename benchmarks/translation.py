@@ -20,7 +20,7 @@ from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.recipes import load_recipe
 from cpunet.training.adversarial import Generator
-from cpunet.translation.backends import Batch, NetworkBackend, response_backend
+from cpunet.translation.backends import Batch, NetworkBackend, ResponseBackend
 
 REPEATS = 3
 DT_NS, FEP_KEV = 16.0, 2614.5
@@ -54,7 +54,7 @@ def main() -> None:
     fast = load_recipe("fast").at(16)
     chain = ResponseGenerator(fast.matching.generator, DT_NS)
     chain.set_noise(BaselineNoise(np.ones(4097), 8192, DT_NS, 100))
-    response = response_backend(chain, fast.preparation)
+    response = ResponseBackend(chain, fast.preparation, DT_NS, chain.noise)
     pulses, energies = windows(8192), np.full(8192, FEP_KEV)
     blocks = [slice(first, first + 512) for first in range(0, len(pulses), 512)]
     generator = np.random.default_rng(0)

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.fft
 
 from cpunet.legend.currents import PEAK, currents_about_peak
+from cpunet.networks.generators import ResponseGenerator
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
@@ -83,8 +84,8 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--detector", default="icpc")
     given = parser.parse_args()
-    generator = REN.load(given.run).backend.chain
-    assert generator is not None, "a run of a readout chain"
+    generator = REN.load(given.run).backend.network
+    assert isinstance(generator, ResponseGenerator), "a run of a readout chain"
     chain = learned_chain(generator.response, "run").undecayed
     detector = read_detector(given.detector)
     fields = compute_fields(detector)

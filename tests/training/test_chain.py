@@ -15,8 +15,8 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.translation.file_translation import Counts
 from cpunet.translation.translate import translate
+from cpunet.translation.translation import Counts
 from cpunet.translation.translator import REN
 from synthetic import (
     Files,

@@ -68,10 +68,10 @@ def test_networks_that_gain_are_behind_the_readout_and_its_inverse(kept, files):
     assert "RMS of held-out cycles" in gains["U-Net of IREN"]
     again = Run.load(kept.folder)
     ren, iren = REN.of(again), IREN.of(again)
-    assert ren.backend.chain.residual is not None
+    assert ren.backend.network.residual is not None
     pulses = phased_edges(5, np.random.default_rng(5), 450, 1100)
     windows = ren.translate(pulses, noise=False)
-    ren.backend.chain.residual = None
+    ren.backend.network.residual = None
     apart = np.abs(ren.translate(pulses, noise=False) - windows)
     assert 0 < apart.max() < 0.05
     assert iren.translate(windows).shape == windows.shape

@@ -93,44 +93,41 @@ def edge_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.min([np.sqrt((s[:, 300:400] ** 2).mean(axis=1)) for s in shifts], axis=0)
 
 
-def test_without_noise_pulses_are_those_of_the_chain(ren, sim) -> None:
+def test_without_noise_pulses_are_those_of_the_chain(ren, iren, sim) -> None:
     traces = responded(N, seed=2)
     truth = prepare(Pulses.of(traces, dt_ns=DT_NS), RECIPE.preparation, "measured")
     assert len(truth) == N
-    found = ren.translate(sim, noise=False)
+    found = ren.translate(sim, noise=False, seed=1)
     errors = edge_errors(found, truth.pulses.waveforms)
     assert np.median(errors) < 1e-3
     assert errors.max() < 0.01
     # prepared as data: no baseline, and the tail at its level
     assert np.abs(found[:, :200].mean(axis=1)).max() < 1e-6
     np.testing.assert_allclose(found[:, -5:].mean(axis=1), 0.8, atol=1e-5)
+    # nothing is random, and energies change nothing
+    again = ren.translate(sim, noise=False, seed=2, energy_kev=np.linspace(100, 3000, N))
+    np.testing.assert_array_equal(again, found)
+    for translator, none in ((ren, np.zeros((0, 225))), (iren, np.zeros((0, 1200)))):
+        assert translator.translate(none, energy_kev=np.zeros(0)).shape == (0, 800)
 
 
-def test_without_noise_nothing_is_random_and_no_energy_is_needed(ren, sim) -> None:
-    first, again = (ren.translate(sim, noise=False, seed=seed) for seed in (1, 2))
-    np.testing.assert_array_equal(first, again)
-    energies = np.linspace(100, 3000, N)
-    np.testing.assert_array_equal(ren.translate(sim, noise=False, energy_kev=energies), first)
-
-
-def test_noise_without_energies_is_refused(ren, sim) -> None:
-    for given in (sim, sim[0]):
-        with pytest.raises(CpunetError, match="give energy_kev, or noise=False"):
-            ren.translate(given)
+def test_what_cannot_be_translated_is_refused(ren, iren, sim, tmp_path: Path) -> None:
     windows = ren.translate(sim, noise=False)
-    with pytest.raises(CpunetError, match="give energy_kev, or noise=False"):
-        ren.apply(windows)
-
-
-@pytest.mark.parametrize("energies", [np.ones(N - 1), np.ones((N, 2))])
-def test_energies_of_other_pulses_are_refused(ren, sim, energies: np.ndarray) -> None:
-    with pytest.raises(CpunetError, match=rf"^energy_kev has shape .* for {N} pulses"):
-        ren.translate(sim, energy_kev=energies)
-
-
-def test_the_inverse_adds_no_tails(iren) -> None:
+    for refused in (
+        lambda: ren.translate(sim),
+        lambda: ren.translate(sim[0]),
+        lambda: ren.apply(windows),
+    ):
+        with pytest.raises(CpunetError, match="give energy_kev, or noise=False"):
+            refused()
+    for energies in (np.ones(N - 1), np.ones((N, 2))):
+        with pytest.raises(CpunetError, match=rf"^energy_kev has shape .* for {N} pulses"):
+            ren.translate(sim, energy_kev=energies)
     with pytest.raises(CpunetError, match="leave out tails_kev"):
         iren.translate(responded(5, seed=3), tails_kev=100.0)
+    REN.load(write_chain(tmp_path))
+    with pytest.raises(CpunetError, match="weights of another network"):
+        IREN.load(tmp_path)
 
 
 def test_pulses_without_energy_are_counted(ren, sim) -> None:
@@ -156,40 +153,27 @@ def test_pulses_without_energy_are_counted(ren, sim) -> None:
 def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:
     charge = prepare(Pulses.of(sim, dt_ns=DT_NS), RECIPE.preparation, "simulated")
     truth = charge.pulses.waveforms
+
+    def errors(pulses: FloatArray) -> np.ndarray:
+        """RMS about the rise, where half of the height is at the same sample."""
+        half, wanted = ([np.flatnonzero(p < 0.5)[-1] for p in of] for of in (pulses, truth))
+        shifts = np.subtract(wanted, half)
+        moved = np.array([np.roll(p, k) for p, k in zip(pulses, shifts, strict=True)])
+        return np.sqrt(((moved - truth)[:, 250:500] ** 2).mean(axis=1))
+
     back = iren.translate(ren.translate(sim, energy_kev=KEV, seed=1))
-
-    def half_times(pulses: FloatArray) -> np.ndarray:
-        return np.array([np.flatnonzero(p < 0.5)[-1] for p in pulses])
-
-    moves = half_times(truth) - half_times(back)
-    moved = np.array([np.roll(p, k) for p, k in zip(back, moves, strict=True)])
-    errors = np.sqrt(((moved - truth)[:, 250:500] ** 2).mean(axis=1))
     measured = ren.translate(sim, noise=False)
-    moves = half_times(truth) - half_times(measured / measured.max(axis=1, keepdims=True))
-    raw = np.array([np.roll(p, k) for p, k in zip(measured, moves, strict=True)])
-    raw_errors = np.sqrt(((raw - truth)[:, 250:500] ** 2).mean(axis=1))
-    assert np.median(errors) < 0.02
-    assert np.median(errors) < 0.2 * np.median(raw_errors)
+    assert np.median(errors(back)) < 0.02
+    raw = errors(measured / measured.max(axis=1, keepdims=True))
+    assert np.median(errors(back)) < 0.2 * np.median(raw)
     # prepared as simulated pulses are
     assert np.abs(back.min(axis=1)).max() < 1e-6
     np.testing.assert_allclose(back.max(axis=1), 1, atol=1e-6)
 
 
-def test_no_pulses_at_all(ren, iren) -> None:
-    none = np.zeros((0, 225), np.float32)
-    assert ren.translate(none, energy_kev=np.zeros(0)).shape == (0, 800)
-    assert iren.translate(np.zeros((0, 1200), np.float32)).shape == (0, 800)
-
-
-def test_weights_of_the_other_half_are_missed(tmp_path: Path) -> None:
-    REN.load(write_chain(tmp_path))
-    with pytest.raises(CpunetError, match="weights of another network"):
-        IREN.load(tmp_path)
-
-
 NOISY = load_recipe("published", ["training.noise=baselines", "generator.width=2"])
 DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)
-DT_NS, RMS_KEV = 16.0, 6.0
+RMS_KEV = 6.0
 
 
 @pytest.fixture(scope="module")
@@ -233,26 +217,25 @@ def test_noise_goes_as_one_over_the_energy(noisy_run, prepared_sim):
 
 
 def test_other_pulses_are_added_with_the_noise(noisy_run, prepared_sim):
-    ren = REN.load(noisy_run)
-    assert ren.tails is not None
-    energies = {"energy_kev": np.full(len(prepared_sim), 2000.0)}
-    plain = ren.apply(prepared_sim, generator=np.random.default_rng(1), **energies)
-    left = np.full(len(prepared_sim), 500.0)
-    lifted = ren.apply(
-        prepared_sim, generator=np.random.default_rng(1), tails_kev=left, **energies
-    )
+    ren, n = REN.load(noisy_run), len(prepared_sim)
+    left = np.full(n, 500.0)
+
+    def windows(**how):
+        kev = np.full(n, 2000.0)
+        seeded = np.random.default_rng(1)
+        return ren.apply(prepared_sim, energy_kev=kev, generator=seeded, **how)
+
+    plain, lifted = windows(), windows(tails_kev=left)
     fall = (lifted - plain)[:, :20].mean() - (lifted - plain)[:, 180:200].mean()
     # 500 keV begin 200 samples before the window and fall within it
     wanted = 0.25 * np.exp(-210 * 0.016 / 50) * -np.expm1(-180 * 0.016 / 50)
     assert fall == pytest.approx(wanted, rel=0.2)
-    piled = InTracePileUp(
-        len(prepared_sim), np.array([4]), np.array([400.0]), np.array([-4000.0]), np.array([0])
-    )
-    drawn = {"generator": np.random.default_rng(1), "piled": piled}
-    result = ren.apply(prepared_sim, **drawn, **energies)
+    rows = np.array([4])
+    piled = InTracePileUp(n, rows, np.array([400.0]), np.array([-4000.0]), np.array([0]))
+    result = windows(piled=piled)
     step = result[4] - plain[4]
     # 0.2 of the height of 1, less by the scale: the tail is higher too
     assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)
     assert np.array_equal(result[5], plain[5])
     with pytest.raises(CpunetError, match="drawn with electronic noise"):
-        ren.apply(prepared_sim, noise=False, tails_kev=left, **energies)
+        windows(noise=False, tails_kev=left)

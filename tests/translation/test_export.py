@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
-from dataclasses import replace
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,13 @@ from lgdo import Array, Table
 
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import LinearInverse, ResponseGenerator
+from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
+from cpunet.translation import export
 from cpunet.translation.dspeed_processor import ren
-from cpunet.translation.export import export_onnx, graph_of, write_onnx
+from cpunet.translation.export import export_onnx
+from cpunet.translation.onnx_readout import chain_model
 from cpunet.translation.translator import IREN, REN
 from synthetic import load_recipe, waveform_table, write_chain
 
@@ -59,16 +63,18 @@ def prepared(sim: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.thorough
-def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
+def test_the_graph_of_a_chain_with_its_noise_and_origin(chain, sim, tmp_path):
     onnx = pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")
     done = export_onnx(chain, tmp_path / "ren.onnx")
     assert done.difference < 2e-5
-    model = onnx.load(tmp_path / "ren.onnx")
+    model = onnx.load(done.graph)
     onnx.checker.check_model(model)
     assert {opset.version for opset in model.opset_import if not opset.domain} == {18}
     assert model.ir_version == 8  # that of ONNX 1.13, which brought opset 18
-    session = ort.InferenceSession(tmp_path / "ren.onnx", providers=["CPUExecutionProvider"])
+    facts = {entry.key: entry.value for entry in model.metadata_props}
+    assert (facts["recipe"], facts["peak"], facts["dt_ns"]) == ("fast", "FEP", "16.0")
+    session = ort.InferenceSession(done.graph, providers=["CPUExecutionProvider"])
     (records,) = session.run(None, {"windows": prepared(sim)})
     assert records.shape == (5, 1400)
     translator = REN.load(chain)
@@ -81,6 +87,18 @@ def test_onnx_runtime_gives_the_records_of_the_chain(chain, sim, tmp_path):
     np.testing.assert_allclose(
         clean.pulses.waveforms, translator.translate(sim, noise=False), atol=5e-5
     )
+    assert done.noise.name == "ren.noise.npz"
+    with np.load(done.noise) as noise:
+        total = noise["shares"] @ (noise["continua"] + noise["lines"])
+        np.testing.assert_allclose(total, 9.0, rtol=1e-5)
+        assert noise["samples"] == 2 * (len(total) - 1)
+    with pytest.raises(CpunetError, match="exists already"):
+        export_onnx(chain, tmp_path / "ren.onnx")
+    # noise of before does not stay with an export that has none
+    again = export_onnx(chain, tmp_path / "ren.onnx", inverse=True, force=True)
+    assert again.difference < 2e-5
+    assert again.noise is None
+    assert not done.noise.exists()
 
 
 @pytest.mark.slow
@@ -103,48 +121,28 @@ def test_onnx_runtime_gives_the_network_with_its_draw(network, sim, tmp_path):
 
 
 @pytest.mark.thorough
-def test_graphs_of_inverses_and_of_a_stretched_drift(network, chain, tmp_path):
+def test_graphs_of_a_stretched_drift_and_of_a_network(network, tmp_path):
     # as where the physics are off
     stretched = written(tmp_path / "stretched", "generator.drift_terms=2")
-    for folder, kind in ((network, IREN), (chain, IREN), (stretched, REN)):
-        graph = graph_of(kind.load(folder).backend.network, 800)
-        assert write_onnx(graph, tmp_path / "graph", {}) < 2e-5
+    for folder, inverse in ((stretched, False), (network, True)):
+        done = export_onnx(folder, tmp_path / "graph.onnx", inverse=inverse, force=True)
+        assert done.difference < 2e-5
 
 
-@pytest.mark.thorough
-def test_the_noise_and_the_origin(chain, tmp_path):
-    onnx = pytest.importorskip("onnx")
-    done = export_onnx(chain, tmp_path / "ren.onnx")
-    told = {one.key: one.value for one in onnx.load(done.graph).metadata_props}
-    assert (told["recipe"], told["peak"], told["dt_ns"]) == ("fast", "FEP", "16.0")
-    assert done.noise.name == "ren.noise.npz"
-    with np.load(done.noise) as noise:
-        total = noise["shares"] @ (noise["continua"] + noise["lines"])
-        np.testing.assert_allclose(total, 9.0, rtol=1e-5)
-        assert noise["samples"] == 2 * (len(total) - 1)
-    with pytest.raises(CpunetError, match="exists already"):
-        export_onnx(chain, tmp_path / "ren.onnx")
-    # noise of before does not stay beside an export without
-    assert export_onnx(chain, tmp_path / "ren.onnx", inverse=True, force=True).noise is None
-    assert not done.noise.exists()
+def test_without_onnx_or_with_another_graph_nothing_is_left(chain, tmp_path, monkeypatch):
+    def other(response: ElectronicsResponse, length: int) -> Any:
+        slower = copy.deepcopy(response)
+        slower.log_decay_us += 1
+        return chain_model(slower, length)
 
-
-def test_what_cannot_be_done_is_said_in_one_line(chain, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "onnx", None)
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "chain_model", other)
+        with pytest.raises(CpunetError, match=r"ren.onnx: the exported graph differs"):
+            export_onnx(chain, tmp_path / "ren.onnx")
+    monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
         export_onnx(chain, tmp_path / "ren.onnx")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.thorough
-def test_a_graph_that_is_not_that_of_the_run_is_not_left(chain, tmp_path):
-    graph = graph_of(REN.load(chain).backend.network, 800)
-    other = REN.load(chain)
-    other.backend.chain.response.log_decay_us += 1
-    wrong = replace(graph, expected=graph_of(other.backend.network, 800).expected)
-    with pytest.raises(CpunetError, match="differs from the run"):
-        write_onnx(wrong, tmp_path / "x", {})
-    assert [p.name for p in tmp_path.iterdir() if p.name != "x"] == []
 
 
 MODULE = "cpunet.translation.dspeed_processor"
@@ -221,23 +219,22 @@ def test_noise_by_the_energy_of_each_event(chain, sim):
 
 
 def test_a_network_both_ways(network, sim, data):
-    kev = np.ones(5)
-    forward = build_dsp(
-        raw_in=table(sim, kev), dsp_config=config(network, "ren", [], False), block_width=5
-    )
-    expected = REN.load(network).translate(sim, noise=False)
-    np.testing.assert_allclose(forward["wf_out"]["values"].nda, expected, atol=1e-5)
-    back = build_dsp(
-        raw_in=table(data.astype(np.uint16), kev),
-        dsp_config=config(network, "iren", [], 7),
-        block_width=5,
-    )
-    translator = IREN.load(network)
-    drawn = translator.translate_pulses(
-        Pulses.of(data.astype(np.uint16), dt_ns=16), generator=np.random.default_rng(7)
-    )
-    assert drawn.valid.all()
-    np.testing.assert_allclose(back["wf_out"]["values"].nda, drawn.pulses.waveforms, atol=1e-5)
+    data = data.astype(np.uint16)
+    for given, function, init, translator in (
+        (sim, "ren", False, REN.load(network)),
+        (data, "iren", 7, IREN.load(network)),
+    ):
+        made = build_dsp(
+            raw_in=table(given, np.ones(5)),
+            dsp_config=config(network, function, [], init),
+            block_width=5,
+        )
+        expected = translator.translate_pulses(
+            Pulses.of(given, dt_ns=16), noise=bool(init), generator=np.random.default_rng(7)
+        )
+        assert expected.valid.all()
+        found = made["wf_out"]["values"].nda
+        np.testing.assert_allclose(found, expected.pulses.waveforms, atol=1e-5)
 
 
 def test_one_waveform_alone(chain, sim):

@@ -11,8 +11,6 @@ import h5py
 import lh5
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from lgdo import Array, ArrayOfEqualSizedArrays, Table, VectorOfVectors
 
 from cpunet.electronics.drawn_pile_up import SIZES_KEV
@@ -23,17 +21,15 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection, prepare
 from cpunet.pulses.provenance import provenance
 from cpunet.pulses.reading.files import PulseFile, open_pulses
-from cpunet.translation import file_translation
-from cpunet.translation.file_translation import Counts, noise_seed
 from cpunet.translation.options import Adc
-from cpunet.translation.translate import expanded, translate
-from cpunet.translation.translator import REN
+from cpunet.translation.translate import translate
+from cpunet.translation.translation import Counts
+from cpunet.translation.translator import REN, noise_seed
 from synthetic import (
     edges,
     load_recipe,
     nearly_full_disk,
     write_chain,
-    write_pulses,
     write_table,
 )
 
@@ -55,13 +51,6 @@ def charge(n=N, seed=1):
     return edges(n, seed, at=80).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A readout chain that was not fitted."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    return write_chain(folder, noise_kev=NOISE_KEV, data=DATA)
-
-
 TAILS = {
     "rate_khz": 1.0,
     "drawn": {
@@ -77,19 +66,32 @@ TAILS = {
 
 
 @pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A readout chain that was not fitted."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return write_chain(folder, noise_kev=NOISE_KEV, data=DATA)
+
+
+@pytest.fixture(scope="module")
 def busy(tmp_path_factory):
     """A chain of data with pile-up tails."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     return write_chain(folder, noise_kev=NOISE_KEV, data=DATA, fit={"tails": TAILS})
 
 
+def energies(n=N, seed=1):
+    return np.random.default_rng(seed).uniform(500, 2600, n)
+
+
 def sim_file(path, n=N, seed=1, **others):
     """An LH5 file by the LH5 library, with columns of many kinds."""
-    rng = np.random.default_rng(seed)
-    numbers = {"event_number": 7 + 2 * np.arange(n)}
-    return write_table(
-        path, "geds/sim", charge(n, seed), rng.uniform(500, 2600, n), **numbers | others
-    )
+    numbers = {"event_number": 7 + 2 * np.arange(n)} | others
+    return write_table(path, "geds/sim", charge(n, seed), energies(n, seed), **numbers)
+
+
+def simulated(n=N):
+    """The same pulses in memory."""
+    return Pulses.of(charge(n), dt_ns=DT_NS, energy_kev=energies(n))
 
 
 def many_columns(n=N):
@@ -192,69 +194,29 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
     assert together == pytest.approx(0, abs=0.05)
 
 
-def test_the_options_of_a_translation_are_told(busy, tmp_path):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    raw = {"adc": True, "scale": Adc(baseline=0.0)}
-    for number, (options, said) in enumerate(
-        [
-            ({}, "noise True"),
-            ({"noise": False}, "noise False"),
-            ({"seed": 4, "tails": "learned"}, "seed 4, tails learned"),
-            (raw, "adc baseline 0.0"),
-        ]
-    ):
-        out = tmp_path / f"{number}.lh5"
-        translate(busy, source, out, **options)
-        assert said in provenance(open_pulses(out))["options"]
-
-
 # --- noise and bytes
-
-
-@pytest.fixture(scope="module")
-def in_blocks(run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("blocks")
-    source = PulseFile(sim_file(folder / "sim.lh5", n=50))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(file_translation, "NOISE_ROWS", 16)
-        translate(run, source, folder / "whole.lh5")
-    return source, (folder / "whole.lh5").read_bytes()
-
-
-@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
-@given(size=st.integers(1, 60), longest=st.integers(225, 225 * 60))
-def test_bytes_do_not_depend_on_blocks(run, in_blocks, tmp_path_factory, size, longest):
-    source, expected = in_blocks
-    out = tmp_path_factory.mktemp("blocks") / "whole.lh5"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(file_translation, "NOISE_ROWS", 16)
-        patch.setattr(file_translation, "BLOCK_SIZE", size)
-        patch.setattr(file_translation, "BLOCK_SAMPLES", longest)
-        translate(run, source, out)
-    assert out.read_bytes() == expected
 
 
 def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
     """A path, a file, pulses and arrays; in memory, streamed, and saved later."""
     path = sim_file(tmp_path / "sim.lh5", **many_columns())
     pulses = open_pulses(path).read()
-    how = {"seed": 4}
-    kept = translate(run, path, **how)
-    assert len(kept) == N
-    assert kept.waveforms.shape == (N, 800)
-    translate(run, PulseFile(path), tmp_path / "streamed.lh5", **how)
-    translate(run, pulses, tmp_path / "given.lh5", **how)
+    kept = translate(run, path, seed=4)
+    assert kept.waveforms.shape == (len(kept), 800) == (N, 800)
+    translate(run, PulseFile(path), tmp_path / "streamed.lh5", seed=4)
+    translate(run, pulses, tmp_path / "given.lh5", seed=4)
     kept.save(tmp_path / "saved.lh5")
     for name in ("streamed", "given", "saved"):
-        found = translate(run, pulses, tmp_path / "given.lh5", **how, resume=True)
         np.testing.assert_array_equal(values(tmp_path / f"{name}.lh5"), kept.waveforms)
-    assert found.counts.skipped
+    assert "noise True, seed 4" in provenance(open_pulses(tmp_path / "given.lh5"))["options"]
+    resumed = translate(run, pulses, tmp_path / "given.lh5", seed=4, resume=True)
+    assert resumed.counts.skipped
     with pytest.raises(CpunetError, match="holds these pulses already"):
-        found.save(tmp_path / "again.lh5")
+        resumed.save(tmp_path / "again.lh5")
     with pytest.raises(CpunetError, match=r"saved.lh5: exists already"):
         kept.save(tmp_path / "saved.lh5")
     with pytest.raises(CpunetError, match="was made with another source"):
-        translate(run, pulses[1:], tmp_path / "given.lh5", **how, resume=True)
+        translate(run, pulses[1:], tmp_path / "given.lh5", seed=4, resume=True)
     array = translate(run, pulses.waveforms, noise=False)
     assert array.pulses.dt_ns == DT_NS
     expected = translate(run, pulses, noise=False).waveforms
@@ -290,8 +252,14 @@ def many(tmp_path_factory):
 @pytest.fixture(scope="module")
 def sequential(run, many, tmp_path_factory):
     out = tmp_path_factory.mktemp("sequential") / "out"
-    told = translate(run, many, out).counts
-    return out, told
+    translate(run, many, out)
+    return out
+
+
+def require_same(folder, expected):
+    assert names(folder) == names(expected)
+    for path in expected.iterdir():
+        assert (folder / path.name).read_bytes() == path.read_bytes()
 
 
 def test_no_output_is_the_input_of_another(run, many, tmp_path):
@@ -310,9 +278,7 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     with pytest.raises(CpunetError, match=r"1 of 4 files failed, .*bad.lh5.* 3 are in"):
         translate(run, sources, out, jobs=jobs)
     assert sum("bad.lh5" in note for note in caplog.messages) == 1
-    assert names(out) == names(sequential[0])
-    for path in sequential[0].iterdir():
-        assert (out / path.name).read_bytes() == path.read_bytes()
+    require_same(out, sequential)
     assert multiprocessing.active_children() == []
 
 
@@ -325,28 +291,23 @@ def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
     told = translate(run, many, out, resume=True).counts
     assert (told.skipped, told.translated) == (2, 3 * N)
     assert [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)] == before
-    for path in sequential[0].iterdir():
-        assert (out / path.name).read_bytes() == path.read_bytes()
+    require_same(out, sequential)
 
 
 def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, tmp_path):
-    out = sequential[0]
-
-    def refused(run=run, sources=many, **options):
-        with pytest.raises(CpunetError) as error:
-            translate(run, sources, out, **options, resume=True)
-        return str(error.value)
-
-    assert "was made with another run" in refused(run=network)
-    assert "was made with other options (seed)" in refused(seed=1)
-    assert "was made with other options (noise)" in refused(noise=False)
     other = PulseFile(sim_file(tmp_path / "sim_0.lh5", seed=9))
-    assert "sim_0.lh5: was made with another source" in refused(sources=[other])
     foreign = tmp_path / "out"
     foreign.mkdir()
     (foreign / "sim_0.lh5").write_bytes(b"x")
-    with pytest.raises(CpunetError, match="no translation that is finished"):
-        translate(run, many[:1], foreign, resume=True)
+    for of, sources, out, options, said in (
+        (network, many, sequential, {}, "another run"),
+        (run, many, sequential, {"seed": 1}, r"other options \(seed\)"),
+        (run, many, sequential, {"noise": False}, r"other options \(noise\)"),
+        (run, [other], sequential, {}, "another source"),
+        (run, many[:1], foreign, {}, "no translation that is finished"),
+    ):
+        with pytest.raises(CpunetError, match=said):
+            translate(of, sources, f"{out}/", **options, resume=True)
 
 
 # --- ADC counts
@@ -372,9 +333,8 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     np.testing.assert_allclose(end / energy, 8.0, atol=5 * 20 / np.sqrt(5) / energy.min())
     # prepared again they are what translation gives without ADC
     config = load_recipe("fast").preparation
-    clean = tmp_path / "clean.lh5"
-    translate(run, source, clean, adc=True, scale=adc, noise=False)
-    back = prepare(Pulses.of(values(clean), dt_ns=DT_NS), config, "measured")
+    clean = translate(run, source, adc=True, scale=adc, noise=False)
+    back = prepare(clean.pulses, config, "measured")
     assert set(np.abs(back.align_sample - n_pre)) <= {0, 1}
     windows = REN.load(run).translate(charge(), noise=False)
     same = back.align_sample == n_pre
@@ -385,45 +345,28 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
 
 
 def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
-    run, network, tmp_path, caplog
+    run, network, caplog
 ):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    translate(run, source, tmp_path / "chain.lh5", adc=True, scale=ADC)
-    traces = values(tmp_path / "chain.lh5").astype(float)
+    traces = translate(run, simulated(), adc=True, scale=ADC).waveforms.astype(float)
     for part in (slice(0, 250), slice(1150, 1400)):
         steps = np.diff(traces[:, part], axis=1).std(axis=1) / np.sqrt(2)
         assert steps.mean() == pytest.approx(10 * NOISE_KEV, rel=0.05)
     given = Adc(adc_per_kev=8.0, baseline=14_000, length=1000, n_pre=500)
-    told = translate(
-        network, source, tmp_path / "unet.lh5", adc=True, scale=given, noise=False
-    ).counts
-    assert told.read == N
+    of_network = translate(network, simulated(), adc=True, scale=given, noise=False)
+    assert len(of_network) == N
     assert any("beyond them stand baseline and decay" in note for note in caplog.messages)
-    assert (values(tmp_path / "unet.lh5")[:, :100] == 14_000).all()
+    assert (of_network.waveforms[:, :100] == 14_000).all()
 
 
-def test_gain_is_the_height_of_a_fast_pulse(run, tmp_path):
-    source = sim_file(tmp_path / "sim.lh5")
-    given = Adc(adc_per_kev=7.0, baseline=100.0)
-    out = tmp_path / "out.lh5"
-    translate(run, source, out, adc=True, scale=given, noise=False)
-    table = lh5.read("geds/ren", out)
-    height = table.waveform.values.nda.max(axis=1) - 100.0
-    np.testing.assert_allclose(height / table.energy.nda, 7.0, rtol=0.01)
-
-
-def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
+def test_saturated_and_lost_pulses_are_counted(run):
     waveforms, kev = charge(6), np.array([1000.0, 6500.0, np.nan, 1000.0, 6500.0, 1000.0])
     waveforms[3] = 0.5
-    path = tmp_path / "sim.lh5"
-    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev))
-    told = translate(run, path, tmp_path / "out.lh5", adc=True, scale=ADC).counts
-    assert told == Counts(6, 4, {"constant": 1, "energy_unknown": 1}, saturated=2)
-    table = lh5.read("geds/ren", tmp_path / "out.lh5")
-    traces = table.waveform.values.nda
-    assert (traces[[2, 3]] == 0).all()
-    assert traces.max(axis=1)[[1, 4]].tolist() == [65535, 65535]
-    codes = [Rejection(code).label for code in table.rejection.nda]
+    pulses = Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=kev)
+    done = translate(run, pulses, adc=True, scale=ADC)
+    assert done.counts == Counts(6, 4, {"constant": 1, "energy_unknown": 1}, saturated=2)
+    assert (done.waveforms[[2, 3]] == 0).all()
+    assert done.waveforms.max(axis=1)[[1, 4]].tolist() == [65535, 65535]
+    codes = [Rejection(code).label for code in done.codes]
     assert codes == ["accepted", "accepted", "energy_unknown", "constant"] + 2 * ["accepted"]
 
 
@@ -441,90 +384,87 @@ def test_saturated_and_lost_pulses_are_counted(run, tmp_path):
 def test_counts_are_clipped_where_the_digitisers_end(tmp_path, counts, bits, ends, kind):
     data = DATA | {"counts": counts}
     run = write_chain(tmp_path / "run", noise_kev=NOISE_KEV, data=data)
-    kev = np.full(6, 1.2 * ends[1] / 4)
-    path = tmp_path / "sim.lh5"
-    write_pulses(path, Pulses.of(charge(6), dt_ns=DT_NS, energy_kev=kev))
+    kev = np.array([0.3, 0.5, 1.2, 1.3, 1.4, 1.5]) * ends[1] / 4
+    pulses = Pulses.of(charge(6), dt_ns=DT_NS, energy_kev=kev)
     scale = Adc(adc_per_kev=4.0, baseline=100.0, bits=bits)
-    told = translate(run, path, tmp_path / "out.lh5", adc=True, scale=scale).counts
-    assert told.saturated == 6
-    traces = lh5.read("geds/ren", tmp_path / "out.lh5").waveform.values.nda
+    options = {"adc": True, "scale": scale, "noise": False}
+    told = translate(run, pulses, tmp_path / "out.lh5", **options).counts
+    assert told.saturated == 4
+    traces = values(tmp_path / "out.lh5")
     assert (traces.dtype, traces.max()) == (np.dtype(kind), ends[1])
+    # the gain is the height of a fast pulse
+    np.testing.assert_allclose((traces.max(axis=1)[:2] - 100.0) / kev[:2], 4.0, rtol=0.01)
 
 
-def left_in(path, table="geds/ren"):
-    return lh5.read(f"{table}/tails_kev", path).nda
+def truth(done, *names):
+    """What was drawn for each pulse."""
+    return [done.in_memory.truth[name][0] for name in names]
 
 
 def test_learned_tails_are_those_behind_the_cuts(busy, tmp_path):
-    source, out = sim_file(tmp_path / "sim.lh5", n=40 * N), tmp_path / "out.lh5"
-    translate(busy, source, out, tails="learned")
-    left = left_in(out)
+    done = translate(busy, simulated(40 * N), tails="learned")
+    (left,) = truth(done, "tails_kev")
     assert len(left) == 40 * N
     assert left.max() < 40
     assert (left > 5).mean() == pytest.approx(0.13, abs=0.04)
     # behind a baseline that falls tails lie lower, and are scaled up to the same level
-    higher = values(out)[:, 430:460].mean(axis=1)
-    share = left / lh5.read("geds/ren/energy", out).nda
-    assert np.corrcoef(share, higher)[0, 1] > 0.4
-    translate(busy, source, tmp_path / "rate.lh5", tails="1")
-    assert left_in(tmp_path / "rate.lh5").max() > 100
+    higher = done.waveforms[:, 430:460].mean(axis=1)
+    assert np.corrcoef(left / done.pulses.energy_kev, higher)[0, 1] > 0.4
+    translate(busy, simulated(40 * N), tmp_path / "out.lh5", tails="1")
+    assert lh5.read("geds/ren/tails_kev", tmp_path / "out.lh5").nda.max() > 100
 
 
-def test_tails_lift_the_baselines_of_raw_traces(busy, tmp_path):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
-    for tails in ("none", "3"):
-        out = tmp_path / f"{tails}.lh5"
-        translate(busy, source, out, adc=True, scale=ADC, tails=tails, seed=3)
-    left = left_in(tmp_path / "3.lh5")
-    none, lifted = (values(tmp_path / f"{name}.lh5") for name in ("none", "3"))
+def test_tails_lift_the_baselines_of_raw_traces(busy):
+    none, lifted = (
+        translate(busy, simulated(), adc=True, scale=ADC, tails=tails, seed=3)
+        for tails in ("none", "3")
+    )
+    (left,) = truth(lifted, "tails_kev")
     assert (left > 20).sum() > 5
     # 9 ADC per keV of height 0.9
     wanted = left * 0.9 * 26145.11 / 2614.511
-    begin = lifted[:, :300].mean(axis=1) - none[:, :300].mean(axis=1)
+    begin = (lifted.waveforms - none.waveforms)[:, :300].mean(axis=1)
     assert begin == pytest.approx(wanted * np.exp(-2.4 / 50), abs=25)
 
 
-def piled(out):
-    return [
-        lh5.read(f"geds/ren/{name}", out).nda for name in ("n_piled", "piled_kev", "piled_ns")
-    ]
+PILED = ("n_piled", "piled_kev", "piled_ns")
 
 
-def test_piled_up_pulses_are_within_raw_traces_and_told(busy, tmp_path):
-    source = sim_file(tmp_path / "sim.lh5", n=5 * N)
-    options = {"adc": True, "scale": ADC, "seed": 3}
-    translate(busy, source, tmp_path / "none.lh5", **options)
-    translate(busy, source, tmp_path / "some.lh5", pile_up_khz=20, **options)
-    with h5py.File(tmp_path / "none.lh5") as file:
-        assert "n_piled" not in file["geds/ren"]
-    count, kev, after_ns = piled(tmp_path / "some.lh5")
+def test_piled_up_pulses_are_within_raw_traces_and_told(busy):
+    none, some = (
+        translate(busy, simulated(5 * N), adc=True, scale=ADC, seed=3, pile_up_khz=rate)
+        for rate in (0, 20)
+    )
+    assert not none.in_memory.truth
+    count, kev, after_ns = truth(some, *PILED)
     assert 0 < (count > 0).sum() < 5 * N
     assert np.array_equal(np.isnan(kev), count == 0)
-    clean, more = (values(tmp_path / f"{name}.lh5").astype(float) for name in ("none", "some"))
+    added = some.waveforms - none.waveforms
     # away from the pulse, the trace rises by the piled-up pulse's energy where it is said
     single = (count == 1) & (np.abs(after_ns) > 1500) & (np.abs(after_ns) < 7000)
     assert single.sum() >= 3
     for row in np.flatnonzero(single):
-        added = more[row] - clean[row]
         at = ADC.n_pre + int(after_ns[row] / DT_NS)
-        assert added[at - 100 : at - 60].mean() == pytest.approx(0, abs=15)
+        assert added[row, at - 100 : at - 60].mean() == pytest.approx(0, abs=15)
         wanted = kev[row] * 0.9 * 26145.11 / 2614.511
-        assert added[at + 40 : at + 50].mean() == pytest.approx(wanted, rel=0.1, abs=40)
+        assert added[row, at + 40 : at + 50].mean() == pytest.approx(wanted, rel=0.1, abs=40)
 
 
 def test_piled_up_pulses_are_within_windows(busy, tmp_path):
-    source, out = sim_file(tmp_path / "sim.lh5", n=10 * N), tmp_path / "some.lh5"
-    translate(busy, source, out, pile_up_khz=20, seed=3)
-    count, kev, after_ns = piled(out)
+    out = tmp_path / "some.lh5"
+    translate(busy, simulated(10 * N), out, pile_up_khz=20, seed=3)
+    table = lh5.read("geds/ren", out)
+    count, kev, after_ns = (table[name].nda for name in PILED)
     assert len(count) == 10 * N
     # 20 kHz for a record of 1,400 samples of 16 ns
     assert count.mean() == pytest.approx(0.448, abs=0.1)
     # baselines are flat but behind a piled-up pulse, or on its edge
-    tilt = np.abs(values(out)[:, :50].mean(axis=1) - values(out)[:, 100:150].mean(axis=1))
+    windows = values(out)
+    tilt = np.abs(windows[:, :50].mean(axis=1) - windows[:, 100:150].mean(axis=1))
     assert tilt[count == 0].max() < 0.03
     inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)
     assert inside.sum() >= 3
-    heights = values(out)[inside].max(axis=1)
+    heights = windows[inside].max(axis=1)
     # those within the tail are rejected, as they are in data
     assert (heights[np.isfinite(heights)] > 0.05).all()
     assert np.isfinite(heights).any()
@@ -544,25 +484,23 @@ def test_piled_up_pulses_are_within_windows(busy, tmp_path):
         ({"adc": True, "scale": Adc(baseline=-1)}, "expected a number that is not negative"),
         ({"adc": True, "scale": Adc(length=100, n_pre=100)}, "not within a trace"),
         ({"jobs": 0}, "`jobs` is 0; expected 1 or more"),
-        ({"seed": -1}, "`seed` -1: expected a whole number from 0"),
-        ({"tails": "many"}, "`tails` many: expected learned, none, or a rate in kHz"),
+        ({"seed": -1}, "`seed` is -1; expected a whole number from 0"),
+        ({"tails": "many"}, "`tails` is many; expected learned, none, or a rate in kHz"),
         ({"tails": "learned", "noise": False}, "or translate with noise"),
         ({"tails": "learned", "inverse": True}, "leave out `tails`"),
     ],
 )
 def test_options_that_cannot_be(busy, tmp_path, options, said):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
     with pytest.raises(CpunetError, match=said):
-        translate(busy, source, tmp_path / "out.lh5", **options)
+        translate(busy, simulated(), tmp_path / "out.lh5", **options)
 
 
-def test_runs_that_tell_of_no_tails(run, network, tmp_path):
-    source = PulseFile(sim_file(tmp_path / "sim.lh5"))
+def test_runs_that_tell_of_no_tails(run, network):
     for folder in (run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of pile-up tails"):
-            translate(folder, source, tmp_path / "o.lh5", tails="1")
+            translate(folder, simulated(), tails="1")
         with pytest.raises(CpunetError, match=r"tells nothing of .* other pulses"):
-            translate(folder, source, tmp_path / "o.lh5", pile_up_khz=1)
+            translate(folder, simulated(), pile_up_khz=1)
 
 
 # --- what can go wrong
@@ -598,12 +536,16 @@ def test_a_process_that_is_killed_is_told():
     assert multiprocessing.active_children() == []
 
 
-def test_names(run, many, tmp_path):
+def test_names(run, many, sequential, tmp_path):
     folder = many[0].path.parent
-    assert expanded(folder / "sim_*.lh5") == [source.path for source in many]
-    assert expanded(folder / "other.lh5") == [folder / "other.lh5"]
-    with pytest.raises(CpunetError, match="no such files"):
-        expanded(folder / "x*.lh5")
+    translate(run, str(folder / "sim_*.lh5"), tmp_path / "all")
+    require_same(tmp_path / "all", sequential)
+    strange = sim_file(tmp_path / "a[1].lh5")  # a file may be named like a pattern
+    assert len(translate(run, strange, noise=False)) == N
+    with pytest.raises(CpunetError, match=r"other.lh5: no such file; check the name"):
+        translate(run, folder / "other.lh5")
+    with pytest.raises(CpunetError, match=r"x\*.lh5: no such files; check the name"):
+        translate(run, folder / "x*.lh5")
     with pytest.raises(CpunetError, match="is a file, but several outputs need a folder"):
         translate(run, many, many[0].path)
     twice = [many[0], many[0]]

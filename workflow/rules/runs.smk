@@ -80,10 +80,6 @@ rule train:
         " || [ -f {output:q}/run.json ]"
 
 
-def translation_reading(wildcards):
-    return simulation_reading(wildcards.detector)
-
-
 rule translate:
     input:
         run=TRAINED,
@@ -103,7 +99,7 @@ rule translate:
             # noise of its own in each file
             seed=config["train"]["seed"] + list(SIMULATIONS[w.detector]).index(w.part),
         ),
-        reading=translation_reading,
+        reading=lambda w: simulation_reading(w.detector),
     shell:
         "cpunet translate {input.run:q} {input.pulses:q} {params.options} {params.reading}"
         " --out {output:q} --force > {log:q} 2>&1"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs
@@ -45,8 +44,13 @@ def run_chain(
     from dspeed import build_dsp
 
     refuse_inputs(out, raw, config, run)
-    chain = _chain(config)
-    decay_us = _decay_us(run) if tau_us is None else tau_us
+    chain = read_values(config)
+    if not {"outputs", "processors"} <= chain.keys():
+        raise CpunetError(f"{config}: no chain of dspeed; give outputs and processors")
+    try:
+        decay_us = tau_us or describe_chain(Run.load(run)).values["decay_us"]
+    except CpunetError as error:
+        raise CpunetError(f"{error}; or give events.tau_us") from error
     # dspeed looks a table's parameters up by the first of its names that is not raw
     names = [name for name in table.split("/") if name not in ("", "raw")][:1]
     aside = out.with_name(f".{out.name}.unfinished")
@@ -57,7 +61,7 @@ def run_chain(
             dsp_out=str(aside),
             dsp_config=chain,
             lh5_tables=[table],
-            database={name: {"pz": {"tau": f"{decay_us}*us"}} for name in names},
+            database={name: {"pz": {"tau": f"{float(decay_us)}*us"}} for name in names},
             write_mode="r",
         )
         aside.replace(out)
@@ -71,22 +75,8 @@ def run_chain(
         aside.unlink(missing_ok=True)
 
 
-def _chain(config: Path) -> dict[str, Any]:
-    chain = read_values(config)
-    if not {"outputs", "processors"} <= chain.keys():
-        raise CpunetError(f"{config}: no chain of dspeed; give outputs and processors")
-    return chain
-
-
-def _decay_us(run: Path) -> float:
-    try:
-        return float(describe_chain(Run.load(run)).values["decay_us"])
-    except CpunetError as error:
-        raise CpunetError(f"{error}; or give events.tau_us") from error
-
-
 def main() -> None:
-    """Read the command line; bad input ends in one line and status 2."""
+    """Read the command line; bad input ends in one line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("raw", type=Path)
     parser.add_argument("out", type=Path)
@@ -94,12 +84,10 @@ def main() -> None:
     parser.add_argument("--table", required=True)
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--tau-us", type=float)
-    given = parser.parse_args()
     try:
-        run_chain(given.raw, given.out, given.config, given.table, given.run, given.tau_us)
+        run_chain(**vars(parser.parse_args()))
     except CpunetError as error:
-        sys.stderr.write(f"error: {error}\n")
-        sys.exit(2)
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

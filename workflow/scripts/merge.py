@@ -64,30 +64,21 @@ def merge(
 
 
 def main() -> None:
-    """Read the command line; bad input ends in one line and status 2."""
+    """Read the command line; bad input ends in one line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--files", type=Path, nargs="+", required=True)
     parser.add_argument("--made-table", required=True)
     parser.add_argument("--table")
-    parser.add_argument("--energy", action="append", default=[])
+    parser.add_argument("--energy", dest="energies", action="append", default=[])
     parser.add_argument("--kev-per-adc", type=float)
     parser.add_argument("--dt-ns", type=float)
-    given = parser.parse_args()
+    given = vars(parser.parse_args())
     try:
-        n_pulses = merge(
-            given.out,
-            given.files,
-            given.made_table,
-            table=given.table,
-            energies=given.energy,
-            kev_per_adc=given.kev_per_adc,
-            dt_ns=given.dt_ns,
-        )
+        n_pulses = merge(**given)
     except CpunetError as error:
-        sys.stderr.write(f"error: {error}\n")
-        sys.exit(2)
-    sys.stderr.write(f"{given.out}: {n_pulses} pulses of {len(given.files)} files\n")
+        sys.exit(f"error: {error}")
+    sys.stderr.write(f"{given['out']}: {n_pulses} pulses of {len(given['files'])} files\n")
 
 
 if __name__ == "__main__":

@@ -11,8 +11,6 @@ give hits just inside their values.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -34,22 +32,20 @@ def currents_about_peak(charge: FloatArray) -> tuple[Floats, Values]:
     Parameters
     ----------
     charge
-        Charge sampled every nanosecond, 0 before the first sample, shape ``(n, samples)``.
+        Charge sampled every nanosecond, 0 before the first sample, shape ``(n, samples)`` with
+        3 samples or more.
 
     Returns
     -------
     currents
         Currents in units of the charge per ns, shape ``(n, LENGTH)``; 0 outside the record,
-        rows of NaN for templates that contain NaN, have no maximum above 0, or have fewer
-        than 3 samples.
+        rows of NaN for templates that contain NaN or have no maximum above 0.
     times_ns
         Times of the maxima after the first sample, shape ``(n,)``, including the delay of the
         backward averages, which is the same for all templates; NaN for rows of NaN.
     """
     n, n_samples = charge.shape
     currents, times = np.full((n, LENGTH), np.nan, np.float32), np.full(n, np.nan)
-    if n_samples < 3:  # no sample has two neighbours
-        return currents, times
     for row, template in enumerate(charge):
         current = averaged(template.astype(np.float64))
         peak = 1 + int(current[1:-1].argmax())
@@ -113,74 +109,48 @@ def most_frequent(amplitudes: Values) -> float:
     return float(0.5 * (edges[highest] + edges[highest + 1]))
 
 
-def with_rings(templates: Floats, rings: int = RINGS) -> Floats:
-    """Fill nodes without a template with the mean of their neighbours, ring by ring.
+def add_rings(templates: Floats, times: Values, rings: int = RINGS) -> None:
+    """Fill nodes without a template, ring by ring, from their eight neighbours, in place.
 
-    The mean of currents that are aligned at their maxima has the mean A/E.
+    A new template is the mean of the neighbours' ones: the mean of currents that are aligned at
+    their maxima has the mean A/E.  A new drift time is the mean of the linear extrapolations
+    from two nodes in each of eight directions, or else the mean of its neighbours.
 
     Parameters
     ----------
     templates
-        Templates, shape ``(r, z, samples)``, NaN if there is none; changed in place.
+        Templates, shape ``(r, z, samples)``, NaN if there is none.
+    times
+        Their drift times in ns, shape ``(r, z)``, NaN at the same nodes.
     rings
         Number of rings; a node depends only on nodes at most this far away.
-
-    Returns
-    -------
-    numpy.ndarray
-        The same array.
 
     Examples
     --------
     >>> line = np.array([[[1.0], [3.0], [np.nan], [np.nan]]], np.float32)
-    >>> with_rings(line, 1)[0, :, 0].tolist()
-    [1.0, 3.0, 3.0, nan]
+    >>> times = np.array([[4.0, 6.0, np.nan, np.nan]])
+    >>> add_rings(line, times, 1)
+    >>> line[0, :, 0].tolist(), times[0].tolist()
+    ([1.0, 3.0, 3.0, nan], [4.0, 6.0, 8.0, nan])
     """
-    filled = ~np.isnan(templates[:, :, 0])
+    n_r, n_z = times.shape
     for _ in range(rings):
-        held = np.pad(filled, 1)
-        around = np.sum([_seen(held, 1, *step) for step in _NEIGHBOURS], axis=0)
-        new_r, new_z = np.nonzero(~filled & (around > 0))
-        total = np.zeros((len(new_r), templates.shape[2]), np.float64)
-        for i, j in _NEIGHBOURS:
-            near = held[new_r + 1 + i, new_z + 1 + j]
-            total[near] += templates[new_r[near] + i, new_z[near] + j]
-        templates[new_r, new_z] = total / around[new_r, new_z][:, np.newaxis]
-        filled[new_r, new_z] = True
-    return templates
-
-
-def continued(times: Values, rings: int = RINGS) -> Values:
-    """Extrapolate drift times linearly to nodes without one, ring by ring.
-
-    Parameters
-    ----------
-    times
-        Drift times in ns, shape ``(r, z)``; NaN if there is none.
-    rings
-        Number of rings.
-
-    Returns
-    -------
-    numpy.ndarray
-        Drift times in ns, shape ``(r, z)``. A new one is the mean of the linear extrapolations
-        from two nodes in each of eight directions, or else the mean of its neighbours.
-
-    Examples
-    --------
-    >>> continued(np.array([[4.0, 6.0, np.nan, np.nan]]), 2).tolist()
-    [[4.0, 6.0, 8.0, 10.0]]
-    """
-    made = np.pad(times, 2, constant_values=np.nan)
-    for _ in range(rings):
+        padded = np.pad(times, 2, constant_values=np.nan)
         near, far = (
-            np.stack([_seen(made, 2, n * i, n * j) for i, j in _NEIGHBOURS]) for n in (1, 2)
+            np.stack([padded[2 + n * i :, 2 + n * j :][:n_r, :n_z] for i, j in _NEIGHBOURS])
+            for n in (1, 2)
         )
-        inner = _seen(made, 2, 0, 0)
-        best = _mean(2 * near - far)
-        best = np.where(np.isnan(best), _mean(near), best)
-        inner[...] = np.where(np.isnan(inner), best, inner)
-    return _seen(made, 2, 0, 0).copy()
+        along, mean = (
+            np.ma.masked_invalid(values).mean(axis=0).filled(np.nan)
+            for values in (2 * near - far, near)
+        )
+        held = np.isfinite(near)
+        new_r, new_z = np.nonzero(np.isnan(times) & held.any(axis=0))
+        total = np.zeros((len(new_r), templates.shape[2]))
+        for (i, j), inside in zip(_NEIGHBOURS, held[:, new_r, new_z], strict=True):
+            total[inside] += templates[new_r[inside] + i, new_z[inside] + j]
+        templates[new_r, new_z] = total / held.sum(axis=0)[new_r, new_z, np.newaxis]
+        times[new_r, new_z] = np.where(np.isnan(along), mean, along)[new_r, new_z]
 
 
 def padded_axis(axis: Values, before: int, after: int) -> Values:
@@ -195,17 +165,3 @@ def padded_axis(axis: Values, before: int, after: int) -> Values:
     low = axis[0] - step * np.arange(before, 0, -1)
     high = axis[-1] + step * np.arange(1, after + 1)
     return np.concatenate([low, axis, high])
-
-
-def _seen(padded: npt.NDArray[Any], pad: int, i: int, j: int) -> npt.NDArray[Any]:
-    """Inner part of an array with a padding of `pad` nodes, shifted by (i, j)."""
-    n_r, n_z = padded.shape
-    return padded[pad + i : n_r - pad + i, pad + j : n_z - pad + j]
-
-
-def _mean(values: Values) -> Values:
-    """Mean of the finite values along the first axis; NaN if there is none."""
-    finite = np.isfinite(values)
-    n = finite.sum(axis=0)
-    total = np.where(finite, values, 0.0).sum(axis=0)
-    return np.where(n > 0, total / np.maximum(n, 1), np.nan)

@@ -24,14 +24,17 @@ from scipy.special import log_ndtr, ndtr
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.legend.currents import WINDOW, WINDOWS, averaged
-from cpunet.legend.library_files import known_detector
+from cpunet.legend.translate_library import known_detector
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
-from cpunet.settings import plain, read_json, yaml_text
+from cpunet.settings import plain, yaml_text
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.closed_forms import StepResponse
 from cpunet.training.response_tables import as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
+from cpunet.validation.report import METRICS, read_metrics
+
+log = logging.getLogger(__name__)
 
 Values = npt.NDArray[np.float64]
 
@@ -40,14 +43,24 @@ START_NS = (40.0, 60.0)  # initial sigma and tau
 LONGEST_NS = 500.0
 LENGTH, BEGIN = 8192, 1500  # number of 1 ns samples, and the one at which charge moves
 WIDTHS_NS = (1, 20, 50, 100, 150, 200, 300)  # of constant currents, as in a detector
+LEGEND_PARS = FolderKind(
+    name="legend-pars",
+    command="cpunet export legend",
+    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
+)
+EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
 
 
-@dataclass(frozen=True)
-class Equivalent:
-    """The Gaussian and exponential kernel nearest to a chain.
+def equivalent_kernel(undecayed: StepResponse) -> dict[str, float]:
+    """Fit the Gaussian and exponential kernel nearest to a chain.
 
-    Attributes
+    Parameters
     ----------
+    undecayed
+        The chain without its decays, like data after pole-zero correction.
+
+    Returns
+    -------
     sigma_ns, tau_ns
         Standard deviation of the Gaussian and time constant of the exponential.
     prompt_share
@@ -61,75 +74,49 @@ class Equivalent:
     ae_error_percent
         Half the range of the ratio of A/E of kernel and chain, over constant currents that last
         from 1 to 300 ns, divided by its median.
-    """
-
-    sigma_ns: float
-    tau_ns: float
-    prompt_share: float
-    current_error_percent: float
-    late_charge_percent: float
-    ae_error_percent: float
-
-
-def equivalent_kernel(undecayed: StepResponse) -> Equivalent:
-    """Fit sigma and tau to a chain.
-
-    Parameters
-    ----------
-    undecayed
-        The chain without its decays, like data after pole-zero correction.
+    delay_ns
+        Time of the maximum of the averaged current for charge that arrives instantaneously.
+        The three averages look back over 48 ns each; half of their total length is subtracted,
+        so that they add no delay.
 
     Examples
     --------
     >>> from cpunet.electronics.exponentials import Exponentials
     >>> chain = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
     >>> nearest = equivalent_kernel(chain.step)
-    >>> 10 < nearest.sigma_ns < 30, 60 < nearest.tau_ns < 90
+    >>> 10 < nearest["sigma_ns"] < 30, 60 < nearest["tau_ns"] < 90
     (True, True)
     """
     time = np.arange(LENGTH, dtype=float) - BEGIN
     step = undecayed(time)
-    wanted = _about_peak(averaged(step))
+    current = averaged(step)
+    wanted = _about_peak(current)
 
-    def scaled(parameters: Values) -> tuple[Values, float]:
-        current = _about_peak(averaged(kernel_step(time, *parameters)))
-        weight = wanted**2
-        return current, float((weight * current * wanted).sum() / (weight * current**2).sum())
-
-    def residual(parameters: Values) -> Values:
-        current, height = scaled(parameters)
-        return np.asarray(wanted * (height * current - wanted) / wanted.max() ** 2)
+    def fitted(parameters: Values) -> tuple[Values, float]:
+        shape, weight = _about_peak(averaged(kernel_step(time, *parameters))), wanted**2
+        height = float((weight * shape * wanted).sum() / (weight * shape**2).sum())
+        return height * shape, height
 
     sigma, tau = scipy.optimize.least_squares(
-        residual, START_NS, bounds=(0.5, LONGEST_NS), diff_step=1e-4
+        lambda parameters: wanted * (fitted(parameters)[0] - wanted) / wanted.max() ** 2,
+        START_NS,
+        bounds=(0.5, LONGEST_NS),
+        diff_step=1e-4,
     ).x
-    current, height = scaled(np.array([sigma, tau]))
-    peak = BEGIN + int(averaged(step)[BEGIN:].argmax()) - (WINDOW - 1) * WINDOWS // 2
+    nearest, height = fitted(np.array([sigma, tau]))
     kernel = kernel_step(time, sigma, tau)
+    late = int(current.argmax()) - (WINDOW - 1) * WINDOWS // 2 + AROUND_NS
     # A of the kernel over A of the chain for constant currents
     ratios = np.array([averaged(kernel, w).max() / averaged(step, w).max() for w in WIDTHS_NS])
-    return Equivalent(
-        sigma_ns=float(sigma),
-        tau_ns=float(tau),
-        prompt_share=height,
-        current_error_percent=float(
-            100 * np.abs(height * current - wanted).max() / wanted.max()
-        ),
-        late_charge_percent=float(
-            100 * ((1 - step[peak + AROUND_NS]) - (1 - kernel[peak + AROUND_NS]))
-        ),
-        ae_error_percent=float(50 * (ratios.max() - ratios.min()) / np.median(ratios)),
-    )
-
-
-def current_delay_ns(undecayed: StepResponse) -> float:
-    """Time of the maximum of the averaged current for charge that arrives instantaneously.
-
-    The three averages look back over 48 ns each. Half of their total length is subtracted, so
-    that they add no delay.
-    """
-    current = averaged(undecayed(np.arange(LENGTH, dtype=float) - BEGIN))
-    return float(current.argmax() - BEGIN - 0.5 * WINDOWS * (WINDOW - 1))
+    return {
+        "sigma_ns": float(sigma),
+        "tau_ns": float(tau),
+        "prompt_share": height,
+        "current_error_percent": float(100 * np.abs(nearest - wanted).max() / wanted.max()),
+        "late_charge_percent": float(100 * ((1 - step[late]) - (1 - kernel[late]))),
+        "ae_error_percent": float(50 * np.ptp(ratios) / np.median(ratios)),
+        "delay_ns": float(current.argmax() - BEGIN - 0.5 * WINDOWS * (WINDOW - 1)),
+    }
 
 
 def kernel_step(time_ns: Values, sigma_ns: float, tau_ns: float) -> Values:
@@ -147,16 +134,6 @@ def _about_peak(current: Values) -> Values:
     time = peak + 0.5 * (low - high) / (low - 2 * mid + high)
     at = time + np.arange(-AROUND_NS, AROUND_NS + 1)
     return np.asarray(np.interp(at, np.arange(len(current)), current), np.float64)
-
-
-log = logging.getLogger(__name__)
-
-LEGEND_PARS = FolderKind(
-    name="legend-pars",
-    command="cpunet export legend",
-    own=r"(elecmod|aoemeanmod|aoeresmod|cpunet|response)\.yaml|response\.csv",
-)
-EVERY_DETECTOR = "default"  # name under which production looks up detectors without an entry
 
 
 @dataclass(frozen=True)
@@ -250,9 +227,9 @@ def export_legend(
     trained = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed}
     name = detector or known_detector(run) or EVERY_DETECTOR
     methods, ae_pars = ({}, {}) if report is None else _against_energy(report, trained)
-    undecayed = described.chain.undecayed
     with stage("Two numbers for the chain"):
-        nearest = equivalent_kernel(undecayed)
+        nearest = equivalent_kernel(described.chain.undecayed)
+    delay_ns = nearest.pop("delay_ns")
     whole = {
         "made_of": {
             "cpunet": cpunet.__version__,
@@ -261,18 +238,18 @@ def export_legend(
             "dt_ns": run.dt_ns,
         },
         "electronics": {
-            "equivalent": asdict(nearest),
+            "equivalent": nearest,
             "chain": described.parameters,
             "chain_errors": described.parameter_errors,
             "numbers": described.values,
         },
         "drift_time": {
-            "current_maximum_delay_ns": current_delay_ns(undecayed),
+            "current_maximum_delay_ns": delay_ns,
             "about": "time of the largest averaged current less this is a charge's drift time",
         },
         "ae_against_energy": methods,
     }
-    pars = {"elecmod": {"sigma": nearest.sigma_ns, "tau": nearest.tau_ns}} | ae_pars
+    pars = {"elecmod": {"sigma": nearest["sigma_ns"], "tau": nearest["tau_ns"]}} | ae_pars
     with folder_written_aside(out, LEGEND_PARS, *given, force=force) as folder:
         for kind, content in (pars | {"cpunet": whole}).items():
             text = yaml_text(plain({name: content}))
@@ -286,32 +263,27 @@ def _against_energy(
     report: Path, trained: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """A/E against energy of a report on this run, and the entries of production for it."""
-    path = report / "metrics.json"
-    metrics = read_json(path, "give the folder that `cpunet validate` made")
-    try:
-        for key, value in trained.items():
-            if (other := metrics["training"][key]) != value:
-                raise CpunetError(
-                    f"{report}: of a run with {key} {other}, this one has {value}; validate "
-                    "this run"
-                )
-        if missing := metrics["ae_energy"].get("missing"):
-            raise CpunetError(f"{report}: no A/E against energy: {missing}")
-        methods = dict(metrics["ae_energy"]["methods"])
-        # the mean of the translation, and the width of the data
-        mean, width = methods["ren"]["mean"], methods["data"]["resolution"]
-        line, law = {k: mean[k] for k in ("a", "b")}, {k: width[k] for k in ("a", "b", "c")}
-        noisy = law["b"] > 0
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CpunetError(
-            f"{path}: no A/E against energy; give the folder that `cpunet validate` made"
-        ) from error
-    pars: dict[str, Any] = {"aoemeanmod": {"psl": {"expression": "x*a+b", "pars": line}}}
-    if noisy:
-        pars["aoeresmod"] = {"expression": "SigmaFit", "parameters": law}
+    metrics = read_metrics(report / METRICS, "give the folder that `cpunet validate` made")
+    for key, value in trained.items():
+        if (other := metrics.training.get(key)) != value:
+            raise CpunetError(
+                f"{report}: of a run with {key} {other}, this one has {value}; validate "
+                "this run"
+            )
+    methods = metrics.ae_energy.methods
+    if not {"ren", "data"} <= methods.keys():
+        missing = metrics.ae_energy.missing or "give the folder that `cpunet validate` made"
+        raise CpunetError(f"{report}: no A/E against energy: {missing}")
+    # the mean of the translation, and the width of the data
+    line, law = methods["ren"].mean, methods["data"].resolution
+    pars = {"a": line.a, "b": line.b}
+    of_ae: dict[str, Any] = {"aoemeanmod": {"psl": {"expression": "x*a+b", "pars": pars}}}
+    if law.b > 0:
+        width = {"a": law.a, "b": law.b, "c": law.c}
+        of_ae["aoeresmod"] = {"expression": "SigmaFit", "parameters": width}
     else:
         log.warning(
             f"{report}: widths of A/E do not determine the part of the noise (b = 0); "
             "aoeresmod.yaml is not written: give events of more energies"
         )
-    return methods, pars
+    return {name: asdict(course) for name, course in methods.items()}, of_ae

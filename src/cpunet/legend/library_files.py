@@ -1,8 +1,7 @@
-"""Pulse-shape libraries in files: those of charge checked, those of currents merged.
+"""Libraries of pulse shapes in files: simulated, and merged into one file.
 
-Simulate the library of pulse shapes that production simulations look up.
-
-A library holds the charge pulse of every place in a detector.
+A library holds the charge pulse of every place in a detector, or the current behind its
+electronics.
 """
 
 from __future__ import annotations
@@ -10,219 +9,42 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import is_column, opened, units_of
+from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.writing import written_hdf5
-from cpunet.settings import Set, read_values
+from cpunet.settings import Set
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import detector_and_settings
 from cpunet.simulation.simulator import Simulator
-from cpunet.training.run import Run
-from cpunet.units import factor, unit_names
 
 PERIOD_NS = 1.0
-LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 WAVEFORM = re.compile(r"waveform_\d{3}_deg")
-
-Values = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class IdealLibrary:
-    """Templates of charge of a detector in a file, sampled every nanosecond.
-
-    Attributes
-    ----------
-    where
-        File and group, for messages.
-    path
-        Path of the group, the detector's name.
-    r_mm, z_mm
-        Grid points.
-    angles
-        Azimuths such as ``"000_deg"``, ascending.
-    """
-
-    where: str
-    path: str
-    r_mm: Values
-    z_mm: Values
-    angles: tuple[str, ...]
-
-    @classmethod
-    def of(cls, file: h5py.File, path: str, source: Path) -> Self:
-        """Read the axes of a library.
-
-        Raises
-        ------
-        CpunetError
-            If the library does not follow the schema, or its templates are not sampled every
-            nanosecond.
-        """
-        where = f"{source}: {path or '/'}"
-        if not path:
-            raise CpunetError(
-                f"{source}: the library stands at the top of the file; production finds it "
-                "under the detector's name: write it into a group of this name"
-            )
-        group = file[path]
-        if missing := sorted({"r", "z", "dt"} - set(group)):
-            raise CpunetError(
-                f"{where}: no {missing[0]} with the waveforms; complete the library"
-            )
-        r_mm, z_mm = (_axis(group[name], where, name) for name in ("r", "z"))
-        dt, units = group["dt"], units_of(group["dt"])
-        ns_per_unit = factor(units, "ns") or np.nan
-        dt_ns = ns_per_unit * dt[()].item() if is_column(dt) else np.nan
-        if not np.isclose(dt_ns, PERIOD_NS):
-            raise CpunetError(
-                f"{where}: sampled every {dt_ns:g} ns (dt in {str(units)!r}), production reads "
-                "templates of 1 ns; make the library with a period of 1 ns"
-            )
-        names = sorted(filter(WAVEFORM.fullmatch, group))
-        for name in names:
-            values = group[name]
-            numbers = isinstance(values, h5py.Dataset) and values.dtype.kind in "iuf"
-            shape: tuple[int, ...] = values.shape if numbers else ()
-            if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 2:
-                raise CpunetError(
-                    f"{where}/{name}: shape {shape} with r and z of {len(r_mm)} and "
-                    f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
-                )
-        angles = tuple(name.removeprefix("waveform_") for name in names)
-        return cls(where, path, r_mm, z_mm, angles)
-
-    @property
-    def n_templates(self) -> int:
-        """Number of grid points times angles."""
-        return len(self.r_mm) * len(self.z_mm) * len(self.angles)
+LENGTH_NS = 5000.0  # as in libraries of SolidStateDetectors.jl
+ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
+ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
-def _axis(column: h5py.Dataset, where: str, name: str) -> Values:
-    if not is_column(column) or column.ndim != 1:
-        raise CpunetError(f"{where}: {name} is no column of numbers; complete the library")
-    units = units_of(column)
-    if (mm_per_unit := factor(units, "mm")) is None:
-        raise CpunetError(
-            f"{where}: {name} is in {units!r}; expected one of {unit_names('mm')}"
-        )
-    values = np.asarray(column[()], np.float64) * mm_per_unit
-    if len(values) < 2 or not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
-        raise CpunetError(
-            f"{where}: {name} does not ascend from node to node; write the library again"
-        )
-    if np.abs(values).max() > LARGEST_MM:
-        raise CpunetError(
-            f"{where}: {name} reaches {np.abs(values).max():g} mm, beyond any crystal; are its "
-            f"units ({units}) right?"
-        )
-    return values
-
-
-def chosen_libraries(
-    file: h5py.File, source: Path, wanted: Sequence[str], name: str | None
-) -> list[str]:
-    """Paths of the libraries to translate.
-
-    Parameters
-    ----------
-    file, source
-        The file and its name.
-    wanted
-        Names given by the user, or an empty sequence.
-    name
-        Detector that the run was trained with; None if unknown.
-
-    Raises
-    ------
-    CpunetError
-        If there is no library, a named one is missing, or none belongs to the detector of the
-        run.
-    """
-    names = _libraries(file)
-    if not names:
-        raise CpunetError(
-            f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
-            "struct{r, z, dt, t0, waveform_000_deg}"
-        )
-    held = ", ".join(path or "/" for path in names)
-    for name in wanted:
-        if name not in names:
-            raise CpunetError(f"{source}: no library of {name}; the file has {held}")
-    if wanted:
-        return list(dict.fromkeys(wanted))
-    if name is None:
-        return names
-    if name not in names:
-        raise CpunetError(
-            f"{source}: a library of {held}, but the run was trained with a simulation of "
-            f"{name}; give the library of {name}, or `detector` {names[0]} to use this one "
-            "all the same"
-        )
-    return [name]
-
-
-def _libraries(file: h5py.File) -> list[str]:
+def libraries_in(file: h5py.File) -> list[str]:
     """Paths of the groups that hold templates."""
-    groups: set[str] = set()
-
-    def visit(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        group, _, last = name.rpartition("/")
-        if isinstance(item, h5py.Dataset) and WAVEFORM.fullmatch(last):
-            groups.add(group)
-
-    file.visititems(visit)
-    return sorted(groups)
-
-
-def known_detector(run: Run) -> str | None:
-    """Name of the detector whose simulation a run was trained with; None if unknown."""
-    if run.folder is not None:
-        with suppress(CpunetError):  # only a calibrated run has it
-            if name := read_values(run.folder / "detector.yaml").get("name"):
-                return str(name)
-    return run.sim.detector
-
-
-def require_complete(
-    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary
-) -> None:
-    """Raise an error if a library lacks whole rows of grid points between others.
-
-    Raises
-    ------
-    CpunetError
-        If an azimuth has no template, or a row of r or of z has none although rows on both
-        sides of it have.
-    """
-    for angle, mask in inside.items():
-        if not mask.any():
-            raise CpunetError(
-                f"{library.where}: no template of {angle} can be translated; simulate this "
-                "azimuth again, or leave it out"
-            )
-        for name, axis, rows in (
-            ("r", library.r_mm, mask.any(axis=1)),
-            ("z", library.z_mm, mask.any(axis=0)),
-        ):
-            held = np.flatnonzero(rows)
-            missing = np.setdiff1d(np.arange(held[0], held[-1]), held)
-            if len(missing):
-                raise CpunetError(
-                    f"{library.where}: {len(missing)} rows of {angle} are NaN between others, "
-                    f"the first at {name} {axis[missing[0]]:g} mm; simulate these places again"
-                )
+    names: list[str] = []
+    file.visit(names.append)
+    return sorted(
+        {
+            name.rpartition("/")[0]
+            for name in names
+            if WAVEFORM.fullmatch(name.rpartition("/")[2])
+            and isinstance(file[name], h5py.Dataset)
+        }
+    )
 
 
 def put(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
@@ -273,7 +95,7 @@ def merge_libraries(
             with opened(path) as file:
                 names = [
                     name  # times of currents are relative to their maxima
-                    for name in _libraries(file)
+                    for name in libraries_in(file)
                     if name
                     and {"r", "z", "dt", "t0"} <= file[name].keys()
                     and file[name]["t0"][()] < 0
@@ -294,12 +116,7 @@ def merge_libraries(
     return sorted(first)
 
 
-LENGTH_NS = 5000.0  # as in libraries of SolidStateDetectors.jl
-ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
-ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
-
-
-@dataclass
+@dataclass(frozen=True)
 class MadeLibrary:
     """A library of charge pulses that was made.
 
@@ -315,10 +132,10 @@ class MadeLibrary:
     """
 
     path: Path
-    templates: int = 0
-    written: int = 0
-    outside: int = 0
-    late: int = 0
+    templates: int
+    written: int
+    outside: int
+    late: int
 
     def __str__(self) -> str:
         return (
@@ -395,9 +212,9 @@ def make_library(
         np.arange(int(axis[-1] / grid_mm + 1e-6) + 1) * grid_mm
         for axis in (simulator.fields.r_mm, simulator.fields.z_mm)
     )
-    counts = MadeLibrary(out, templates=len(ANGLES_DEG) * len(r_mm) * len(z_mm))
-    shape = (len(r_mm), len(z_mm))
-    with written_hdf5(out) as (made, _), stage("Templates", counts.templates) as bar:
+    shape, counts = (len(r_mm), len(z_mm)), np.zeros(3, int)
+    templates = len(ANGLES_DEG) * len(r_mm) * len(z_mm)
+    with written_hdf5(out) as (made, _), stage("Templates", templates) as bar:
         library = made.create_group(detector.name or "detector")
         put(library, "r", r_mm, "mm")
         put(library, "z", z_mm, "mm")
@@ -406,22 +223,20 @@ def make_library(
         waveforms = np.empty((*shape, wanted.n_samples), np.float32)
         drift_times = np.empty(shape)
         for angle_deg in ANGLES_DEG:
-            waveforms.fill(np.nan)
-            drift_times.fill(np.nan)
             phi = math.radians(angle_deg)
             for i, r in enumerate(r_mm):
                 x, y = r * math.cos(phi), r * math.sin(phi)
                 signals = simulator.signals(x, y, z_mm, ENERGY_KEV)
+                late = signals.valid & ~signals.collected
                 good = signals.valid & signals.collected
-                waveforms[i, good] = signals.waveforms[good]
-                drift_times[i, good] = signals.collection_time_ns[good]
-                counts.written += int(good.sum())
-                counts.outside += int((~signals.valid).sum())
-                counts.late += int((signals.valid & ~signals.collected).sum())
+                waveforms[i] = np.where(good[:, np.newaxis], signals.waveforms, np.nan)
+                drift_times[i] = np.where(good, signals.collection_time_ns, np.nan)
+                counts += [good.sum(), (~signals.valid).sum(), late.sum()]
                 bar.update(len(z_mm))
             put(library, f"waveform_{angle_deg:03d}_deg", waveforms, "")
             put(library, f"drift_time_{angle_deg:03d}_deg", drift_times, "ns")
         describe(library)
-        if not counts.written:
-            raise CpunetError(f"{counts}; give a finer grid or longer records")
-    return counts
+        done = MadeLibrary(out, templates, *counts.tolist())
+        if not done.written:
+            raise CpunetError(f"{done}; give a finer grid or longer records")
+    return done

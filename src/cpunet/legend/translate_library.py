@@ -13,47 +13,49 @@ from __future__ import annotations
 import copy
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Self
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import binary_fill_holes
 
 import cpunet
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened
+from cpunet.hdf5_files import is_column, opened, units_of
 from cpunet.legend.currents import (
     LENGTH,
     PEAK,
     RINGS,
     Floats,
     Values,
-    continued,
+    add_rings,
     currents_about_peak,
     most_frequent,
     padded_axis,
-    with_rings,
 )
-from cpunet.legend.library_files import (
-    PERIOD_NS,
-    IdealLibrary,
-    chosen_libraries,
-    describe,
-    known_detector,
-    put,
-    require_complete,
-)
+from cpunet.legend.library_files import PERIOD_NS, WAVEFORM, describe, libraries_in, put
 from cpunet.networks.response_layer import padding
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.writing import written_hdf5
-from cpunet.training.run import RunLike, used_run
+from cpunet.settings import read_values
+from cpunet.training.run import Run, RunLike, used_run
+from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import BATCH, REN
+from cpunet.units import factor, unit_names
 
 log = logging.getLogger(__name__)
+
+LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
+ROWS = 16  # rows of r read at a time
+MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
+STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
 class TemplateTranslator:
@@ -76,7 +78,7 @@ class TemplateTranslator:
     """
 
     def __init__(self, ren: REN, dt_ns: float) -> None:
-        if ren.backend.chain is None:
+        if not isinstance(ren.backend, ResponseBackend):
             raise CpunetError(
                 "the run's network translates whole pulses, not the templates that they are "
                 "summed from; give a run of the recipe fast"
@@ -86,7 +88,7 @@ class TemplateTranslator:
                 "templates are summed, and get the linear part of the readout alone: its slew "
                 "rate and curve act on the sums"
             )
-        self._chain = copy.deepcopy(ren.backend.chain)
+        self._chain = copy.deepcopy(ren.backend.network)
         self._chain.response.dt_ns[...] = dt_ns
         if self._chain.response.drift is not None:
             self._chain.response.drift.keeps_begin = True  # templates are summed by time
@@ -99,11 +101,6 @@ class TemplateTranslator:
         for rows in blocks(len(templates), BATCH):
             results[rows] = self._chain(templates[rows].astype(np.float32))[:, inside]
         return results
-
-
-ROWS = 16  # rows of r read at a time
-MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
-STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
 
 
 @dataclass(frozen=True)
@@ -215,21 +212,146 @@ def translate_library(
         ideal = [IdealLibrary.of(given, name, source) for name in names]
         made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
         with written_hdf5(out) as (made, _):
-            for charge in ideal:
-                group = made.require_group(charge.path)
-                counted = _write(translate, charge, given[charge.path], group)
+            for name, charge in zip(names, ideal, strict=True):
+                group = made.require_group(name)
+                numbers[name] = _write(translate, charge, group)
                 content = {"cpunet": cpunet.__version__, "rings": RINGS, **made_from}
-                group.attrs["cpunet"] = json.dumps(content | asdict(counted))
+                group.attrs["cpunet"] = json.dumps(content | asdict(numbers[name]))
                 describe(group)
-                numbers[charge.path] = counted
     return TranslatedLibrary(out, numbers)
 
 
+def chosen_libraries(
+    file: h5py.File, source: Path, wanted: Sequence[str], name: str | None
+) -> list[str]:
+    """Paths of the libraries to translate.
+
+    Parameters
+    ----------
+    file, source
+        The file and its name.
+    wanted
+        Names given by the user, or an empty sequence.
+    name
+        Detector that the run was trained with; None if unknown.
+
+    Raises
+    ------
+    CpunetError
+        If there is no library, a named one is missing, or none belongs to the detector of the
+        run.
+    """
+    names = libraries_in(file)
+    if not names:
+        raise CpunetError(
+            f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "
+            "struct{r, z, dt, t0, waveform_000_deg}"
+        )
+    held = ", ".join(path or "/" for path in names)
+    chosen = list(dict.fromkeys(wanted)) or ([name] if name else names)
+    for missing in (path for path in chosen if path not in names):
+        if wanted:
+            raise CpunetError(f"{source}: no library of {missing}; the file has {held}")
+        raise CpunetError(
+            f"{source}: a library of {held}, but the run was trained with a simulation of "
+            f"{name}; give the library of {name}, or `detector` {names[0]} to use this one "
+            "all the same"
+        )
+    return chosen
+
+
+def known_detector(run: Run) -> str | None:
+    """Name of the detector whose simulation a run was trained with; None if unknown."""
+    if run.folder is not None:
+        with suppress(CpunetError):  # only a calibrated run has it
+            if name := read_values(run.folder / "detector.yaml").get("name"):
+                return str(name)
+    return run.sim.detector
+
+
+@dataclass(frozen=True, eq=False)
+class IdealLibrary:
+    """Templates of charge of a detector in a file, sampled every nanosecond.
+
+    Attributes
+    ----------
+    where
+        File and group, for messages.
+    group
+        The group.
+    r_mm, z_mm
+        Grid points.
+    angles
+        Azimuths such as ``"000_deg"``, ascending.
+    """
+
+    where: str
+    group: h5py.Group
+    r_mm: Values
+    z_mm: Values
+    angles: tuple[str, ...]
+
+    @classmethod
+    def of(cls, file: h5py.File, path: str, source: Path) -> Self:
+        """Read the axes of a library.
+
+        Raises
+        ------
+        CpunetError
+            If the library does not follow the schema, or its templates are not sampled every
+            nanosecond.
+        """
+        where, group = f"{source}: {path or '/'}", file[path or "/"]
+        if not path:
+            raise CpunetError(
+                f"{source}: the library stands at the top of the file; production finds it "
+                "under the detector's name: write it into a group of this name"
+            )
+        if missing := sorted({"r", "z", "dt"} - set(group)):
+            raise CpunetError(
+                f"{where}: no {missing[0]} with the waveforms; complete the library"
+            )
+        r_mm, z_mm = (_axis(group[name], f"{where}: {name}") for name in ("r", "z"))
+        dt, units = group["dt"], units_of(group["dt"])
+        dt_ns = (factor(units, "ns") or np.nan) * dt[()].item() if is_column(dt) else np.nan
+        if not np.isclose(dt_ns, PERIOD_NS):
+            raise CpunetError(
+                f"{where}: sampled every {dt_ns:g} ns (dt in {str(units)!r}), production reads "
+                "templates of 1 ns; make the library with a period of 1 ns"
+            )
+        names = sorted(filter(WAVEFORM.fullmatch, group))
+        for name in names:
+            values = group[name]
+            numbers = isinstance(values, h5py.Dataset) and values.dtype.kind in "iuf"
+            shape: tuple[int, ...] = values.shape if numbers else ()
+            if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 3:
+                raise CpunetError(
+                    f"{where}/{name}: shape {shape} with r and z of {len(r_mm)} and "
+                    f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
+                )
+        angles = tuple(name.removeprefix("waveform_") for name in names)
+        return cls(where, group, r_mm, z_mm, angles)
+
+
+def _axis(column: h5py.Dataset, where: str) -> Values:
+    """Grid points in mm."""
+    units = units_of(column)
+    if (mm_per_unit := factor(units, "mm")) is None:
+        raise CpunetError(f"{where} is in {units!r}; expected one of {unit_names('mm')}")
+    numbers = is_column(column) and column.ndim == 1 and len(column) > 1
+    values = np.asarray(column[()] if numbers else [0, 0], np.float64) * mm_per_unit
+    if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
+        raise CpunetError(f"{where} does not ascend from node to node; write the library again")
+    if np.abs(values).max() > LARGEST_MM:
+        raise CpunetError(
+            f"{where} reaches {np.abs(values).max():g} mm, beyond any crystal; are its "
+            f"units ({units}) right?"
+        )
+    return values
+
+
 def _write(
-    translate: TemplateTranslator,
-    library: IdealLibrary,
-    given: h5py.Group,
-    group: h5py.Group,
+    translate: TemplateTranslator, library: IdealLibrary, group: h5py.Group
 ) -> LibraryNumbers:
     """Write currents, and drift times within the crystal and about it."""
     step = np.zeros((1, STEP_LENGTH), np.float32)
@@ -239,26 +361,26 @@ def _write(
     z_mm = padded_axis(library.z_mm, RINGS, RINGS)
     shape, inner = (len(r_mm), len(z_mm)), np.s_[: len(library.r_mm), RINGS : len(z_mm) - RINGS]
     currents, times = dict[str, Floats](), dict[str, Values]()
+    templates = len(library.r_mm) * len(library.z_mm) * len(library.angles)
     not_ending = 0
-    with stage(f"Translating {library.path}", library.n_templates) as bar:
+    with stage(f"Translating {library.group.name.strip('/')}", templates) as bar:
         for angle in library.angles:
             currents[angle] = np.full((*shape, LENGTH), np.nan, np.float32)
             times[angle] = np.full(shape, np.nan)
             within = currents[angle][inner], times[angle][inner]
-            for rows, charge in _blocks(given[f"waveform_{angle}"], library):
-                held = ~np.isnan(charge[:, :, 0])
-                templates = charge[held]
-                within[0][rows][held], when = currents_about_peak(translate(templates))
+            for rows in blocks(len(library.r_mm), ROWS):
+                held, charge = _held(library, f"waveform_{angle}", rows)
+                within[0][rows][held], when = currents_about_peak(translate(charge))
                 within[1][rows][held] = when - delay_ns
-                ends, heights = templates[:, -1], np.abs(templates).max(axis=1)
-                not_ending += int((np.isfinite(when) & (ends < MIN_END * heights)).sum())
+                late = charge[:, -1] < MIN_END * np.abs(charge).max(axis=1)
+                not_ending += int((np.isfinite(when) & late).sum())
                 bar.update(held.size)
     inside = {angle: np.isfinite(when[inner]) for angle, when in times.items()}
     translated = sum(int(mask.sum()) for mask in inside.values())
     if not translated:
         raise CpunetError(
-            f"{library.where}: none of {library.n_templates} templates can be translated; are "
-            "they charge pulses?"
+            f"{library.where}: none of {templates} templates can be translated; are they "
+            "charge pulses?"
         )
     if 2 * not_ending > translated:
         raise CpunetError(
@@ -266,7 +388,7 @@ def _write(
             "maximum: these are currents, of negative sign, or behind electronics already; "
             "give the library of charge pulses"
         )
-    require_complete(inside, library)
+    _require_complete(inside, library)
     amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
     mode = most_frequent(np.concatenate(amplitudes).astype(float))
 
@@ -277,33 +399,64 @@ def _write(
     padded = healed = 0
     for angle, mask in inside.items():
         currents[angle] /= np.float32(mode)
-        put(group, f"waveform_{angle}", with_rings(currents.pop(angle)), "")
-        filled = continued(times[angle])
-        put(group, f"drift_time_{angle}", filled.astype(np.float32), "ns")
-        padded += int(np.isfinite(filled).sum() - mask.sum())
-        healed += int((np.isfinite(filled[inner]) & ~mask & binary_fill_holes(mask)).sum())
-    return LibraryNumbers(library.n_templates, translated, padded, healed, mode, delay_ns)
+        add_rings(currents[angle], times[angle])
+        put(group, f"waveform_{angle}", currents.pop(angle), "")
+        put(group, f"drift_time_{angle}", times[angle].astype(np.float32), "ns")
+        filled = np.isfinite(times[angle])
+        padded += int(filled.sum() - mask.sum())
+        healed += int((filled[inner] & ~mask & binary_fill_holes(mask)).sum())
+    return LibraryNumbers(templates, translated, padded, healed, mode, delay_ns)
 
 
-def _blocks(given: h5py.Dataset, library: IdealLibrary) -> Iterator[tuple[slice, Floats]]:
-    """Rows of charge templates, NaN for those of only zeros.
+def _held(
+    library: IdealLibrary, name: str, rows: slice
+) -> tuple[npt.NDArray[np.bool_], Floats]:
+    """Which grid points of some rows hold a template, and these; only zeros are none.
 
     Raises
     ------
     CpunetError
         If only a part of a template is NaN.
     """
-    for first in range(0, given.shape[0], ROWS):
-        charge = np.array(given[first : first + ROWS], np.float32)
-        bad = np.isnan(charge)
-        part = bad.any(axis=2) & ~bad.all(axis=2)
-        if part.any():
-            i, j = np.argwhere(part)[0]
+    charge = np.array(library.group[name][rows], np.float32)
+    missing = np.isnan(charge)
+    part = missing.any(axis=2) & ~missing.all(axis=2)
+    if part.any():
+        i, j = np.argwhere(part)[0]
+        raise CpunetError(
+            f"{library.where}: {int(part.sum())} templates hold NaN among their samples, the "
+            f"first at r {library.r_mm[rows][i]:g}, z {library.z_mm[j]:g} mm of {name}; "
+            "simulate the library again, with longer records if charge was late"
+        )
+    held = charge.any(axis=2) & ~missing[:, :, 0]
+    return held, charge[held]
+
+
+def _require_complete(
+    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary
+) -> None:
+    """Raise an error if a library lacks whole rows of grid points between others.
+
+    Raises
+    ------
+    CpunetError
+        If an azimuth has no template, or a row of r or of z has none although rows on both
+        sides of it have.
+    """
+    for angle, mask in inside.items():
+        if not mask.any():
             raise CpunetError(
-                f"{library.where}: {int(part.sum())} templates hold NaN among their samples, "
-                f"the first at r {library.r_mm[first + i]:g}, z {library.z_mm[j]:g} mm of "
-                f"{given.name}; simulate the library again, with longer records if "
-                "charge was late"
+                f"{library.where}: no template of {angle} can be translated; simulate this "
+                "azimuth again, or leave it out"
             )
-        charge[~charge.any(axis=2)] = np.nan
-        yield slice(first, first + len(charge)), charge
+        for name, axis, rows in (
+            ("r", library.r_mm, mask.any(axis=1)),
+            ("z", library.z_mm, mask.any(axis=0)),
+        ):
+            held = np.flatnonzero(rows)
+            missing = np.setdiff1d(np.arange(held[0], held[-1]), held)
+            if len(missing):
+                raise CpunetError(
+                    f"{library.where}: {len(missing)} rows of {angle} are NaN between others, "
+                    f"the first at {name} {axis[missing[0]]:g} mm; simulate these places again"
+                )

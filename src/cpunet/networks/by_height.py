@@ -119,7 +119,7 @@ def _fine(knots: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 @kernel
 def _add(signal: Any, added: Any, per_kev: float) -> None:  # pragma: no cover - compiled
-    """Add what depends on the height alone, in place: a line below 0, nothing beyond the top."""
+    """Add what depends on the height alone, in place: a line below 0, nothing above."""
     last = len(added) - 1
     for row in range(len(signal)):
         for i in range(signal.shape[1]):

@@ -231,7 +231,7 @@ class Sides:
         return [self.read(clean, heights, draw) for draw in draws]
 
     def read(self, clean: FloatArray, heights: Floats, draw: int | None = None) -> Aligned:
-        """Records of prepared height with a draw of noise, or none, read behind the electronics."""
+        """Records of prepared height, with a draw of noise or none, behind the electronics."""
         records = clean if draw is None else self.noise.add(clean, draw)
         if self.by_height is not None:
             height = heights[:, np.newaxis].astype(np.float32)

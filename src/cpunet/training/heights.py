@@ -24,8 +24,8 @@ from cpunet.training.chain_parameters import SmoothParameters, with_settings
 from cpunet.training.comparison import Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
 
-# Stages: most pulses of a side, width of the bounded functions, least error of a quantile (those
-# of a limited current are all but equal), and share by which a step must lower the cost.
+# Stages: most pulses of a side, width of the bounded functions, least error of a quantile
+# (those of a limited current are all but equal), share by which a step must lower the cost.
 STAGES = ((512, 60.0, 3e-3, 0.03), (512, 6.0, 1e-3, 0.03), (1024, 1.5, 2e-4, 0.003))
 MOST = 2048  # pulses that are fitted, and as many that are held out
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps

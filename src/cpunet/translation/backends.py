@@ -11,15 +11,10 @@ import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
-from cpunet.electronics.finishing import finish, padding, with_room
+from cpunet.electronics.finishing import extended, finish, padding, with_room
 from cpunet.networks import require_torch
 from cpunet.networks.by_height import ByHeight
-from cpunet.networks.generators import (
-    KeptNoise,
-    LinearInverse,
-    Residual,
-    ResponseGenerator,
-)
+from cpunet.networks.generators import KeptNoise, LinearInverse, Residual, ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig, PunetConfig
@@ -29,6 +24,7 @@ if TYPE_CHECKING:
     from cpunet.training.adversarial import Generator
 
 Energies = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating]
 Inverse = LinearInverse | Residual  # arrays of windows → pulses
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 
@@ -53,7 +49,8 @@ class Batch:
         Piled-up pulses within the records.
     trace
         Samples of a raw trace before the alignment of a pulse without noise, and all; None for
-        windows.
+        windows.  A network knows its windows alone: beyond them traces are the baseline, and
+        the decay fitted to their end, both without noise.
     """
 
     windows: FloatArray
@@ -66,12 +63,13 @@ class Batch:
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Batch:
         """The same for some of the pulses."""
+        piled = None if self.piled is None else self.piled.of_rows(rows)
         return replace(
             self,
             windows=self.windows[rows],
             energy_kev=None if self.energy_kev is None else self.energy_kev[rows],
             tails_kev=None if self.tails_kev is None else self.tails_kev[rows],
-            piled=None if self.piled is None else self.piled.of_rows(rows),
+            piled=piled if piled is not None and len(piled.row) else None,
         )
 
 
@@ -118,30 +116,24 @@ class Backend(ABC):
     tails: DrawnTails | None = None
     by_height: ByHeight | None = None
 
-    @property
-    def chain(self) -> ResponseGenerator | None:
-        """Readout chain, which gives traces of any length."""
-        return self.network if isinstance(self.network, ResponseGenerator) else None
-
     @abstractmethod
     def translate(self, batch: Batch) -> Translated:
         """Translate a batch of windows."""
 
-    def finished(self, records: FloatArray, windows: FloatArray, batch: Batch) -> Translated:
+    def finished(
+        self, records: FloatArray, batch: Batch, shapes: Floats | None = None
+    ) -> Translated:
         """Records with noise in proportion to 1/energy and other pulses, prepared like data.
 
-        `windows` are those of which `shapes` makes the other pulses.
+        `shapes` are records of the piled-up pulses, see `InTracePileUp.added`.
         """
-        energy_kev, piled, added = batch.energy_kev, batch.piled, None
-        if energy_kev is not None and (batch.tails_kev is not None or piled is not None):
-            added = np.zeros(records.shape)
-            if batch.tails_kev is not None and self.tails is not None:
-                left = batch.tails_kev * self.tails.height / energy_kev
-                added += left[:, np.newaxis] * self.tails.decay(records.shape[1])
-            if piled is not None and len(piled.row):
-                # with shapes of the same batch; early ones need longer records
-                shapes = self.shapes(windows[piled.partner], piled.reach(self.dt_ns))
-                added += piled.added(shapes, energy_kev, self.dt_ns, records.shape[1])
+        energy_kev, added = batch.energy_kev, None
+        if energy_kev is not None and batch.tails_kev is not None and self.tails is not None:
+            left = batch.tails_kev * self.tails.height / energy_kev
+            added = left[:, np.newaxis] * self.tails.decay(records.shape[1])
+        if energy_kev is not None and batch.piled is not None and shapes is not None:
+            piled = batch.piled.added(shapes, energy_kev, self.dt_ns, records.shape[1])
+            added = piled if added is None else added + piled
         done = finish(
             records,
             self.config,
@@ -153,10 +145,6 @@ class Backend(ABC):
             by_height=self.by_height,
         )
         return Translated(done.windows, done.codes, done.begin - padding(self.dt_ns)[0])
-
-    def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
-        """Records in prepared units, longer by `reach`, for piled-up pulses."""
-        raise NotImplementedError
 
 
 class NetworkBackend(Backend):
@@ -178,15 +166,23 @@ class NetworkBackend(Backend):
             else:
                 out = self.network(given)
         clean: FloatArray = out.cpu().numpy()
-        if length < clean.shape[1]:  # records
-            first = padding(self.dt_ns)[0]
-            return self.finished(clean, clean[:, first : first + length], batch)
-        if self.noise is None or not batch.noise:
-            return Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
-        return self.finished(with_room(clean, self.config, self.dt_ns), clean, batch)
-
-    def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
-        return with_room(windows, self.config, self.dt_ns, reach)
+        records = shapes = None
+        if length < clean.shape[1]:
+            records, first = clean, padding(self.dt_ns)[0]
+            clean = records[:, first : first + length]
+        elif self.noise is not None and batch.noise:
+            records = with_room(clean, self.config, self.dt_ns)
+        if (piled := batch.piled) is not None:
+            others, reach = clean[piled.partner], piled.reach(self.dt_ns)
+            shapes = with_room(others, self.config, self.dt_ns, reach)
+        done = Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
+        if records is not None:
+            done = self.finished(records, batch, shapes)
+        if batch.trace is None:
+            return done
+        n_pre, length = batch.trace
+        traces = extended(done.windows, self.config, self.dt_ns, length, n_pre)
+        return Translated(traces, done.codes, done.begin - n_pre + self.config.samples_before)
 
 
 class ResponseBackend(Backend):
@@ -197,57 +193,58 @@ class ResponseBackend(Backend):
     def translate(self, batch: Batch) -> Translated:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         windows, energies, piled = batch.windows, batch.energy_kev, batch.piled
+        # early piled-up pulses need longer records
+        reach = 0 if piled is None else piled.reach(self.dt_ns)
         if batch.trace is None:
-            return self.finished(self.network(windows), windows, batch)
+            shapes: Floats | None = None
+            if piled is not None:
+                others = np.pad(windows[piled.partner], ((0, 0), (0, reach)), mode="edge")
+                records, clean = self._clean(others)
+                scale = np.full(len(records), np.median(clean.scale))
+                scale[clean.index] = clean.scale
+                shapes = records / scale[:, np.newaxis]
+            return self.finished(self.network(windows), batch, shapes)
+
         n_pre, length = batch.trace
         assert energies is not None  # those of the pulses
-        levels, codes, begin, charge = self._levels(windows, n_pre, length)
+        levels, clean, first = self._levels(windows, n_pre, length)
         noise = np.zeros_like(levels)
         if batch.noise and self.noise is not None:
             noise += self.noise.draw(energies, length, batch.generator)
-        if piled is not None and len(piled.row):
-            # early piled-up pulses need longer traces
-            reached = length + piled.reach(self.dt_ns)
-            shapes = self._levels(windows[piled.partner], n_pre, reached)[0]
-            levels += piled.added(np.nan_to_num(shapes), energies, self.dt_ns, length)
+        if piled is not None:
+            others = self._levels(windows[piled.partner], n_pre, length + reach)[0]
+            levels += piled.added(np.nan_to_num(others), energies, self.dt_ns, length)
         if self.by_height is None:
             levels += noise
         else:
+            charge = np.ones((len(windows), 1), np.float32)
+            charge[clean.index] = clean.scale[:, np.newaxis]
             levels = self.by_height(levels * charge, energies, noise * charge) / charge
-        return Translated(levels, codes, begin)
+        begin = np.zeros(len(windows), np.int64)
+        begin[clean.index] = clean.align_sample - first
+        return Translated(levels, clean.codes, begin)
 
     def _levels(
         self, windows: FloatArray, n_pre: int, length: int
-    ) -> tuple[FloatArray, Codes, npt.NDArray[np.int64], FloatArray]:
-        """Noise-free traces, aligned at sample `n_pre`, their codes, begins and charge."""
+    ) -> tuple[FloatArray, Prepared, int]:
+        """Noise-free traces, aligned at sample `n_pre`, how, and where the windows begin."""
         before = max(0, n_pre - self.config.samples_before)
         after = max(0, length - n_pre - self.config.samples_after)
         # before the window no charge has moved, after it all charge has been collected
-        long = np.pad(windows, ((0, 0), (before, after)), mode="edge")
-        records, clean = self._clean(long)
+        records, clean = self._clean(np.pad(windows, ((0, 0), (before, after)), mode="edge"))
         source = clean.align_sample[:, np.newaxis] - n_pre + np.arange(length)
         source = source.clip(0, records.shape[1] - 1)
         level = np.take_along_axis(records[clean.index], source, axis=1)
         levels = np.full((len(windows), length), np.nan, np.float32)
-        height = clean.scale[:, np.newaxis]
-        levels[clean.index] = (level - clean.baseline[:, np.newaxis]) / height
-        begin = np.zeros(len(windows), np.int64)
-        begin[clean.index] = clean.align_sample - n_pre - before - padding(self.dt_ns)[0]
-        charge = np.ones((len(windows), 1), np.float32)
-        charge[clean.index] = height
-        return levels, clean.codes, begin, charge
+        baseline, scale = clean.baseline[:, np.newaxis], clean.scale[:, np.newaxis]
+        levels[clean.index] = (level - baseline) / scale
+        return levels, clean, n_pre + before + padding(self.dt_ns)[0]
 
     def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
         """Records without noise, and the same prepared; flat tops do not count as saturated."""
         records = self.network(windows)
         config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
         return records, prepare(Pulses.of(records, dt_ns=self.dt_ns), config, "measured")
-
-    def shapes(self, windows: FloatArray, reach: int) -> npt.NDArray[np.floating]:
-        records, clean = self._clean(np.pad(windows, ((0, 0), (0, reach)), mode="edge"))
-        scale = np.full(len(records), np.median(clean.scale))
-        scale[clean.index] = clean.scale
-        return records / scale[:, np.newaxis]
 
 
 class InverseBackend(Backend):
@@ -302,13 +299,6 @@ def backend_of(run: Run, part: str, device: str) -> Backend:
         inverse.residual = residual
         return InverseBackend(inverse, config, dt_ns)
     chain = run.fill(part, ResponseGenerator(generator, dt_ns))
-    chain.tails, chain.residual = run.tails, residual
-    return response_backend(chain, config)
-
-
-def response_backend(chain: ResponseGenerator, config: PreparationConfig) -> ResponseBackend:
-    """The backend of a readout chain."""
-    response = chain.response
-    return ResponseBackend(
-        chain, config, float(response.dt_ns), chain.noise, chain.tails, response.by_height
-    )
+    chain.residual = residual
+    by_height = chain.response.by_height
+    return ResponseBackend(chain, config, dt_ns, chain.noise, run.tails, by_height)

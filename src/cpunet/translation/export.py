@@ -88,14 +88,30 @@ def export_onnx(
     for path in (out, noise_file):
         refuse_existing(path, run.folder, force=force)
     kind: type[Translator] = IREN if inverse else REN
-    translator = kind.of(run)
-    noise = translator.backend.noise
+    backend, length = kind.of(run).backend, run.recipe.preparation.length
     facts = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed, "dt_ns": run.dt_ns}
     with stage("Exporting"), written_aside(out) as aside:
-        needed("onnx")
-        graph = graph_of(translator.backend.network, run.recipe.preparation.length)
-        difference = write_onnx(graph, aside, {"cpunet": cpunet.__version__, **facts})
-        if noise is not None:
+        checker = needed("onnx").checker
+        model, latent, expected = graph_of(backend.network, length)
+        model.ir_version = FORMAT
+        for name, value in {"cpunet": cpunet.__version__, **facts}.items():
+            model.metadata_props.add(key=name, value=str(value))
+        checker.check_model(model)
+        aside.write_bytes(model.SerializeToString())
+
+        runtime = needed("onnxruntime")
+        session = runtime.InferenceSession(str(aside), providers=["CPUExecutionProvider"])
+        difference = 0.0
+        for n in CHECKED:
+            given = examples(n, length, latent)
+            (output,) = session.run(None, given)
+            wrong = np.abs(output - expected(*given.values()))
+            difference = max(difference, float(wrong.max()))
+        if not difference <= TOLERANCE:
+            raise CpunetError(
+                f"{out}: the exported graph differs from the run by {difference:.1e}"
+            )
+        if (noise := backend.noise) is not None:
             spectra: Any = {"continua": noise.kinds, "lines": noise.lines}
             spectra |= {"shares": noise.shares, "samples": noise.samples, "dt_ns": noise.dt_ns}
             with written_aside(noise_file) as stored, stored.open("wb") as stream:
@@ -105,99 +121,56 @@ def export_onnx(
     return Export(out, None if noise is None else noise_file, difference)
 
 
-Inputs = dict[str, FloatArray]
-
-
-@dataclass(frozen=True)
-class Graph:
-    """An ONNX model, inputs of a number of pulses, and what the run makes of these."""
-
-    model: Any
-    example: Callable[[int], Inputs]
-    expected: Callable[[Inputs], FloatArray]
-
-
-def graph_of(network: Any, length: int) -> Graph:
+def graph_of(
+    network: Any, length: int
+) -> tuple[Any, tuple[int, ...], Callable[..., FloatArray]]:
     """What can be exported of the network, chain or inverse of a run, for windows of a length.
 
     Inputs: prepared ``windows`` (batch, samples) and for a network ``epsilon``, either zeros
     for the latent mean or drawn from N(0, 1).  Output: ``translated`` windows of a network,
     unprepared ``records`` of a readout chain, ``pulses`` of its inverse.
+
+    Returns
+    -------
+    model
+        Of ONNX.
+    latent
+        Shape of a draw, empty without.
+    expected
+        What the run makes of inputs.
     """
-
-    def windows(n: int) -> Inputs:
-        """Prepared pulses with edges of several widths and positions."""
-        rng = np.random.default_rng(n)
-        width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
-        charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
-        return {"windows": charge.astype(np.float32)}
-
     behind = getattr(network, "linear", None) or getattr(network, "residual", None)
     if behind is not None:
         raise CpunetError(
             "ONNX graphs have a readout or a network, this run has both in series; export one "
             "of the recipe fast"
         )
+    if isinstance(network, LinearInverse):
+        return inverse_model(network), (), network
     if isinstance(network, ResponseGenerator):
         if network.response.by_height is not None:
             raise CpunetError(
                 "the electronics of this run act by the height of a pulse, and a graph has no "
                 "energies; train on one line alone for the linear part"
             )
-        model = chain_model(network.response, length)
-        return Graph(model, windows, lambda given: network(given["windows"]))
-    if isinstance(network, LinearInverse):
-        model = inverse_model(network)
-        return Graph(model, windows, lambda given: network(given["windows"]))
+        return chain_model(network.response, length), (), network
     needed("onnxscript")
-    from cpunet.translation.onnx_network import NetworkGraph
+    from cpunet.translation.onnx_network import network_model
 
-    graph = NetworkGraph(network.unet)
-
-    def with_epsilon(n: int) -> Inputs:
-        drawn = np.random.default_rng(n).normal(size=(n, *graph.latent)).astype(np.float32)
-        return windows(n) | {"epsilon": drawn}
-
-    return Graph(graph.model(with_epsilon(2)), with_epsilon, graph.expected)
+    latent = network.unet.latent_mean.out_channels, length // 16
+    model, expected = network_model(network.unet, examples(2, length, latent))
+    return model, latent, expected
 
 
-def write_onnx(graph: Graph, path: Path, facts: dict[str, Any]) -> float:
-    """Write a graph of any batch size, and compare the file's output with that of the run.
-
-    Parameters
-    ----------
-    graph
-        Result of `graph_of`.
-    path
-        File to write.
-    facts
-        Metadata of the file.
-
-    Returns
-    -------
-    float
-        Largest difference of any sample.
-
-    Raises
-    ------
-    CpunetError
-        If a package is missing or the file differs from the run by more than 1e-4.
-    """
-    graph.model.ir_version = FORMAT
-    for name, value in facts.items():
-        graph.model.metadata_props.add(key=name, value=str(value))
-    needed("onnx").checker.check_model(graph.model)
-    path.write_bytes(graph.model.SerializeToString())
-    providers = ["CPUExecutionProvider"]
-    session = needed("onnxruntime").InferenceSession(str(path), providers=providers)
-    worst = 0.0
-    for n in CHECKED:
-        given = graph.example(n)
-        (output,) = session.run(None, given)
-        worst = max(worst, float(np.abs(output - graph.expected(given)).max()))
-    if not worst <= TOLERANCE:
-        raise CpunetError(f"{path}: the exported graph differs from the run by {worst:.1e}")
-    return worst
+def examples(n: int, length: int, latent: tuple[int, ...]) -> dict[str, FloatArray]:
+    """Inputs of a graph: pulses with edges of several widths and positions, and a draw."""
+    rng = np.random.default_rng(n)
+    width, at = rng.uniform(2, 12, (n, 1)), length // 2 - rng.uniform(10, 60, (n, 1))
+    charge = 1 / (1 + np.exp(-(np.arange(length) - at) / width))
+    given = {"windows": charge.astype(np.float32)}
+    if latent:
+        given["epsilon"] = rng.normal(size=(n, *latent)).astype(np.float32)
+    return given
 
 
 def needed(package: str) -> Any:

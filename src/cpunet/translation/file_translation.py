@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,19 @@ import numpy as np
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
-from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.outputs import refuse_existing
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import stage
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import rejections_of
 from cpunet.pulses.provenance import TRANSLATED_BY, TRANSLATION, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.pulses.writing import PulseWriter, other_columns
+from cpunet.tables import counted
 from cpunet.training.run import RunLike, as_run, resolve_device
 from cpunet.translation.forms import Form
 from cpunet.translation.options import TranslateOptions
+from cpunet.translation.translation import Counts, Translation
 from cpunet.translation.translator import (
     IREN,
     NOISE_ROWS,
@@ -38,42 +40,10 @@ from cpunet.translation.translator import (
 
 log = logging.getLogger(__name__)
 
-BLOCK_SIZE = 4096  # pulses read at a time; fewer if traces are long
-BLOCK_SAMPLES = 1 << 24
 OWN_COLUMNS = frozenset(
     {"waveform", "energy", "event_number", "rejection", "tails_kev"}
     | {"n_piled", "piled_kev", "piled_ns"}
 )
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Numbers of rows: read, translated, rejected by reason, and saturated ones in ADC.
-
-    Of several files also their number, and how many existed already; 1 or 0 for a single file.
-    """
-
-    read: int = 0
-    translated: int = 0
-    rejections: dict[str, int] = field(default_factory=dict)
-    saturated: int = 0
-    files: int | None = None
-    skipped: int = 0
-
-    @classmethod
-    def of(cls, block: TranslatedPulses) -> Counts:
-        """Count the rows of a block."""
-        saturated = 0 if block.saturated is None else int(block.saturated.sum())
-        return cls(len(block.codes), int(block.valid.sum()), block.rejections, saturated)
-
-    def __add__(self, other: Counts) -> Counts:
-        return Counts(
-            self.read + other.read,
-            self.translated + other.translated,
-            dict(Counter(self.rejections) + Counter(other.rejections)),
-            self.saturated + other.saturated,
-            skipped=self.skipped + other.skipped,
-        )
 
 
 class FileTranslation:
@@ -104,22 +74,15 @@ class FileTranslation:
         force: bool = False,
     ) -> None:
         self.run, self.options, self.resume, self.force = as_run(run), options, resume, force
-        self.kind: type[Translator] = IREN if options.inverse else REN
-        self.translator = self.kind.of(self.run, resolve_device("auto", self.run.recipe))
+        kind = IREN if options.inverse else REN
+        self.translator: Translator = kind.of(self.run, resolve_device("auto", self.run.recipe))
         self.form = Form(self.run, self.translator, options)
-        identity = f"{self.run.weights_sha256}{self.run.recipe!r}"
-        self._print = hashlib.sha256(identity.encode()).hexdigest()
+        adc = options.adc is not None
+        self.result = partial(Translation, self.run.name, self.run.recipe, adc=adc)
 
-    def warn(self) -> None:
-        """Say what the user should know of the output."""
-        if self.form.fills_in:
-            window = self.translator.recipe.preparation.length
-            log.warning(
-                f"a network knows windows of {window} samples alone; beyond them stand "
-                "baseline and decay without noise"
-            )
-
-    def __call__(self, source: PulseFile, out: Path, noise_key: str | None = None) -> Counts:
+    def __call__(
+        self, source: PulseFile, out: Path, noise_key: str | None = None
+    ) -> Translation:
         """Translate a file, block by block, with its rows and other columns.
 
         Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
@@ -141,23 +104,28 @@ class FileTranslation:
             If source or output cannot be used, no pulse can be translated, the source changes
             meanwhile, or another process writes the same output.
         """
-        refuse_inputs(out, self.run.folder, *source.files)
+        resume = self.resume and not self.force
+        refuse_existing(out, self.run.folder, *source.files, force=self.force or resume)
         before = source_print(source)
-        options = asdict(self.options) | {"noise_key": noise_key}
-        provenance = {"source": before, "run": self._print, "options": options}
-        if self.resume and not self.force and out.exists():
-            return replace(finished(out, provenance), skipped=1)
-        refuse_existing(out, force=self.force)
+        made_by = f"{self.run.weights_sha256}{self.run.recipe!r}"
+        provenance = {
+            "source": before,
+            "run": hashlib.sha256(made_by.encode()).hexdigest(),
+            "options": asdict(self.options) | {"noise_key": noise_key},
+        }
+        if resume and out.exists():
+            return self.result(replace(finished(out, provenance), skipped=1), path=out)
         counts = Counts()
         give_back_large_arrays()
-        with self._opened(source) as pulses, self.writer(out, force=self.force) as writer:
+        with source.open() as pulses, self.writer(out, force=self.force) as writer:
             read_others, left_out = other_columns(pulses, OWN_COLUMNS)
             for column, reason in left_out.items():
                 log.warning(f"{source.path.name}: column {column} is left out: {reason}")
-            for block in self._blocks(pulses, noise_key):
+            for block, counts_after in self._blocks(source, pulses, noise_key):
                 others = read_others(counts.read, len(block.codes))
-                writer.append(block.pulses, {**block.columns, **others})
-                counts += Counts.of(block)
+                columns = {"rejection": (block.codes, ""), **block.truth, **others}
+                writer.append(block.pulses, columns)
+                counts = counts_after
             if source_print(source) != before:
                 raise CpunetError(
                     f"{source.path}: changed while it was read; translate it once it is "
@@ -166,101 +134,73 @@ class FileTranslation:
             record = provenance | {"counts": asdict(counts), "cpunet": cpunet.__version__}
             # options given from Python may be numbers of NumPy
             writer.annotate(TRANSLATION, json.dumps(record, default=np.generic.item), file=True)
-        return counts
+        return self.result(counts, path=out)
 
-    def in_memory(self, source: PulseFile) -> TranslatedPulses:
-        """Translated pulses of a file, the same as those of `__call__`.
+    def in_memory(self, source: PulseFile) -> Translation:
+        """Translate a file, or pulses, to the same pulses as `__call__`, without writing them.
 
         Raises
         ------
         CpunetError
             If the source cannot be used, or no pulse can be translated.
         """
-        with self._opened(source) as pulses:
-            return TranslatedPulses.joined(list(self._blocks(pulses, None)))
-
-    def _opened(self, source: PulseFile) -> PulseSource:
-        """Open a file of pulses that this run can translate."""
-        pulses = source.open()
-        self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
-        remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
-        if pulses.attrs.get(TRANSLATED_BY):
-            remedy = f"translate the {self.kind.takes} ones that they were made of"
-        require_side(pulses, self.kind.takes, remedy, insist=source.insist)
-        return pulses
+        with source.open() as pulses:
+            parts, counts = zip(*self._blocks(source, pulses, None), strict=True)
+        done = TranslatedPulses.joined(parts)
+        return self.result(counts[-1], in_memory=done, writer=self.writer)
 
     def writer(self, out: Path, *, force: bool) -> PulseWriter:
         """Return a writer of translated pulses."""
+        part = self.translator.part
         return PulseWriter(
             out,
-            table=self.options.table or f"geds/{self.kind.part}",
+            table=self.options.table or f"geds/{part}",
             waveform_units="ADC" if self.options.adc else "",
-            attrs={TRANSLATED_BY: f"cpunet {self.kind.part}", "run": self.run.name},
+            attrs={TRANSLATED_BY: f"cpunet {part}", "run": self.run.name},
             samples=self.form.samples,
             force=force,
         )
 
-    def _blocks(self, pulses: PulseSource, noise_key: str | None) -> Iterator[TranslatedPulses]:
-        """Translate block by block; the noise depends only on the order of the pulses."""
-        size = max(1, min(BLOCK_SIZE, BLOCK_SAMPLES // pulses.length))  # fits in memory
+    def _blocks(
+        self, source: PulseFile, pulses: PulseSource, noise_key: str | None
+    ) -> Iterator[tuple[TranslatedPulses, Counts]]:
+        """Translate block by block, with the counts so far.
+
+        The noise depends only on the order of the pulses.
+        """
+        takes = self.translator.takes
+        self.translator.require_sampling(f"{source.path}:", pulses.dt_ns)
+        remedy = f"{'leave out' if self.options.inverse else 'give'} `inverse`"
+        if pulses.attrs.get(TRANSLATED_BY):
+            remedy = f"translate the {takes} ones that they were made of"
+        require_side(pulses, takes, remedy, insist=source.insist)
         counts = Counts()
         with stage("Translating", pulses.n_pulses) as bar:
-            for number, block in enumerate(regrouped(pulses.blocks(size), NOISE_ROWS)):
+            for number, block in enumerate(pulses.blocks(NOISE_ROWS)):
                 seed = noise_seed(self.options.seed, noise_key, number)
-                generator = np.random.default_rng(seed)
-                done = self.form(block, generator)
-                counts += Counts.of(done)
-                yield done
+                done = self.form(block, np.random.default_rng(seed))
+                numbers = len(block), int(done.valid.sum()), rejections_of(done.codes)
+                counts += Counts(*numbers, done.saturated)
+                yield done, counts
                 bar.update(len(block))
         if not counts.translated:
-            reasons = ", ".join(f"{n} {why}" for why, n in counts.rejections.items())
             raise CpunetError(
                 f"{pulses.path}: none of {counts.read} pulses can be translated "
-                f"({reasons}); are these {self.kind.takes} pulses?"
+                f"({counted(counts.rejections)}); are these {takes} pulses?"
             )
 
 
 def source_print(source: PulseFile) -> str:
-    """Digest of names, sizes and times of the input files, and of how they are read.
-
-    Raises
-    ------
-    CpunetError
-        If a file does not exist.
-    """
+    """Digest of names, sizes and times of the input files, and of how they are read."""
     if source.pulses is not None:
         content = source.pulses.waveforms, source.pulses.energy_kev
         return hashlib.sha256(b"".join(values.tobytes() for values in content)).hexdigest()
-    paths = [source.path]
-    elsewhere = (source.energy or "").rpartition(":")[0]
-    if elsewhere and Path(elsewhere).is_file():
-        paths.append(Path(elsewhere))
     facts: list[Any] = [source.table, source.energy, source.kev_per_adc, source.dt_ns]
-    for path in paths:
-        try:
+    for path in (source.path, Path((source.energy or "").rpartition(":")[0])):
+        if path.is_file():
             stat = path.stat()
-        except OSError:
-            raise CpunetError(f"{path}: no such file; check the name") from None
-        facts.append((path.name, stat.st_size, stat.st_mtime_ns))
+            facts.append((path.name, stat.st_size, stat.st_mtime_ns))
     return hashlib.sha256(repr(facts).encode(errors="surrogateescape")).hexdigest()
-
-
-def regrouped(blocks: Iterable[Pulses], size: int) -> Iterator[Pulses]:
-    """The same pulses in blocks of `size`, the last one shorter.
-
-    Examples
-    --------
-    >>> pulses = Pulses.of(np.zeros((7, 2)), dt_ns=16)
-    >>> [len(block) for block in regrouped([pulses[:2], pulses[2:3], pulses[3:]], 3)]
-    [3, 3, 1]
-    """
-    waiting: list[Pulses] = []
-    for block in blocks:
-        waiting = [Pulses.concatenate([*waiting, block])]
-        while len(waiting[0]) >= size:
-            yield waiting[0][:size]
-            waiting = [waiting[0][size:]]
-    yield from (rest for rest in waiting if len(rest))
 
 
 def finished(out: Path, wanted: dict[str, Any]) -> Counts:
@@ -291,7 +231,7 @@ def finished(out: Path, wanted: dict[str, Any]) -> Counts:
             continue
         other = f"another {what}"
         if what == "options":
-            names = ", ".join(n for n in value if record[what].get(n, ...) != value[n])
-            other = f"other options ({names})"
+            names = (name for name in value if record[what].get(name, ...) != value[name])
+            other = f"other options ({', '.join(names)})"
         raise CpunetError(f"{out}: was made with {other}; choose another `out` or give `force`")
     return Counts(**record["counts"])

@@ -11,25 +11,22 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
-from cpunet.electronics.finishing import extended
+from cpunet.electronics.drawn_pile_up import Columns, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import padding, record_length
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import Rejection
 from cpunet.training.run import Run
+from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.options import LEARNED, NONE, Adc, TranslateOptions
 from cpunet.translation.translator import TranslatedPulses, Translator
 
 log = logging.getLogger(__name__)
 
 HIGHEST = int(np.iinfo(np.uint16).max)
-MAX_BITS = 24  # of whole numbers in single precision
 RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
 
@@ -66,26 +63,30 @@ class Form:
 
     def __init__(self, run: Run, translator: Translator, options: TranslateOptions) -> None:
         self.translator, self.options, adc = translator, options, options.adc
-        config, rate_khz = translator.recipe.preparation, options.pile_up_khz
-        self.tails = wanted_tails(translator, options.tails, raw=adc is not None)
-        if not (np.isfinite(rate_khz) and rate_khz >= 0):
-            raise CpunetError(f"`pile_up_khz` {rate_khz:g}: expected a rate in kHz, 0 or more")
-        self.energies_kev: tuple[float, ...] = ()  # of piled-up pulses
-        if rate_khz:
-            learned = _tails_of(translator, f"`pile_up_khz` {rate_khz:g}")
-            self.energies_kev = learned.law.energies_kev
+        config, tails = translator.recipe.preparation, translator.tails
+        if tails is None and (options.tails != NONE or options.pile_up_khz):
+            name = "tails" if options.tails != NONE else "pile_up_khz"
+            raise CpunetError(
+                f"`{name}` {getattr(options, name)}: the run tells nothing of pile-up tails "
+                "and of other pulses (a network, or trained without raw traces)",
+                "train a readout chain on raw traces, or leave it out",
+            )
+        if options.tails == NONE:
+            tails = None
+        elif tails is not None and options.tails != LEARNED:
+            tails = tails.uncut(float(options.tails))
+        elif tails is not None and adc is not None:
+            tails = tails.uncut()
+        self.tails = tails if tails is not None and tails.law.rate_khz > 0 else None
         self.n_pre, self.length = config.samples_before, config.length
         self.scale: tuple[float, float] | None = None
-        self.ends, self.samples = (0, HIGHEST), np.dtype(np.float32)
+        self.ends, self.samples = (0, HIGHEST), "f4"
         if adc is None:
             return
         self.scale, self.ends = adc_scale(run, translator, adc), adc_ends(run, adc)
-        self.samples = _kind(self.ends)
-        if rate_khz and translator.backend.chain is None:
-            raise CpunetError(
-                "a network knows no shapes beyond its windows, so it gives no raw traces with "
-                "piled-up pulses; leave out `pile_up_khz` or `adc`"
-            )
+        kinds = {kind: np.iinfo(kind) for kind in ("u2", "i2", "u4", "i4")}
+        low, high = self.ends
+        self.samples = next(k for k, of in kinds.items() if of.min <= low and high <= of.max)
         self.length = self.length if adc.length is None else adc.length
         self.n_pre = self.n_pre if adc.n_pre is None else adc.n_pre
         if not 0 <= self.n_pre < self.length:
@@ -93,73 +94,71 @@ class Form:
                 f"`n_pre` {self.n_pre} is not within a trace of {self.length} samples; "
                 "give less, or a longer `length`"
             )
-
-    @property
-    def fills_in(self) -> bool:
-        """Whether traces are padded with baseline and decay without noise."""
-        config = self.translator.recipe.preparation
+        if isinstance(translator.backend, ResponseBackend):
+            return
+        if options.pile_up_khz:
+            raise CpunetError(
+                "a network knows no shapes beyond its windows, so it gives no raw traces with "
+                "piled-up pulses; leave out `pile_up_khz` or `adc`"
+            )
         after = self.length - self.n_pre
-        beyond = self.n_pre > config.samples_before or after > config.samples_after
-        return self.translator.backend.chain is None and beyond
+        if self.n_pre > config.samples_before or after > config.samples_after:
+            log.warning(
+                f"a network knows windows of {config.length} samples alone; beyond them stand "
+                "baseline and decay without noise"
+            )
 
     def __call__(self, pulses: Pulses, generator: np.random.Generator) -> TranslatedPulses:
         """Translate pulses, of which all rows stay; raw traces need energies."""
-        translator, dt_ns = self.translator, self.translator.dt_ns
-        left, piled, n = None, None, len(pulses)
+        n, dt_ns, rate_khz = len(pulses), self.translator.dt_ns, self.options.pile_up_khz
+        left, piled, energies = None, None, pulses.energy_kev
         truth: Columns = {}
         if self.tails is not None:
             left = self.tails.draw_kev(n, generator)
             truth = {"tails_kev": (left, "keV")}
-        if self.options.pile_up_khz:
+        if rate_khz and (learned := self.translator.tails) is not None:
             record = self.n_pre, self.length
             if self.scale is None:
                 record = padding(dt_ns)[0] + self.n_pre, record_length(self.length, dt_ns)
-            rate = self.options.pile_up_khz
-            piled = InTracePileUp.draw(n, rate, self.energies_kev, dt_ns, *record, generator)
+            sizes = learned.law.energies_kev
+            piled = InTracePileUp.draw(n, rate_khz, sizes, dt_ns, *record, generator)
             truth |= piled.columns()
-        chain = translator.backend.chain is not None
-        done = translator.translate_pulses(
+        windows = self.scale is None
+        done = self.translator.translate_pulses(
             pulses,
             noise=self.options.noise,
             generator=generator,
-            tails_kev=left if chain or self.scale is None else None,
+            tails_kev=left if windows else None,
             piled=piled,
-            trace=(self.n_pre, self.length) if chain and self.scale is not None else None,
+            trace=None if windows else (self.n_pre, self.length),
         )
         if self.scale is None:
             return replace(done, truth=truth)
-        codes, windows, t0_ns = done.codes, done.pulses.waveforms, done.pulses.t0_ns
-        if not chain:
-            config = translator.recipe.preparation
-            windows = extended(windows, config, dt_ns, self.length, self.n_pre)
-            t0_ns = t0_ns - (self.n_pre - config.samples_before) * dt_ns
-        unknown = ~(np.isfinite(pulses.energy_kev) & (pulses.energy_kev > 0))
-        codes[unknown & (codes == Rejection.ACCEPTED)] = Rejection.ENERGY_UNKNOWN
+
+        unknown = ~(np.isfinite(energies) & (energies > 0))
+        done.codes[unknown & done.valid] = Rejection.ENERGY_UNKNOWN
+        levels = done.pulses.waveforms
         if left is not None and self.tails is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
-                heights = left * self.tails.height / pulses.energy_kev
-            windows += heights[:, np.newaxis] * self.tails.decay(self.length, lead_us=0.0)
-        windows[codes != Rejection.ACCEPTED] = np.nan
+                heights = left * self.tails.height / energies
+            levels += heights[:, np.newaxis] * self.tails.decay(self.length, lead_us=0.0)
+        levels[~done.valid] = np.nan
+
         per_kev, baseline = self.scale
-        scale = np.where(unknown, 0.0, per_kev * pulses.energy_kev)
-        traces, saturated = to_adc(windows, scale, baseline, self.ends)
+        counts = np.rint(levels * (per_kev * energies)[:, np.newaxis] + baseline)
+        counts[~np.isfinite(counts).all(axis=1)] = 0
+        clipped = counts.clip(*self.ends)
+        saturated = int((clipped != counts).any(axis=1).sum())
         # single precision represents these integers exactly
-        whole = replace(pulses, waveforms=traces.astype(np.float32), t0_ns=t0_ns)
-        return TranslatedPulses(whole, codes, saturated, truth)
+        traces = done.pulses.with_waveforms(clipped.astype(np.float32))
+        return TranslatedPulses(traces, done.codes, saturated, truth)
 
 
 def adc_ends(run: Run, adc: Adc) -> tuple[int, int]:
     """Lowest and highest count of a digitiser: of `bits`, or of those that the data need.
 
     Data that leave out saturated pulses end at their highest count.
-
-    Raises
-    ------
-    CpunetError
-        If there are no such digitisers.
     """
-    if adc.bits is not None and not 1 <= adc.bits <= MAX_BITS:
-        raise CpunetError(f"`bits` is {adc.bits}; expected 1 to {MAX_BITS}")
     low, high = run.data.counts or (0, HIGHEST)
     signed = low < 0
     bits = adc.bits or max(high.bit_length(), (-low - 1).bit_length()) + signed
@@ -168,50 +167,6 @@ def adc_ends(run: Run, adc: Adc) -> tuple[int, int]:
         last = high
     log.info(f"counts from {first} to {last}, beyond which they are clipped (`bits`)")
     return first, last
-
-
-def to_adc(
-    windows: FloatArray,
-    scale: npt.ArrayLike,
-    baseline: npt.ArrayLike,
-    ends: tuple[int, int] = (0, HIGHEST),
-) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.bool_]]:
-    """Invert ``prepared = (raw - baseline) / scale``, round, and clip.
-
-    Parameters
-    ----------
-    windows
-        Prepared pulses, shape (n, samples); a row with NaN becomes a row of 0.
-    scale, baseline
-        Scale and baseline in ADC counts, per row or common.
-    ends
-        The lowest and the highest count.
-
-    Returns
-    -------
-    traces
-        Raw traces in ADC counts, shape (n, samples).
-    saturated
-        Mask of the clipped rows, shape (n,).
-
-    Examples
-    --------
-    >>> to_adc(np.array([[0, 0.8], [0, 80]], np.float32), 1000.0, 200.0)
-    (array([[  200,  1000],
-           [  200, 65535]], dtype=uint16), array([False,  True]))
-    """
-    factor = np.asarray(scale, float).reshape(-1, 1)
-    counts = np.rint(windows * factor + np.asarray(baseline, float).reshape(-1, 1))
-    missing = ~np.isfinite(counts).all(axis=1)
-    counts[missing] = 0
-    saturated = ((counts < ends[0]) | (counts > ends[1])).any(axis=1)
-    return counts.clip(*ends).astype(_kind(ends)), saturated
-
-
-def _kind(ends: tuple[int, int]) -> np.dtype[Any]:
-    """The smallest type of integers, of 16 bits or more, that has both ends."""
-    kinds = [np.iinfo(kind) for kind in ("u2", "i2", "u4", "i4")]
-    return next(kind.dtype for kind in kinds if kind.min <= ends[0] and ends[1] <= kind.max)
 
 
 def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]:
@@ -227,20 +182,15 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
     Raises
     ------
     CpunetError
-        If one of the two is neither given nor in the run, the gain is not positive, or the
-        baseline is negative.
+        If one of the two is neither given nor in the run.
     """
-    adc_per_kev, baseline = adc.adc_per_kev, adc.baseline
-    if adc_per_kev is not None and not (np.isfinite(adc_per_kev) and adc_per_kev > 0):
-        raise CpunetError(f"`adc_per_kev` is {adc_per_kev}; expected a number above 0")
-    if baseline is not None and not (np.isfinite(baseline) and baseline >= 0):
-        raise CpunetError(f"`baseline` is {baseline}; expected a number that is not negative")
-    per_kev, cuts, peak = None, run.data.cuts, run.recipe.peaks.get(run.peak)
+    per_kev, baseline, cuts = None, adc.baseline, run.data.cuts
     if cuts is not None and cuts.amplitude >= MIN_ADC:
+        peak = run.recipe.peaks.get(run.peak)
         per_kev = None if peak is None else cuts.amplitude / peak.energy_kev
         if baseline is None:
             baseline = {window.name: window.centre for window in cuts.windows}.get("baseline")
-    if adc_per_kev is not None:  # of the maximum, in prepared units, of a fast pulse
+    if adc.adc_per_kev is not None:  # of the maximum, in prepared units, of a fast pulse
         config = translator.recipe.preparation
         time = np.arange(config.length) - config.samples_before
         ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
@@ -248,7 +198,7 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
         height = float(pulse.max())
         if not (np.isfinite(height) and height > 0):
             raise CpunetError("the run cannot translate a fast pulse; train again")
-        per_kev = adc_per_kev / height
+        per_kev = adc.adc_per_kev / height
     if per_kev is None:
         raise CpunetError(
             f"{run.name}: does not say how many ADC counts a keV is; give `adc_per_kev`"
@@ -256,50 +206,3 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
     if baseline is None:
         raise CpunetError(f"{run.name}: does not say where the baseline is; give `baseline`")
     return per_kev, baseline
-
-
-def wanted_tails(
-    translator: Translator, wanted: str | float, *, raw: bool = False
-) -> DrawnTails | None:
-    """Pile-up tails to add to translations.
-
-    Parameters
-    ----------
-    translator
-        Trained run.
-    wanted
-        ``"learned"`` for the tails of the data, ``"none"``, or a rate in kHz.
-    raw
-        Whether the tails are for raw traces, which have not passed any cuts.
-
-    Raises
-    ------
-    CpunetError
-        If `wanted` is invalid, or the run lacks the necessary information.
-    """
-    if wanted == NONE:
-        return None
-    rate = None
-    if wanted != LEARNED:
-        try:
-            rate = float(wanted)
-        except ValueError:
-            rate = np.nan
-        if not (np.isfinite(rate) and rate >= 0):
-            raise CpunetError(f"`tails` {wanted}: expected learned, none, or a rate in kHz")
-    tails = _tails_of(translator, f"`tails` {wanted}")
-    if rate is not None:
-        tails = tails.uncut(rate)
-    elif raw:
-        tails = tails.uncut()
-    return tails if tails.law.rate_khz > 0 else None
-
-
-def _tails_of(translator: Translator, asked: str) -> DrawnTails:
-    if translator.tails is None:
-        raise CpunetError(
-            f"{asked}: the run tells nothing of pile-up tails and of other pulses (a network, "
-            "or trained without raw traces)",
-            "train a readout chain on raw traces, or leave it out",
-        )
-    return translator.tails

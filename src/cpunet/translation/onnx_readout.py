@@ -1,4 +1,4 @@
-"""The graphs of a readout and of its inverse, in the text form of ONNX.
+"""The graphs of a readout and of its inverse, by ONNX alone.
 
 A readout is linear.  A product with its responses to single samples gives the same records as
 its Fourier transforms, which few runtimes have.
@@ -7,6 +7,7 @@ its Fourier transforms, which few runtimes have.
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,57 @@ from cpunet.networks.generators import MIN_LEVEL, LinearInverse
 from cpunet.networks.response_layer import END, LONGEST_US, MIN_STRETCH, ElectronicsResponse
 
 OPSET = 18  # version of the operators
+FLOAT, INT64, DOUBLE = 1, 7, 11  # types of ONNX
+# weights of four samples by powers of the time between the middle ones (Catmull-Rom)
+CUBICS = np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]], np.float32) / 2
+
+
+@dataclass
+class Graph:
+    """A graph in the making, with ``windows`` (batch, samples) as input.
+
+    Parameters
+    ----------
+    length
+        Samples of a window.
+    nodes, constants
+        Objects of ONNX.
+    """
+
+    length: int
+    nodes: list[Any] = field(default_factory=list)
+    constants: list[Any] = field(default_factory=list)
+
+    def __call__(self, operator: str, *inputs: Any, **attributes: Any) -> str:
+        """Add a node, and return the name of its output.
+
+        Parameters
+        ----------
+        operator, attributes
+            See the operators of ONNX.
+        inputs
+            Names of outputs, and constants.
+        """
+        from onnx import helper, numpy_helper
+
+        names = []
+        for given in inputs:
+            names.append(given if isinstance(given, str) else f"constant{len(self.constants)}")
+            if not isinstance(given, str):
+                self.constants.append(numpy_helper.from_array(np.asarray(given), names[-1]))
+        output = f"{operator}{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, names, [output], **attributes))
+        return output
+
+    def model(self, output: str, name: str, samples: int) -> Any:
+        """The model of which an output (batch, samples) is the result, under another name."""
+        from onnx import helper
+
+        self.nodes.append(helper.make_node("Identity", [output], [name]))
+        windows = helper.make_tensor_value_info("windows", FLOAT, ["batch", self.length])
+        made = helper.make_tensor_value_info(name, FLOAT, ["batch", samples])
+        graph = helper.make_graph(self.nodes, "cpunet", [windows], [made], self.constants)
+        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
 
 
 def chain_model(response: ElectronicsResponse, length: int) -> Any:
@@ -29,149 +81,59 @@ def chain_model(response: ElectronicsResponse, length: int) -> Any:
     """
     linear = copy.copy(response)
     linear.drift = None
-    constants: dict[str, Any] = {"matrix": linear(np.eye(length, dtype=np.float32))}
-    lines = ["records = MatMul(windows, matrix)"]
+    matrix = linear(np.eye(length, dtype=np.float32))
+    add, charge, last = Graph(length), "windows", length - 1
     if response.drift is not None:
         stretch, per_us = [*response.drift.stretch.tolist(), 0.0][:2]
-        constants |= {
-            "axis": np.array([1]),
-            "end": np.array(END, np.float32),
-            "index": np.arange(length, dtype=float),
-            "dt_us": np.array(1e-3 * float(response.dt_ns)),
-            "zero": np.array(0.0),
-            "one": np.array(1.0),
-            "longest_us": np.array(LONGEST_US),
-            "per_us": np.array(per_us),
-            "one_and_stretch": np.array(1 + stretch),
-            "least": np.array(MIN_STRETCH),
-            "last": np.array(length - 1.0),
-            "first_sample": np.array(0),
-            "last_sample": np.array(length - 1),
-        }
-        lines = [
-            "highest = ReduceMax <keepdims = 1> (windows, axis)",
-            "level = Mul(end, highest)",
-            "above = GreaterOrEqual(windows, level)",
-            "risen = Cast <to = 1> (above)",
-            "end_sample = ArgMax <axis = 1, keepdims = 1> (risen)",
-            "end_time = Cast <to = 11> (end_sample)",
-            "before = Sub(end_time, index)",
-            "all_us = Mul(before, dt_us)",
-            "us = Clip(all_us, zero, longest_us)",
-            "change = Mul(us, per_us)",
-            "factor = Add(change, one_and_stretch)",
-            "positive = Max(factor, least)",
-            "simulated = Div(before, positive)",
-            "time = Sub(end_time, simulated)",
-            "floor = Floor(time)",
-            "first = Clip(floor, zero, last)",
-            "after = Sub(time, first)",
-            "within = Clip(after, zero, one)",
-            "part = Cast <to = 1> (within)",
-            "sample = Cast <to = 7> (first)",
-        ]
-        # cubics through four samples (Catmull-Rom), by powers of the part
-        weights = [(0, -0.5, 1, -0.5), (1, 0, -2.5, 1.5), (0, 0.5, 2, -1.5), (0, 0, -0.5, 0.5)]
-        for i, cubic in enumerate(weights):
-            constants[f"step{i}"] = np.array(i - 1)
-            lines += [
-                f"near{i} = Add(sample, step{i})",
-                f"place{i} = Clip(near{i}, first_sample, last_sample)",
-                f"value{i} = GatherElements <axis = 1> (windows, place{i})",
-            ]
-            for power, weight in enumerate(cubic):
-                constants[f"w{i}{power}"] = np.array(weight, np.float32)
-            lines += [
-                f"a{i} = Mul(part, w{i}3)",
-                f"b{i} = Add(a{i}, w{i}2)",
-                f"c{i} = Mul(part, b{i})",
-                f"d{i} = Add(c{i}, w{i}1)",
-                f"e{i} = Mul(part, d{i})",
-                f"f{i} = Add(e{i}, w{i}0)",
-                f"term{i} = Mul(f{i}, value{i})",
-            ]
-        lines += ["drifted = Sum(term0, term1, term2, term3)"]
-        lines += ["records = MatMul(drifted, matrix)"]
-    return _model(length, ("records", constants["matrix"].shape[1]), lines, constants)
+        highest = add("ReduceMax", charge, [1], keepdims=1)
+        risen = add("GreaterOrEqual", charge, add("Mul", np.float32(END), highest))
+        end = add("ArgMax", add("Cast", risen, to=FLOAT), axis=1, keepdims=1)
+        end = add("Cast", end, to=DOUBLE)
+        before = add("Sub", end, np.arange(length, dtype=float))
+        us = add("Clip", add("Mul", before, 1e-3 * float(response.dt_ns)), 0.0, LONGEST_US)
+        factor = add("Max", add("Add", add("Mul", us, per_us), 1 + stretch), MIN_STRETCH)
+        time = add("Sub", end, add("Div", before, factor))
+        first = add("Clip", add("Floor", time), 0.0, float(last))
+        part = add("Cast", add("Clip", add("Sub", time, first), 0.0, 1.0), to=FLOAT)
+        sample = add("Cast", first, to=INT64)
+        terms = []
+        for step, (*lower, weight) in zip((-1, 0, 1, 2), CUBICS, strict=True):
+            for value in reversed(lower):
+                weight = add("Add", add("Mul", part, weight), value)
+            place = add("Clip", add("Add", sample, step), 0, last)
+            near = add("GatherElements", charge, place, axis=1)
+            terms.append(add("Mul", weight, near))
+        charge = add("Sum", *terms)
+    return add.model(add("MatMul", charge, matrix), "records", matrix.shape[1])
 
 
 def inverse_model(inverse: LinearInverse) -> Any:
     """Measured windows (batch, samples) → pulses within 0 … 1, as `LinearInverse`."""
     length = inverse.length
-    constants = {
-        "half": inverse.half_height.astype(np.float32),
-        "index": np.arange(length),
-        "number": np.arange(1, length + 1),
-        "axis": np.array([1]),
-        "zero": np.array(0),
-        "one": np.array(1),
-        "last": np.array(length - 1),
-        "base_samples": np.arange(*inverse.baseline),
-        "level_samples": np.arange(*inverse.level),
-        "samples": np.arange(-inverse.before, inverse.after),
-        "least": np.array(MIN_LEVEL),
-        "low": np.array(0.0),
-        "high": np.array(1.0),
-        "mean_in": inverse.mean_in,
-        "mean_out": inverse.mean_out,
-        "matrix": inverse.weights.T.copy(),
-        "left": np.array([0, 1, 0, 0]),
-        "right": np.array([0, 0, 0, 1]),
-        "start": np.arange(length) + 1 + inverse.before,
-        "end": np.array(len(inverse.mean_in) + 1),
-    }
-    lines = [
-        "highest = ArgMax <axis = 1, keepdims = 1> (windows)",
-        "low_samples = Less(windows, half)",
-        "early_samples = Less(index, highest)",
-        "below = And(low_samples, early_samples)",
-        "ones = Cast <to = 7> (below)",
-        "numbers = Mul(ones, number)",
-        "after = ReduceMax <keepdims = 1> (numbers, axis)",
-        "before = Sub(after, one)",
-        "sample = Max(before, zero)",
-        "double = Cast <to = 11> (windows)",
-    ]
-    for name in ("base", "level", ""):
-        own = f"{name}_" if name else ""
-        lines += [
-            f"{own}at = Add(sample, {own}samples)",
-            f"{own}inside = Clip({own}at, zero, last)",
-            f"{own}values = GatherElements <axis = 1> (double, {own}inside)",
-        ]
-    lines += [
-        "base = ReduceMean <keepdims = 1> (base_values, axis)",
-        "top = ReduceMean <keepdims = 1> (level_values, axis)",
-        "height = Sub(top, base)",
-        "scale = Max(height, least)",
-        "lowered = Sub(values, base)",
-        "scaled = Div(lowered, scale)",
-        "centred = Sub(scaled, mean_in)",
-        "product = MatMul(centred, matrix)",
-        "charge = Add(product, mean_out)",
-        "clipped = Clip(charge, low, high)",
-        "led = Pad(clipped, left, low)",
-        "padded = Pad(led, right, high)",
-        "shifted = Sub(start, sample)",
-        "place = Clip(shifted, zero, end)",
-        "moved = GatherElements <axis = 1> (padded, place)",
-        "pulses = Cast <to = 1> (moved)",
-    ]
-    return _model(length, ("pulses", length), lines, constants)
-
-
-def _model(
-    length: int, output: tuple[str, int], lines: list[str], constants: dict[str, Any]
-) -> Any:
-    from onnx import numpy_helper, parser
-
-    name, samples = output
-    text = "\n".join(lines)
-    model = parser.parse_model(
-        f"""<ir_version: 8, opset_import: ["": {OPSET}]>
-        cpunet (float[batch, {length}] windows) => (float[batch, {samples}] {name})
-        {{ {text} }}"""
+    add, index = Graph(length), np.arange(length)
+    highest = add("ArgMax", "windows", axis=1, keepdims=1)
+    low = add("Less", "windows", inverse.half_height.astype(np.float32))
+    below = add("Cast", add("And", low, add("Less", index, highest)), to=INT64)
+    after = add("ReduceMax", add("Mul", below, index + 1), [1], keepdims=1)
+    sample = add("Max", add("Sub", after, 1), 0)
+    double = add("Cast", "windows", to=DOUBLE)
+    base, level, values = (
+        add(
+            "GatherElements",
+            double,
+            add("Clip", add("Add", sample, np.arange(first, stop)), 0, length - 1),
+            axis=1,
+        )
+        for first, stop in (inverse.baseline, inverse.level, (-inverse.before, inverse.after))
     )
-    named = (numpy_helper.from_array(np.asarray(v), key) for key, v in constants.items())
-    model.graph.initializer.extend(named)
-    return model
+    base, level = (add("ReduceMean", part, [1], keepdims=1) for part in (base, level))
+    height = add("Max", add("Sub", level, base), MIN_LEVEL)
+    centred = add("Sub", add("Div", add("Sub", values, base), height), inverse.mean_in)
+    product = add("MatMul", centred, inverse.weights.T.copy())
+    charge = add("Clip", add("Add", product, inverse.mean_out), 0.0, 1.0)
+    # 0 before the region and 1 after it
+    padded = add("Pad", add("Pad", charge, [0, 1, 0, 0], 0.0), [0, 0, 0, 1], 1.0)
+    shifted = add("Sub", index + 1 + inverse.before, sample)
+    place = add("Clip", shifted, 0, len(inverse.mean_in) + 1)
+    moved = add("GatherElements", padded, place, axis=1)
+    return add.model(add("Cast", moved, to=FLOAT), "pulses", length)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import logging
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -16,22 +15,22 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.outputs import refuse_existing, refuse_inputs
+from cpunet.outputs import refuse_existing
 from cpunet.processes import outcomes
 from cpunet.progress import stage
 from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own_folder
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run, used_run
-from cpunet.translation.file_translation import Counts, FileTranslation
+from cpunet.translation.file_translation import FileTranslation
 from cpunet.translation.options import NONE, Adc, TranslateOptions
-from cpunet.translation.translation import Translation
+from cpunet.translation.translation import Counts, Translation
 
 log = logging.getLogger(__name__)
 
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 
-Task = tuple[PulseFile, Path]  # a file and its output
+Task = tuple[PulseFile, Path, str]  # a file, its output, and the name of its noise
 
 
 def translate(
@@ -116,27 +115,23 @@ def translate(
         )
     if jobs < 1:
         raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")
-    scale_ = scale if adc else None
-    options = TranslateOptions(inverse, noise, seed, out_table, scale_, tails, pile_up_khz)
+    digitiser = scale if adc else None
+    options = TranslateOptions(inverse, noise, seed, out_table, digitiser, tails, pile_up_khz)
     files = list(_files(pulses, read, insist, run))
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
-    if out is None:
-        if several or channels:
-            raise CpunetError("several files or tables do not stay in memory; give `out`")
-        job = FileTranslation(used_run(run), options)
-        job.warn()
-        done = job.in_memory(files[0])
-        of_job = Translation.of(job, Counts.of(done))
-        return replace(of_job, in_memory=done, writer=job.writer)
+    if out is None and (several or channels):
+        raise CpunetError("several files or tables do not stay in memory; give `out`")
     make = partial(FileTranslation, options=options, resume=resume, force=force)
+    if out is None:
+        return make(used_run(run)).in_memory(files[0])
     if channels:
         if len(files) > 1:
             raise CpunetError(f"`table` {ALL} belongs to one file, not to {len(files)}")
         return _channels(make, run, files[0], Path(out))
     if several:
         return _several(make, used_run(run), files, Path(out), jobs)
-    return _one(make, used_run(run), files[0], Path(out))
+    return make(used_run(run))(files[0], Path(out))
 
 
 def _files(
@@ -153,19 +148,18 @@ def _files(
         waveforms = np.atleast_2d(np.asarray(given, np.float32))
         sources = [Pulses.of(waveforms, dt_ns=as_run(run).dt_ns)]
     for source in sources:
-        names = expanded(Path(source)) if isinstance(source, str | Path) else [source]
+        names = [source]
+        # a name with such a character may be that of a file
+        if isinstance(source, str | Path) and not Path(source).exists():
+            pattern = str(source)
+            if glob.has_magic(pattern):
+                names = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 absolute, too
+            if not names:
+                raise CpunetError(f"{pattern}: no such files; check the name")
         yield from (pulse_file(name, read, insist) for name in names)
 
 
 Make = Callable[[RunLike], FileTranslation]
-
-
-def _one(
-    make: Make, run: RunLike, source: PulseFile, out: Path, noise_key: str | None = None
-) -> Translation:
-    job = make(run)
-    job.warn()
-    return Translation.of(job, job(source, out, noise_key), out)
 
 
 def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:
@@ -186,7 +180,7 @@ def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcom
 
 def _channel(make: Make, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
     run = used_run(runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO))
-    return _one(make, run, pair[0], place.with_name(f"{name}.lh5"), name)
+    return make(run)(pair[0], place.with_name(f"{name}.lh5"), name)
 
 
 def _several(
@@ -203,42 +197,37 @@ def _several(
         Before the translation, if the run cannot be used, or outputs exist (without
         `resume` or `force`) or would have the same names; at the end, if files failed.
     """
-    targets = [out / file.path.name for file in sources]
-    tasks = [
-        (file, to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5"))
-        for file, to in zip(sources, targets, strict=True)
-    ]
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
-    twice = [name for name, n in Counter(to.name for _, to in tasks).items() if n > 1]
-    if twice:
-        raise CpunetError(
-            f"{len(twice)} names occur twice among the files, as {twice[0]}; "
-            "translate these into folders of their own"
-        )
-    shared = next((s.energy for s in sources if s.energy and ":" in s.energy), None)
-    if shared is not None and len(tasks) > 1:
-        raise CpunetError(
-            f"`energy` {shared} belongs to one file of pulses, not to {len(tasks)}; "
-            "translate them one by one"
-        )
-    job = make(run)
-    job.warn()  # what is wrong is said once
+    job, tasks = make(run), dict[Path, Task]()
     # thousands of files are compared by their identity, and not each with each other
-    inputs = {_identity(source.path) for source in sources} - {None}
-    for source, to in tasks:
-        refuse_inputs(to, run.folder, *source.files)
-        if _identity(to) in inputs:
+    stats = [source.path.stat() for source in sources if source.path.exists()]
+    inputs = {(stat.st_dev, stat.st_ino) for stat in stats}
+    for source in sources:
+        to = out / source.path.name
+        to = to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5")
+        if to in tasks:
+            raise CpunetError(
+                f"names occur twice among the files, as {to.name}; translate these into "
+                "folders of their own"
+            )
+        if len(sources) > 1 and ":" in (source.energy or ""):
+            raise CpunetError(
+                f"`energy` {source.energy} belongs to one file of pulses, not to "
+                f"{len(sources)}; translate them one by one"
+            )
+        refuse_existing(to, run.folder, *source.files, force=job.force or job.resume)
+        if to.exists() and (to.stat().st_dev, to.stat().st_ino) in inputs:
             raise CpunetError(f"{to}: is the input; choose another `out`")
-        if not job.resume:
-            refuse_existing(to, force=job.force)
-    done: list[Counts] = []
-    failed: list[str] = []
+        tasks[to] = source, to, to.name
+    counts, failed = Counts(), list[str]()
+    # what the job says is said once: others make theirs in processes of their own
+    begin = partial(_worker, partial(make, run) if jobs > 1 else lambda: job)
     with (
         stage("Translating", len(tasks)) as bar,
-        closing(outcomes(partial(_worker, make, run), tasks, jobs, once=True)) as results,
+        closing(outcomes(begin, [*tasks.values()], jobs, once=True)) as results,
     ):
-        for (source, to), outcome in results:
+        for (source, to, _), outcome in results:
             bar.update()
             if isinstance(outcome, CpunetError):
                 text = str(outcome)
@@ -246,42 +235,18 @@ def _several(
                 failed.append(text if named else f"{source.path}: {text}")
                 log.error(failed[-1])
             else:
-                done.append(outcome)
+                counts += outcome
     if failed:
-        others = f"; {len(done)} are in {out}" if done else ""
+        done = len(tasks) - len(failed)
+        others = f"; {done} are in {out}" if done else ""
         raise CpunetError(
             f"{len(failed)} of {len(tasks)} files failed, the first: {failed[0]}{others}; "
             "continue with `resume`"
         )
-    counts = replace(sum(done, Counts()), files=len(done))
-    return Translation.of(job, counts, out)
+    return job.result(replace(counts, files=len(tasks)), path=out)
 
 
-def _worker(make: Make, run: Run) -> Callable[[Task], Counts]:
+def _worker(make: Callable[[], FileTranslation]) -> Callable[[Task], Counts]:
     """Return a function that translates a file after the other."""
-    job = make(run)
-    return lambda task: job(*task, task[1].name)
-
-
-def expanded(name: Path) -> list[Path]:
-    """The file of a name, or those that match a pattern (``*``, ``?``, ``[``).
-
-    Raises
-    ------
-    CpunetError
-        If no file matches a pattern.
-    """
-    if name.exists() or not glob.has_magic(str(name)):
-        return [name]
-    fitting = sorted(glob.glob(str(name), recursive=True))  # noqa: PTH207 (absolute ones too)
-    if not fitting:
-        raise CpunetError(f"{name}: no such files; check the name")
-    return [*map(Path, fitting)]
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Device and number of a file, the same under all its names; None if there is none."""
-    if not path.exists():
-        return None
-    stat = path.stat()
-    return stat.st_dev, stat.st_ino
+    job = make()
+    return lambda task: job(*task).counts

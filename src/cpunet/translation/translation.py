@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,6 @@ from cpunet.pulses.shape_parameters import (
 )
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.file_translation import Counts, FileTranslation
 from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
@@ -33,6 +33,27 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 DRAWN = 50  # pulses in a figure
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Numbers of rows: read, translated, rejected by reason, and saturated ones in ADC.
+
+    Of several files also their number, and how many existed already; 1 or 0 for a single file.
+    """
+
+    read: int = 0
+    translated: int = 0
+    rejections: dict[str, int] = field(default_factory=dict)
+    saturated: int = 0
+    files: int | None = None
+    skipped: int = 0
+
+    def __add__(self, other: Counts) -> Counts:
+        names = ("read", "translated", "saturated", "skipped")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        rejections = Counter(self.rejections) + Counter(other.rejections)
+        return Counts(**sums, rejections=dict(rejections))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,16 +81,10 @@ class Translation:
     run: str
     recipe: Recipe
     counts: Counts
-    adc: bool = False
+    adc: bool
     path: Path | None = None
     in_memory: TranslatedPulses | None = None
     writer: Callable[..., PulseWriter] | None = None
-
-    @classmethod
-    def of(cls, job: FileTranslation, counts: Counts, path: Path | None = None) -> Self:
-        """The result of a translation."""
-        adc = job.options.adc is not None
-        return cls(job.run.name, job.run.recipe, counts, adc, path)
 
     @cached_property
     def pulses(self) -> Pulses:
@@ -172,7 +187,8 @@ class Translation:
         if self.in_memory is None or self.writer is None:
             raise CpunetError(f"{self.path}: holds these pulses already; copy it")
         with self.writer(Path(path), force=force) as writer:
-            writer.append(self.in_memory.pulses, self.in_memory.columns)
+            done = self.in_memory
+            writer.append(done.pulses, {"rejection": (done.codes, ""), **done.truth})
         return Path(path)
 
     def __len__(self) -> int:
@@ -186,8 +202,7 @@ class Translation:
         if counts.skipped:
             which = f"{counts.skipped} files were" if counts.files else "it was"
             text += f" ({which} there already)"
-        rejected = ", ".join(f"{n} {reason}" for reason, n in self.rejections.items())
-        if rejected:
+        if rejected := ", ".join(f"{n} {reason}" for reason, n in self.rejections.items()):
             text += f"; rows of {'0' if self.adc else 'NaN'} for {rejected}"
         if counts.saturated:
             text += f"; {counts.saturated} saturated"

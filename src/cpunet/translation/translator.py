@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejections_of
 from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
@@ -31,7 +31,7 @@ Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], Pulses)
 NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
 NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
 BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
-NOISE_ROWS = 512  # pulses per noise seed, however many are read at a time
+NOISE_ROWS = 512  # pulses read at a time, which have a common seed of the noise
 
 
 class RejectionWarning(UserWarning):
@@ -50,16 +50,16 @@ class TranslatedPulses:
     codes
         A `Rejection` for each row.
     saturated
-        Mask of the traces that reach an end of the digitiser's range; None for windows.
+        Number of traces that reach an end of the digitiser's range.
     truth
         What was drawn for each pulse, arrays of shape (n,) with their units: ``tails_kev``
         with pile-up tails; ``n_piled``, ``piled_kev`` and ``piled_ns`` with piled-up
-        pulses, see `InTracePileUp.largest`.
+        pulses, see `InTracePileUp.columns`.
     """
 
     pulses: Pulses
     codes: Codes
-    saturated: npt.NDArray[np.bool_] | None = None
+    saturated: int = 0
     truth: Columns = field(default_factory=dict)
 
     @property
@@ -67,27 +67,16 @@ class TranslatedPulses:
         """Mask of the translated rows."""
         return np.asarray(self.codes == Rejection.ACCEPTED)
 
-    @property
-    def rejections(self) -> dict[str, int]:
-        """Numbers of rejected rows by reason."""
-        return rejections_of(self.codes)
-
-    @property
-    def columns(self) -> Columns:
-        """Columns to be stored with the pulses."""
-        return {"rejection": (self.codes, ""), **self.truth}
-
     @classmethod
-    def joined(cls, blocks: Sequence[Self]) -> Self:
+    def joined(cls, parts: Sequence[Self]) -> Self:
         """The rows of all blocks."""
-        masks = [block.saturated for block in blocks if block.saturated is not None]
         return cls(
-            Pulses.concatenate([block.pulses for block in blocks]),
-            np.concatenate([block.codes for block in blocks]),
-            np.concatenate(masks) if masks else None,
+            Pulses.concatenate([part.pulses for part in parts]),
+            np.concatenate([part.codes for part in parts]),
+            sum(part.saturated for part in parts),
             {
-                name: (np.concatenate([block.truth[name][0] for block in blocks]), units)
-                for name, (_, units) in blocks[0].truth.items()
+                name: (np.concatenate([part.truth[name][0] for part in parts]), units)
+                for name, (_, units) in parts[0].truth.items()
             },
         )
 
@@ -196,8 +185,6 @@ class Translator:
         else:
             array = np.asarray(waveforms)
             ndim, pulses = array.ndim, Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
-        if not ndim:
-            raise CpunetError("waveforms is a single number; expected (pulses, samples)")
         self._by_energy(energy_kev, noise)
         kev: dict[str, Energies] = {}
         for name, values in {"energy_kev": energy_kev, "tails_kev": tails_kev}.items():
@@ -213,21 +200,19 @@ class Translator:
         left = kev.get("tails_kev")
         if seed is None:
             seed = int(np.random.default_rng().integers(2**63))
-        blocks: list[TranslatedPulses] = []
-        for first in range(0, max(len(pulses), 1), NOISE_ROWS):
-            rows = slice(first, first + NOISE_ROWS)
-            block = self.translate_pulses(
+        parts = [
+            self.translate_pulses(
                 pulses[rows],
                 noise=noise,
-                generator=np.random.default_rng(noise_seed(seed, None, len(blocks))),
+                generator=np.random.default_rng(noise_seed(seed, None, number)),
                 tails_kev=None if left is None else left[rows],
             )
-            blocks.append(block)
-        done = TranslatedPulses.joined(blocks)
-        reasons = counted(done.rejections)
-        if ndim == 1 and reasons:
-            raise CpunetError(f"the pulse cannot be translated: {reasons}")
-        if reasons:
+            for number, rows in enumerate(blocks(max(len(pulses), 1), NOISE_ROWS))
+        ]
+        done = TranslatedPulses.joined(parts)
+        if reasons := counted(rejections_of(done.codes)):
+            if ndim < 2:
+                raise CpunetError(f"the pulse cannot be translated: {reasons}")
             warnings.warn(
                 f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
                 f"translated and are rows of NaN: {reasons}",
@@ -265,7 +250,7 @@ class Translator:
         tails_kev
             Pile-up tails under each pulse in keV, shape ``(n,)``.
         piled, trace
-            See `Batch`; a chain alone gives raw traces.
+            See `Batch`.
 
         Raises
         ------
@@ -321,13 +306,12 @@ class Translator:
             raise CpunetError("the run does not tell of pile-up tails; leave out tails_kev")
         n, length = whole.windows.shape
         length = length if whole.trace is None else whole.trace[1]
-        result = np.empty((n, length), np.float32)
+        windows = np.empty((n, length), np.float32)
         codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
-        for first in range(0, n, BATCH):
-            rows = np.arange(first, min(first + BATCH, n))
-            done = self.backend.translate(whole.of_rows(rows))
-            result[rows], codes[rows], begin[rows] = done
-        return Translated(result, codes, begin)
+        for rows in blocks(n, BATCH):
+            batch = whole.of_rows(np.arange(n)[rows])
+            windows[rows], codes[rows], begin[rows] = self.backend.translate(batch)
+        return Translated(windows, codes, begin)
 
     def _by_energy(self, energy_kev: npt.ArrayLike | None, noise: bool) -> bool:
         """Whether a translation depends on the energies, which then must be given."""

@@ -35,8 +35,6 @@ from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.recipes.schema import Recipe
-from cpunet.translation.forms import wanted_tails
-from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 
@@ -351,7 +349,7 @@ def translate_all(
 
 def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:
     """Translated windows with noise and pile-up tails as those of the data."""
-    tails = wanted_tails(ren, LEARNED) if ren.tails is not None else None
+    tails = ren.tails if ren.tails is not None and ren.tails.law.rate_khz > 0 else None
     return ren.apply(
         pulses.waveforms,
         energy_kev=pulses.energy_kev,
