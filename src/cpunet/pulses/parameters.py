@@ -352,12 +352,13 @@ def crossings(waveforms: Values, levels: Values, stops: npt.NDArray[np.int64]) -
 
 
 def last_below(
-    waveforms: FloatArray | Values, top: npt.NDArray[np.intp], level: FloatArray | Values
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Whether each pulse is below a level before its `top`, and the last such sample."""
+    waveforms: FloatArray | Values, stops: npt.NDArray[np.intp], level: FloatArray | Values
+) -> npt.NDArray[np.intp]:
+    """The last sample before a stop at which each pulse is below a level; -1 without any."""
     below = waveforms < level[:, np.newaxis]
-    below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
-    return np.asarray(below.any(axis=1)), waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    below &= np.arange(waveforms.shape[1]) < stops[:, np.newaxis]
+    last = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    return np.where(below.any(axis=1), last, -1)
 
 
 def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
@@ -419,8 +420,8 @@ def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
-    crosses, before = last_below(waveforms, top, 0.5 * height)
-    if not (usable := finite & (height > 0) & crosses).any():
+    before = last_below(waveforms, top, 0.5 * height)
+    if not (usable := finite & (height > 0) & (before >= 0)).any():
         return moved
     pulses, before = waveforms[usable], before[usable]
     padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
