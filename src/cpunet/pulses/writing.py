@@ -22,7 +22,6 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import lh5_rows, members, one_line, text_attribute, units_of
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.units import factor
 
@@ -271,9 +270,15 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     """
     readers, left_out = dict[str, Callable[[int, int], LGDO]](), dict[str, str]()
     if (group := source.group) is None:
+        n = source.n_pulses or 0
         for name, column in source.columns.items():
-            if not _is_same(name, column.units, own):
-                readers[name] = partial(_of_column, column)
+            if _is_same(name, column.units, own):
+                continue
+            if column.values.shape in ((), (n,)):
+                values = np.broadcast_to(column.values, (n,))
+                readers[name] = partial(_of_values, values, column.units)
+            else:
+                left_out[name] = f"{column.size} rows for {n} pulses"
     else:
         waveforms, size = source.name.rpartition("/")[2], source.n_all or source.n_pulses or 0
         with one_line(source.path):
@@ -300,8 +305,8 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     return read, left_out
 
 
-def _of_column(column: Column, start: int, n: int) -> LGDO:
-    return _column((column.read(start, start + n), column.units))
+def _of_values(values: npt.NDArray[Any], units: str, start: int, n: int) -> LGDO:
+    return _column((values[start : start + n], units))
 
 
 def _rows(

@@ -215,7 +215,7 @@ class PulseFile:
             read = arrays.READERS[format_]
         source = read(self)
         try:
-            return source.resolved(self)
+            return source.resolve(self)
         except BaseException:
             source.close()
             raise

@@ -25,7 +25,7 @@ def read_flashcam(options: PulseFile) -> PulseSource:
     The energy of the digitiser's own filter is not in keV and is not read.
     """
     stream = _open(options.path)
-    channels = [str(channel) for channel in range(_n_channels(options.path, stream))]
+    channels = [str(channel) for channel in range(int(stream.config.adcs))]
     name = options.chosen_of(channels, "channel", "channels")
     period_ns = np.asarray(float(stream.config.sampling_period_ns))
     events = _Events(options.path, int(name), int(stream.config.eventsamples), stream)
@@ -105,18 +105,12 @@ def channel_sizes(path: Path) -> dict[str, int | None]:
     """
     counts: Counter[int] = Counter()
     stream = _open(path)
-    if _n_channels(path, stream) == 1:
+    if stream.config.adcs == 1:
         return {"0": None}
     while _next(path, stream):
         if stream.tag in (Tags.Event, Tags.SparseEvent):
             counts.update(int(channel) for channel in stream.event.trace_list)
     return {str(c): counts[c] for c in sorted(counts)}
-
-
-def _n_channels(path: Path, stream: FCIO) -> int:
-    if stream.config is None:
-        raise CpunetError(f"{path}: holds no configuration; copy it again")
-    return int(stream.config.adcs)
 
 
 def _next(path: Path, stream: FCIO) -> bool:
@@ -132,10 +126,13 @@ def _open(path: Path) -> FCIO:
     stderr, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(sink, 2)
-        return fcio_open(str(path))
+        stream = fcio_open(str(path))
     except Exception as error:  # the library raises various errors on damaged records
         raise CpunetError(f"{path}: cannot be read as FlashCam file; copy it again") from error
     finally:
         os.dup2(stderr, 2)
         os.close(sink)
         os.close(stderr)
+    if stream.config is None:
+        raise CpunetError(f"{path}: holds no configuration; copy it again")
+    return stream

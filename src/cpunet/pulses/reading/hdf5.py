@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -41,6 +40,8 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
+_Folder = tuple[str, dict[str, h5py.Group | h5py.Dataset], list[str], list[str]]
+
 # plain datasets, in order of preference
 _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
@@ -56,9 +57,9 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
         if isinstance(values, h5py.Dataset):
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-            plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
-            rows = reading(path, values, plain.rows)
-            return replace(plain, rows=rows, group=group, close=unless_read.pop_all().close)
+            rows = reading(path, values, lambda start, stop: np.asarray(values[start:stop]))
+            how = {"attrs": attrs, "group": group, "close": unless_read.pop_all().close}
+            return PulseSource.of_array(path, "HDF5", name, values, columns, rows=rows, **how)
         own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
         is_group, sized = isinstance(values, h5py.Group), values
@@ -129,9 +130,9 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     if _is_lh5(item) or _is_array(item):
         return place
     folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
-    for broken in (link for folder in folders for link in folder.broken):
-        item_at(file, broken)  # which says what is wrong
-    columns = [column for folder in folders for column in folder.waveforms]
+    for link in (link for *_, broken in folders for link in broken):
+        item_at(file, link)  # which says what is wrong
+    columns = [column for _, _, waveforms, _ in folders for column in waveforms]
     if len(columns) == 1:
         return columns[0]
     if not columns:
@@ -157,12 +158,12 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     if place and (tables := waveform_tables(file)):
         return CpunetError(f"{path}: no waveforms in {place}; they are in {shortened(tables)}")
     held: dict[str, int] = {}
-    for folder in _folders(file):
-        for name, item in folder.members.items():
+    for folder, items, _, _ in _folders(file):
+        for name, item in items.items():
             if isinstance(item, h5py.Dataset) and item.shape:
                 what = h5py.check_vlen_dtype(item.dtype) or item.dtype
                 size = item.dtype.itemsize * int(np.prod(item.shape[1:]))
-                held[f"{folder.path}/{name}".strip("/") + f" {item.shape} of {what}"] = size
+                held[f"{folder}/{name}".strip("/") + f" {item.shape} of {what}"] = size
     listed = sorted(held, key=lambda name: -held[name]) or list(file)
     return CpunetError(
         f"{path}: no waveforms in it; it holds {shortened(listed)}",
@@ -177,13 +178,10 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    return sorted(
-        {
-            place
-            for f in _folders(file)
-            for place in f.broken or ([f.path] if f.waveforms else [])
-        }
-    )
+    tables = set[str]()
+    for path, _, waveforms, broken in _folders(file):
+        tables.update(broken or ([path] if waveforms else []))
+    return sorted(tables)
 
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
@@ -195,31 +193,23 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
             columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
-        rows = max(map(len, columns.values()), default=0)
-        of = {n: c.read(0, rows) for n, c in columns.items() if divides(n) and len(c) == rows}
+        rows = max((column.size for column in columns.values()), default=0)
+        whole = {n: c for n, c in columns.items() if divides(n) and c.size == rows}
+        of = {name: np.atleast_1d(column.values) for name, column in whole.items()}
         names = dividing(of, rows)
         parts = np.unique(labels(of, names)) if names else [""]
         channels += [f"{table}/{part}".strip("/") for part in parts]
     return channels
 
 
-@dataclass(frozen=True)
-class _Folder:
-    """A group of a file: its path, what it holds, waveforms in it, and links that lead nowhere.
-
-    The waveforms are those of LH5, or else the first of the usual names.
-    """
-
-    path: str
-    members: dict[str, h5py.Group | h5py.Dataset]
-    waveforms: list[str]
-    broken: list[str]
-
-
 def _folders(
     group: h5py.Group, path: str = "", seen: set[tuple[int, int]] | None = None
 ) -> Iterator[_Folder]:
-    """A group and those in it, except in tables, through links."""
+    """A group and those in it, except in tables, through links.
+
+    Of each: its path, what it holds, paths of waveforms in it, and of links that lead nowhere.
+    The waveforms are those of LH5, or else the first of the usual names.
+    """
     # links can give an object several names or form cycles: visit each object once
     seen, info = set() if seen is None else seen, h5py.h5o.get_info(group.id)
     if (info.fileno, info.addr) in seen:
@@ -238,7 +228,7 @@ def _folders(
         names = []  # the inside of waveforms
     of = f"{path}/".lstrip("/")
     lost = [] if names or is_table else [of + name for name in broken]
-    yield _Folder(path, items, [of + name for name in names], lost)
+    yield path, items, [of + name for name in names], lost
     for name, item in items.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
@@ -253,23 +243,20 @@ def _is_lh5(item: object) -> bool:
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
+
+    def load(item: h5py.Dataset) -> npt.NDArray[Any]:
+        with one_line(path):
+            values = np.asarray(item[()])
+        return values.ravel() if values.ndim else values
+
     columns = {}
     for name, item in members(group).items():
         # MATLAB has no vectors, but writes a row
         is_number = is_column(item) or (_is_array(item) and 1 in item.shape)
         is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
         if is_number or (is_text and divides(name)):
-            columns[name] = _stored(path, item)
+            columns[name] = Column(partial(load, item), item.size, units_of(item))
     return columns
-
-
-def _stored(path: Path, dataset: h5py.Dataset) -> Column:
-    """A dataset as a column."""
-    if dataset.ndim != 1:  # a number, or a row of MATLAB's
-        values = np.asarray(dataset[()])
-        return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
-    read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
-    return Column(read, dataset.size, units_of(dataset))
 
 
 def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
