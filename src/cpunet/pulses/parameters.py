@@ -14,13 +14,8 @@ undefined value is NaN and never raises an exception.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.util import find_spec, module_from_spec
-from threading import Lock
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -322,33 +317,15 @@ def _spline(near: Sequence[Values], t: Values) -> Values:
     return np.asarray(a + b + c + d)
 
 
-_IMPORT = Lock()
-
-
-@cache
-def processors() -> tuple[Any, ...]:
-    """Dspeed's processors, without its reading of files, which takes seconds to import."""
-    with _IMPORT:
-        bare = "dspeed" not in sys.modules
-        if bare and (spec := find_spec("dspeed")) is not None:
-            sys.modules["dspeed"] = module_from_spec(spec)  # its folder alone, nothing is run
-        try:
-            from dspeed.processors.pole_zero import pole_zero
-            from dspeed.processors.time_point_thresh import interpolated_time_point_thresh
-            from dspeed.processors.trap_filters import trap_norm, trap_pickoff
-        finally:
-            for name in [m for m in sys.modules if bare and m.partition(".")[0] == "dspeed"]:
-                del sys.modules[name]
-    return pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff
-
-
 def crossings(waveforms: Values, levels: Values, stops: npt.NDArray[np.int64]) -> Values:
     """Times in samples of the last crossings of levels before a sample; NaN without any.
 
     They are those of dspeed's ``interpolated_time_point_thresh``, backward and with straight
     lines between samples, of waveforms ``(..., length)``, a level and a sample for each.
     """
-    return np.asarray(processors()[1](waveforms, levels, stops, 0, ord("l")))
+    from dspeed.processors.time_point_thresh import interpolated_time_point_thresh  # a second
+
+    return np.asarray(interpolated_time_point_thresh(waveforms, levels, stops, 0, ord("l")))
 
 
 def last_below(
