@@ -65,11 +65,8 @@ def read_memory(options: PulseFile) -> PulseSource:
     """Pulses in memory."""
     pulses = options.pulses
     assert pulses is not None  # which are read in place of a file
-    columns = {
-        "energy_kev": Column.of(pulses.energy_kev),
-        "event_number": Column.of(pulses.event_number),
-        "dt_ns": Column.of(np.array(pulses.dt_ns)),
-    }
+    names = ("energy_kev", "event_number", "dt_ns")
+    columns = {name: Column.of(np.asarray(getattr(pulses, name))) for name in names}
     return PulseSource.of_array(options.path, "memory", "", pulses.waveforms, columns)
 
 
@@ -84,8 +81,8 @@ def read_numpy(options: PulseFile) -> PulseSource:
     matrices = [name for name, values in arrays.items() if values.ndim == 2]
     if not matrices:
         raise CpunetError(
-            f"{options.path}: no waveforms in it; it holds {shortened(arrays)}; "
-            "give an array of two dimensions (event, sample)"
+            f"{options.path}: no waveforms in it; it holds {shortened(arrays)}",
+            "give an array of two dimensions (event, sample)",
         )
     usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
     name = options.chosen_of(usual or matrices, "array", "arrays of two dimensions")
@@ -96,8 +93,9 @@ def read_numpy(options: PulseFile) -> PulseSource:
     columns = {
         column: Column.of(values.ravel() if values.ndim else values)
         for column, values in arrays.items()
-        if (values.ndim <= 1 or (1 in values.shape and column != name))
+        if (values.ndim <= 1 or 1 in values.shape)
         and values.dtype.kind in "iufb"
+        and column != name
     }
     return PulseSource.of_array(options.path, "NumPy", name, arrays[name], columns)
 
@@ -137,9 +135,8 @@ def read_pickles(options: PulseFile) -> PulseSource:
     path = options.path
     if options.table is not None:
         raise CpunetError(f"{path}: a file of pickled pulses has no tables; leave out `table`")
-    traces: list[npt.NDArray[np.float32]] = []
-    events: list[int] = []
-    numbers: list[dict[str, float]] = []
+    traces, events = list[npt.NDArray[np.float32]](), list[int]()
+    numbers = list[dict[str, float]]()
     for place, entry in enumerate(_entries(path)):
         try:
             with np.errstate(over="ignore"):  # values beyond single precision are counted later
