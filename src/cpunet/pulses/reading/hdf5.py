@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -48,18 +47,19 @@ _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    path = options.path
-    with one_line(path), ExitStack() as unless_read:
-        file = unless_read.enter_context(open_hdf5(path))
+    path, file = options.path, open_hdf5(options.path)
+    with one_line(path):
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
         group, values = file[table or "/"], file[name]
         columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+        of_file = {"attrs": attrs, "group": group, "close": file.close}
         if isinstance(values, h5py.Dataset):
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
             rows = reading(path, values, lambda start, stop: np.asarray(values[start:stop]))
-            how = {"attrs": attrs, "group": group, "close": unless_read.pop_all().close}
-            return PulseSource.of_array(path, "HDF5", name, values, columns, rows=rows, **how)
+            return PulseSource.of_array(
+                path, "HDF5", name, values, columns, rows=rows, **of_file
+            )
         own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
         is_group, sized = isinstance(values, h5py.Group), values
@@ -67,19 +67,19 @@ def read_hdf5(options: PulseFile) -> PulseSource:
             sized = values.get("encoded_data", values).get("cumulative_length")
         n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
         first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-        shortest, longest = first.shape[1:] * 2
-        if n and is_group and "cumulative_length" in values:
+        longest = first.shape[1]
+        if n and is_group and "cumulative_length" in values and first.dtype.kind == "f":
             lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-            shortest, longest = int(lengths.min()), int(lengths.max())
-        if shortest < longest and first.dtype.kind == "f":
-            log.info(
-                f"{path.name}: pulses of {shortest} to {longest} samples are continued with "
-                "their last value"
-            )
+            longest = int(lengths.max())
+            if lengths.min() < longest:
+                log.info(
+                    f"{path.name}: pulses of {lengths.min()} to {longest} samples are "
+                    "continued with their last value"
+                )
         rows = reading(path, values, partial(_lh5_traces, values, longest))
         return PulseSource(
-            path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
-            t0=own.get("t0"), group=group, close=unless_read.pop_all().close,
+            path, "LH5", name, n, longest, rows, columns, period_name=f"{name}/dt",
+            period=own.get("dt"), t0=own.get("t0"), **of_file,
         )  # fmt: skip
 
 

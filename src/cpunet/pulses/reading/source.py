@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -68,7 +69,7 @@ Values = npt.NDArray[Any]
 
 
 @dataclass(eq=False, repr=False)
-class PulseSource:
+class PulseSource(AbstractContextManager["PulseSource"]):
     """Pulses of an open file: iterate over its `blocks`, or `read` it as a whole.
 
     The reader of a format gives the content, and `resolve` the sampling period and the
@@ -110,8 +111,11 @@ class PulseSource:
         Sampling period in ns.
     energies
         The rule that gives each pulse its energy, in words.
-    energy_kev, kev_per_adc
-        Energies in keV; without them, the factor from the amplitude, or unknown without that.
+    kev_per_adc
+        The factor from the amplitude to the energy, if there are no energies.
+    of_each
+        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
+        ``t0_ns``, and ``dt_ns`` if there are several.
     """
 
     path: Path
@@ -132,10 +136,8 @@ class PulseSource:
     n_all: int | None = field(default=None, init=False)
     dt_ns: float = field(default=np.nan, init=False)
     energies: str = field(default="", init=False)
-    energy_kev: Values | None = field(default=None, init=False)
     kev_per_adc: float | None = field(default=None, init=False)
-    _periods: Values | None = field(default=None, init=False)
-    _t0_ns: Values | None = field(default=None, init=False)
+    of_each: dict[str, Values] = field(default_factory=dict, init=False)
 
     @classmethod
     def of_array(
@@ -190,10 +192,9 @@ class PulseSource:
         self._sample(file.dt_ns)
         self._calibrate(file.energy, file.kev_per_adc)
         if self.t0 is not None and (t0_ns := self.t0.to("ns")) is not None:
-            self._t0_ns = np.broadcast_to(t0_ns, (self.n_pulses or 0,))
+            self.of_each["t0_ns"] = np.broadcast_to(t0_ns, (self.n_pulses or 0,))
         if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
-            numbers = self._of_each(name, self.columns[name])
-            self.numbers = lambda start, stop: numbers[start:stop]
+            self.of_each["event_number"] = self._of_each(name, self.columns[name])
         return self
 
     def _of_each(self, name: str, column: Column) -> Values:
@@ -266,16 +267,14 @@ class PulseSource:
                 f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns",
                 "give `dt_ns`",
             )
-        # a single value applies to all events
-        self._periods = periods if column.size > 1 and is_period else None
         if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
             log.warning(
                 f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
                 f"{dt_ns:g} ns, as given (`dt_ns`)"
             )
             self.dt_ns = dt_ns
-            if self._periods is not None:
-                self._periods = self._periods * (dt_ns / period)
+        if column.size > 1 and is_period:  # a single value applies to all events
+            self.of_each["dt_ns"] = periods * (self.dt_ns / period)
 
     def _calibrate(self, energy: str | None, kev_per_adc: float | None) -> None:
         """Take the energies in keV from a column, and say by which rule.
@@ -300,8 +299,8 @@ class PulseSource:
                 )
                 by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
             if by is not None:
-                values = self._of_each(name, column)
-                self.energies, self.energy_kev = rule, by * np.asarray(values, np.float64)
+                values = np.asarray(self._of_each(name, column), np.float64)
+                self.energies, self.of_each["energy_kev"] = rule, by * values
                 return
             if energy is not None:
                 units = f"in {column.units}" if column.units else "without units"
@@ -348,9 +347,6 @@ class PulseSource:
         values[at] = np.asarray(column.values, float)[of]
         return Column.of(values, column.units)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
@@ -374,9 +370,9 @@ class PulseSource:
             start += len(traces)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
-        if self.energy_kev is not None and len(self.energy_kev) != start:
+        if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
             raise CpunetError(
-                f"{self.path}: {start} waveforms, but {len(self.energy_kev)} energies; "
+                f"{self.path}: {start} waveforms, but {energies} energies; "
                 "give the energies of the same events"
             )
 
@@ -391,11 +387,12 @@ class PulseSource:
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces, np.float32)
         n, stop = len(waveforms), start + len(waveforms)
-        numbers = np.arange(start, stop) if self.numbers is None else self.numbers(start, stop)
-        energy_kev = np.full(n, np.nan)
-        if self.energy_kev is not None:
-            energy_kev = self.energy_kev[start:stop]
-        elif self.kev_per_adc is not None:
+        of_each = {name: values[start:stop] for name, values in self.of_each.items()}
+        numbers = of_each.get("event_number", np.arange(start, stop))
+        if self.numbers is not None:
+            numbers = self.numbers(start, stop)
+        energy_kev = of_each.get("energy_kev", np.full(n, np.nan))
+        if "energy_kev" not in of_each and self.kev_per_adc is not None:
             energy_kev = self.kev_per_adc * amplitude(waveforms)
         if len(energy_kev) != n:
             raise CpunetError(
@@ -403,20 +400,19 @@ class PulseSource:
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
-        if self._periods is not None:
-            periods = self._periods[start:stop]
-            other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
-            if other.any():
-                first = int(other.argmax())
-                raise CpunetError(
-                    f"{self.path}: event {event_number[first]}: sampling period "
-                    f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
-                    "split the file by sampling period"
-                )
+        periods = of_each.get("dt_ns", np.full(n, self.dt_ns))
+        other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
+        if other.any():
+            first = int(other.argmax())
+            raise CpunetError(
+                f"{self.path}: event {event_number[first]}: sampling period "
+                f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
+                "split the file by sampling period"
+            )
         return Pulses.of(
             waveforms,
             dt_ns=self.dt_ns,
             energy_kev=energy_kev,
             event_number=event_number,
-            t0_ns=0.0 if self._t0_ns is None else self._t0_ns[start:stop],
+            t0_ns=of_each.get("t0_ns", 0.0),
         )
