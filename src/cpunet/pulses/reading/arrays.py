@@ -14,7 +14,6 @@ from __future__ import annotations
 import pickle
 import zipfile
 import zlib
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -135,9 +134,22 @@ def read_pickles(options: PulseFile) -> PulseSource:
     path = options.path
     if options.table is not None:
         raise CpunetError(f"{path}: a file of pickled pulses has no tables; leave out `table`")
+    entries = list[Any]()
+    with path.open("rb") as stream:
+        while stream.peek(1):
+            try:
+                value = _Unpickler(stream).load()
+            except CpunetError as error:
+                raise CpunetError(f"{path}: {error}") from error
+            except Exception as error:  # a damaged pickle can raise anything
+                raise CpunetError(
+                    f"{path}: breaks off after {len(entries)} entries "
+                    f"({' '.join(str(error).split())}); download it again"
+                ) from error
+            entries += value if isinstance(value, list | tuple) else [value]
     traces, events = list[npt.NDArray[np.float32]](), list[int]()
     numbers = list[dict[str, float]]()
-    for place, entry in enumerate(_entries(path)):
+    for place, entry in enumerate(entries):
         try:
             with np.errstate(over="ignore"):  # values beyond single precision are counted later
                 trace = np.asarray(entry["wf"], np.float32)
@@ -160,25 +172,6 @@ def read_pickles(options: PulseFile) -> PulseSource:
         columns[name] = Column.of(values, "keV" if name == "energy" else "")
     waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
     return PulseSource.of_array(path, "pickled pulses", "", waveforms, columns)
-
-
-def _entries(path: Path) -> Iterator[Any]:
-    """Yield the objects pickled one after the other in a file, and the items of lists."""
-    n_read = 0
-    with path.open("rb") as stream:
-        while stream.peek(1):
-            try:
-                value = _Unpickler(stream).load()
-            except CpunetError as error:
-                raise CpunetError(f"{path}: {error}") from error
-            except Exception as error:  # a damaged pickle can raise anything
-                said = " ".join(str(error).split())
-                raise CpunetError(
-                    f"{path}: breaks off after {n_read} entries ({said}); download it again"
-                ) from error
-            some = value if isinstance(value, list | tuple) else [value]
-            n_read += len(some)
-            yield from some
 
 
 READERS = {"memory": read_memory, "NumPy": read_numpy, "pickle": read_pickles}
