@@ -7,8 +7,9 @@ float64.  Traces are read in place and never copied.
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -166,23 +167,14 @@ SMOOTHED_NS = 480.0
 PREPARED_NS, _NORMALISED = 128.0, 1e-5
 
 
-class Settings(NamedTuple):
-    """The preparation settings in the form that the compiled loop accepts, in samples."""
-
-    simulated: bool
-    samples_before: int
-    samples_after: int
-    of_maximum: float  # at which pulses are aligned; 0 for half of the height
-    baseline_samples: int
-    tail_samples: int
-    tail_level: float
-    decay_fit_samples: int
-    max_padding_before: int
-    max_padding_after: int
-    saturation_run: int
-    smoothed: int
-    begun_margin: int
-    prepared: int
+# The preparation settings in the form that the compiled loop accepts, in samples; `of_maximum`
+# is where pulses are aligned, 0 for half of the height.
+Settings = namedtuple(
+    "Settings",
+    "simulated samples_before samples_after of_maximum baseline_samples tail_samples "
+    "tail_level decay_fit_samples max_padding_before max_padding_after saturation_run "
+    "smoothed begun_margin prepared",
+)
 
 
 @compiled
