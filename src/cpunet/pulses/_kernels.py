@@ -109,15 +109,6 @@ def tail_fit(tail, rms):  # type: ignore[no-untyped-def]
     return slope, squares / (rms * rms * (len(tail) - 2))
 
 
-@compiled
-def tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
-    """Mean of the `tail_samples` before `stop`; the last value replaces missing samples."""
-    total = 0.0
-    for i in range(stop - tail_samples, stop):
-        total += np.float64(trace[min(i, len(trace) - 1)])
-    return total / tail_samples
-
-
 class Rejection(IntEnum):
     """Reason why a pulse was rejected; values and labels are stored and never change.
 
@@ -288,7 +279,7 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
         if s.simulated:
             scale = np.float64(trace.max())
         else:
-            scale = tail_mean(trace, length, s.tail_samples) / s.tail_level
+            scale = mean_of(trace[length - s.tail_samples :]) / s.tail_level
         normalised = abs(base) < _NORMALISED and abs(scale - 1.0) < _NORMALISED
         near = max(s.prepared, _NEAREST) if normalised else _NEAREST
         if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < near:
@@ -374,7 +365,8 @@ def _prepare_one(trace, s, window, numbers, smooth):  # type: ignore[no-untyped-
             short = length + before + s.max_padding_after < len(window)
             return Rejection.WINDOW_OUTSIDE_RECORD if short else Rejection.PULSE_AT_EDGE
         base = mean
-        scale = (tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
+        tail = trace[np.minimum(np.arange(stop - s.tail_samples, stop), length - 1)]
+        scale = (tail.astype(np.float64).mean() - base) / s.tail_level
         if rise > max(_MAX_RISE * height, _MAX_RISE_RMS * quietest):
             # most of it within the time over which noise is averaged?
             part, width = smooth[stop - s.decay_fit_samples : stop], 2 * s.smoothed + 1

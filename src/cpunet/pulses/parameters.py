@@ -14,7 +14,7 @@ undefined value is NaN and never raises an exception.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,8 +114,11 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
         means = around.reshape(-1, 2 * reach + 1) @ weights.T
         return np.asarray(means.reshape(len(current), -1).max(axis=1))
 
-    def one_block(block: FloatArray) -> Values:
-        current = np.diff(block, axis=1)
+    require_pulses(waveforms, 2 * reach + 2)
+    amplitudes = np.empty(len(waveforms))
+    # samples and averages near the steepest point are as many more as the period is shorter
+    for rows in blocks(len(waveforms), max(1, round(BLOCK * min(1.0, dt_ns / REFERENCE_NS)))):
+        current = np.diff(np.ascontiguousarray(waveforms[rows], np.float32), axis=1)
         samples = current.shape[1]
         n = min(near, samples)
         first = np.clip(current.argmax(axis=1) - n // 2, 0, samples - n)[:, np.newaxis]
@@ -126,11 +129,8 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
         np.put_along_axis(elsewhere, first + np.arange(2 * reach, n - 2 * reach), -np.inf, 1)
         if len(unsure := np.flatnonzero(~(elsewhere.max(axis=1) <= values))):
             values[unsure] = highest(current[unsure])
-        return values
-
-    # samples and averages near the steepest point are as many more as the period is shorter
-    size = max(1, round(BLOCK * min(1.0, dt_ns / REFERENCE_NS)))
-    return _by_blocks(one_block, waveforms, 2 * reach + 2, size)
+        amplitudes[rows] = values
+    return amplitudes
 
 
 def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
@@ -198,14 +198,15 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     >>> drift_time(ramp[np.newaxis], dt_ns=16, start_fraction=0.01).round(3)
     array([3168.])
     """
-
-    def one_block(block: FloatArray) -> Values:
+    require_pulses(waveforms, 2)
+    times = np.empty(len(waveforms))
+    for rows in blocks(len(waveforms), BLOCK):
+        block = np.asarray(waveforms[rows], np.float32)
         # the fraction in single precision, as of the pulse
         end, levels = block.argmax(axis=1), start_fraction * block.max(axis=1)
         start = crossings(block.astype(float), levels.astype(float), end)
-        return np.asarray((end - start) * dt_ns)
-
-    return _by_blocks(one_block, waveforms, shortest=2)
+        times[rows] = (end - start) * dt_ns
+    return times
 
 
 def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
@@ -244,16 +245,13 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
     >>> (-1e3 / tail_slope(decay, dt_ns=16, fit_samples=300)).round(2)  # in µs
     array([54.6])
     """
-    weights = line_slope(fit_samples) / (dt_ns * 1e-6)
-
-    def one_block(block: FloatArray) -> Values:
-        tail = block[:, -fit_samples:].astype(float)
+    require_pulses(waveforms, fit_samples)
+    weights, slopes = line_slope(fit_samples) / (dt_ns * 1e-6), np.full(len(waveforms), np.nan)
+    for rows in blocks(len(waveforms), BLOCK):
+        tail = np.asarray(waveforms[rows, -fit_samples:], np.float32).astype(float)
         usable = (np.isfinite(tail) & (tail > 0)).all(axis=1)
-        slopes = np.full(len(tail), np.nan)
-        slopes[usable] = np.log(tail[usable]) @ weights
-        return slopes
-
-    return _by_blocks(one_block, waveforms, shortest=fit_samples)
+        slopes[rows][usable] = np.log(tail[usable]) @ weights
+    return slopes
 
 
 def pulse_parameters(
@@ -284,20 +282,6 @@ def pulse_parameters(
             waveforms, pulses.dt_ns, preparation.at(pulses.dt_ns).decay_fit_samples
         ),
     }
-
-
-def _by_blocks(
-    function: Callable[[FloatArray], Values],
-    waveforms: FloatArray,
-    shortest: int,
-    size: int = BLOCK,
-) -> Values:
-    """Apply `function` to blocks of pulses of at least `shortest` samples."""
-    require_pulses(waveforms, shortest)
-    values = np.empty(len(waveforms))
-    for rows in blocks(len(waveforms), size):
-        values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
-    return values
 
 
 BISECTIONS = 30  # of one sample: a precision of 1e-9
