@@ -236,36 +236,31 @@ def _smooth(trace, half, smooth):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _level_at(trace, align, s):  # type: ignore[no-untyped-def]
-    """Base, height and rise of the tail of a pulse that is aligned at a sample.
+def _half_crossing(trace, smooth, align, s):  # type: ignore[no-untyped-def]
+    """When a pulse that is aligned at a sample passes half of its height.
 
-    The height is that of a straight line through the tail at the alignment: a decay takes
-    nothing from it, and noise moves it little.
+    Time in samples, base, height, and rise of the tail.  The height is that of a straight line
+    through the tail at the alignment: a decay takes nothing from it, and noise moves it little.
+    The crossing is searched backward from the plateau; the averaged trace decides which of
+    several crossings by noise is meant.
     """
     start, stop, n = align - s.samples_before, align + s.samples_after, s.decay_fit_samples
-    base, centre = _base_of_window(trace, start, stop, s), 0.5 * (n - 1)
-    tail = trace[np.minimum(np.arange(stop - n, stop), len(trace) - 1)].astype(np.float64)
+    base, centre, last = _base_of_window(trace, start, stop, s), 0.5 * (n - 1), len(trace) - 1
+    tail = trace[np.minimum(np.arange(stop - n, stop), last)].astype(np.float64)
     slope = ((np.arange(n) - centre) * tail).sum() / (n * (n * n - 1.0) / 12.0)
     height = tail.sum() / n + slope * (align - (stop - n + centre)) - base
-    return base, height, slope * n
 
-
-@compiled
-def _half_crossing(trace, smooth, align, level, s):  # type: ignore[no-untyped-def]
-    """Time in samples at which a pulse passes a level, searched backward from its plateau.
-
-    The averaged trace decides which of several crossings by noise is meant.
-    """
-    last = len(trace) - 1
-    near = min(align + s.samples_after - s.decay_fit_samples, last)
-    near = min(crossing(smooth, near, level) + s.smoothed, last)
+    level = base + 0.5 * height
+    near = min(crossing(smooth, min(stop - n, last), level) + s.smoothed, last)
     sample = crossing(trace, near, level) - 1
-    if sample < 0:
-        return 0.0  # charge that moved within the first sample
-    if sample == last:
-        return last + 1.0
-    low, high = np.float64(trace[sample]), np.float64(trace[sample + 1])
-    return sample + (level - low) / (high - low)
+    if sample < 0:  # charge that moved within the first sample
+        time = 0.0
+    elif sample == last:
+        time = last + 1.0
+    else:
+        low, high = np.float64(trace[sample]), np.float64(trace[sample + 1])
+        time = sample + (level - low) / (high - low)
+    return time, base, height, slope * n
 
 
 @compiled
@@ -275,14 +270,14 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     _smooth(trace, s.smoothed, smooth)
     if length == s.samples_before + s.samples_after:  # prepared already?
         align = s.samples_before
-        base, height, rise = _level_at(trace, align, s)
+        time, base, height, rise = _half_crossing(trace, smooth, align, s)
         if s.simulated:
             scale = np.float64(trace.max())
         else:
             scale = mean_of(trace[length - s.tail_samples :]) / s.tail_level
         normalised = abs(base) < _NORMALISED and abs(scale - 1.0) < _NORMALISED
         near = max(s.prepared, _NEAREST) if normalised else _NEAREST
-        if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < near:
+        if abs(time - align) < near:
             return align, base, height, rise
     top = smooth.max()
     top_sample = smooth.argmax()
@@ -292,8 +287,7 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     align = crossing(smooth, top_sample, base + 0.5 * (top - base))
     nearest, best = math.inf, (align, base, 0.0, 0.0)
     for _ in range(_ROUNDS):
-        base, height, rise = _level_at(trace, align, s)
-        time = _half_crossing(trace, smooth, align, base + 0.5 * height, s)
+        time, base, height, rise = _half_crossing(trace, smooth, align, s)
         if abs(time - align) < nearest:
             nearest, best = abs(time - align), (align, base, height, rise)
         if nearest < _NEAREST:

@@ -168,15 +168,14 @@ class Pulses:
 def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> Any:
     """Plain numbers of anything like an array; what is masked, which NumPy drops, is NaN."""
     try:
-        plain = np.asarray(values, kind)
+        if isinstance(values, np.ma.MaskedArray):
+            values = values.astype(kind).filled(np.nan)
+        return np.asarray(values, kind)
     except (ValueError, TypeError) as error:  # of awkward as of NumPy
         raise CpunetError(
             f"{name}: no plain numbers ({str(error).splitlines()[0][:100]})",
             "give rows of equal length, and NaN for what is missing",
         ) from error
-    if isinstance(values, np.ma.MaskedArray):
-        plain = np.where(np.ma.getmaskarray(values), kind(np.nan), plain)
-    return plain
 
 
 def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:
