@@ -169,7 +169,7 @@ def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> 
     """Plain numbers of anything like an array; what is masked, which NumPy drops, is NaN."""
     try:
         if isinstance(values, np.ma.MaskedArray):
-            values = values.astype(kind).filled(np.nan)
+            values = np.ma.filled(values.astype(kind), np.nan)
         return np.asarray(values, kind)
     except (ValueError, TypeError) as error:  # of awkward as of NumPy
         raise CpunetError(

@@ -30,7 +30,7 @@ from cpunet.hdf5_files import (
     texts_of,
     units_of,
 )
-from cpunet.pulses.reading.columns import Column, divides, dividing, labels
+from cpunet.pulses.reading.columns import EVENT_KEYS, Column, divides, dividing, labels
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.tables import shortened
@@ -258,20 +258,42 @@ def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     return columns
 
 
-def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
-    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
+def column_elsewhere(source: PulseSource, column: str) -> Column:
+    """``FILE:path/to/column`` in the order of the pulses, if both tell of which events.
 
     Raises
     ------
     CpunetError
-        If there is no such file or column; the message lists the other columns of the group.
+        If there is no such file or column, or it is of other events.
     """
+    path, place = Path(column.rpartition(":")[0]), column.rpartition(":")[2].strip("/")
+    folder, _, own = place.rpartition("/")
     file = open_hdf5(path)
-    place, _, own = name.strip("/").rpartition("/")
     with one_line(path):
-        group = item_at(file, place)
+        group = item_at(file, folder)
         columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
-        if own in columns:
-            return columns[own], columns
         names = list(columns or file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(names)}")
+    if own not in columns:
+        raise CpunetError(f"{path}: no column {place}; there are {shortened(names)}")
+    if source.chosen is not None and columns[own].size == source.n_all:
+        columns = {name: c.at(source.chosen, source.n_all) for name, c in columns.items()}
+    theirs, wanted = columns[own], source.columns
+    key = next((k for k in EVENT_KEYS if k in wanted and k in columns), None)
+    if key is None or not wanted[key].values.ndim or columns[key].size != theirs.size:
+        return theirs
+    events, others = wanted[key].values, columns[key].values
+    if np.array_equal(events, others):
+        return theirs
+    _, at, of = np.intersect1d(events, others, return_indices=True)
+    if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (events, others)):
+        raise CpunetError(
+            f"{source.path}: {column} is of other events than these pulses ({key})",
+            "give the energies of the same events",
+        )
+    log.info(
+        f"{source.path.name}: {column} is in another order or of other events; joined by "
+        f"{key}, {len(events) - len(at)} of {len(events)} pulses have no energy there"
+    )
+    values = np.full(len(events), np.nan)
+    values[at] = np.asarray(theirs.values, float)[of]
+    return Column.of(values, theirs.units)

@@ -287,7 +287,15 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """
         self.kev_per_adc, why = kev_per_adc, ""
         if name := energy or next((name for name in _USUAL if name in self.columns), ""):
-            column = self.columns.get(name) or self._elsewhere(name)
+            if (column := self.columns.get(name)) is None:
+                if ":" not in name:
+                    raise CpunetError(
+                        f"{self.path}: no column {name} for the energy; there are "
+                        f"{shortened(self.columns)}"
+                    )
+                from cpunet.pulses.reading import hdf5  # which other formats do not need
+
+                column = hdf5.column_elsewhere(self, name)
             units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
             by, rule = factor(units, "keV"), f"column {name} [{units}]"
             if by is None and kev_per_adc is not None:
@@ -312,40 +320,6 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         self.energies = f"not known{why}"
         if kev_per_adc is not None:
             self.energies = f"amplitude x {kev_per_adc:g} keV/ADC"
-
-    def _elsewhere(self, energy: str) -> Column:
-        """A column of another file in the order of the pulses, if both tell of which events."""
-        file, colon, inner = energy.rpartition(":")
-        if not colon:
-            raise CpunetError(
-                f"{self.path}: no column {energy} for the energy; there are "
-                f"{shortened(self.columns)}"
-            )
-        from cpunet.pulses.reading.hdf5 import column_of  # which other formats do not need
-
-        column, others = column_of(Path(file), inner)
-        if self.chosen is not None and column.size == self.n_all:
-            others = {n: c.at(self.chosen, self.n_all) for n, c in others.items()}
-            column = column.at(self.chosen, self.n_all)
-        key = next((k for k in EVENT_KEYS if k in self.columns and k in others), None)
-        if key is None or not self.columns[key].values.ndim or others[key].size != column.size:
-            return column
-        ours, theirs = self.columns[key].values, others[key].values
-        if np.array_equal(ours, theirs):
-            return column
-        _, at, of = np.intersect1d(ours, theirs, return_indices=True)
-        if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
-            raise CpunetError(
-                f"{self.path}: {energy} is of other events than these pulses ({key})",
-                "give the energies of the same events",
-            )
-        log.info(
-            f"{self.path.name}: {energy} is in another order or of other events; joined by "
-            f"{key}, {len(ours) - len(at)} of {len(ours)} pulses have no energy there"
-        )
-        values = np.full(len(ours), np.nan)
-        values[at] = np.asarray(column.values, float)[of]
-        return Column.of(values, column.units)
 
     def __exit__(self, *error: object) -> None:
         self.close()
