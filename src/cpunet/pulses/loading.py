@@ -209,7 +209,7 @@ def load_pulses(
     with file.open() as source:
         require_side(source, side, SWAPPED, insist=file.insist)
         how = (recipe, selection, max_pulses, shorten)
-        inputs, parts, whole, whole_rows = _read(source, file, side, *how)
+        inputs, parts, whole = _read(source, file, side, *how)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
     if side == "measured":
         cuts = fit_cuts(prepared, recipe.cuts)
@@ -218,8 +218,8 @@ def load_pulses(
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
-        passed = Pulses.concatenate(whole)[np.isin(np.concatenate(whole_rows), prepared.index)]
-        baselines = Baselines.concatenate(parts, passed)
+        passed = [traces[np.isin(rows, prepared.index)] for rows, traces in whole]
+        baselines = Baselines.concatenate(parts, Pulses.concatenate(passed))
         inputs = replace(inputs, prepared=prepared, cuts=cuts, baselines=baselines)
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
@@ -285,7 +285,7 @@ def _read(
     selection: EnergySelection,
     max_pulses: int | None,
     shorten: bool,
-) -> tuple[InputSet, list[Baselines], list[Pulses], list[Rows]]:
+) -> tuple[InputSet, list[Baselines], list[tuple[Rows, Pulses]]]:
     """Read, select, prepare and collect the pulses of a file in one pass.
 
     Without quality cuts; also baselines, and whole traces with their rows.
@@ -296,7 +296,7 @@ def _read(
     """
     sets, drawn, before = list[Prepared](), list[FloatColumn](), set[int]()
     seen = list[tuple[FloatColumn, FloatColumn]]()
-    baselines, whole, whole_rows = list[Baselines](), list[Pulses](), list[Rows]()
+    baselines, whole = list[Baselines](), list[tuple[Rows, Pulses]]()
     first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
     lowest, highest, counts = np.inf, -np.inf, None
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
@@ -310,14 +310,13 @@ def _read(
             of_all = side == "measured" and sum(map(len, baselines)) < TRACES
             part, prepared = _selected(block, config, side, selection, before, of_all)
             if of_all:
-                first_one = baselines[:1]
-                baselines.append(Baselines.of_block(block, prepared, config, *first_one))
+                like = baselines[:1]
+                baselines.append(Baselines.of_block(block, prepared, config, *like))
             if side == "measured":
                 good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
                 lowest, highest = good.min(initial=lowest), good.max(initial=highest)
-                rows = part.index[: max(WHOLE - sum(map(len, whole)), 0)]
-                whole.append(block[rows])
-                whole_rows.append(start + rows)
+                rows = part.index[: max(WHOLE - sum(len(traces) for _, traces in whole), 0)]
+                whole.append((start + rows, block[rows]))
             seen.append((block.energy_kev, amplitude(block.waveforms)))
             sets.append(part)
             drawn.append(rng.random(len(part)))
@@ -340,7 +339,7 @@ def _read(
         _joined(sets), source.dt_ns, source.path, energies, recipe, None, file.options,
         recorded_detector(source), None, counts,
     )  # fmt: skip
-    return inputs, baselines, whole, whole_rows
+    return inputs, baselines, whole
 
 
 def _joined(sets: list[Prepared]) -> Prepared:

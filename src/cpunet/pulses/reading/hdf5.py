@@ -141,10 +141,11 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     names = {column.rpartition("/")[2]: column for column in columns}
     best = next((name for name in _PREFERRED if name in names), None)
     if len(tables) > 1 or best is None:
-        many = "tables of waveforms" if len(tables) > 1 else "waveform columns"
-        several = tables if len(tables) > 1 else columns
+        several, what = columns, "waveform columns ("
+        if len(tables) > 1:
+            several, what = tables, "tables of waveforms ("
         raise CpunetError(
-            f"{path}: {len(several)} {many} ({shortened(several)}); choose one with `table` "
+            f"{path}: {len(several)} {what}{shortened(several)}); choose one with `table` "
             "(`sim_table`, `data_table`)"
         )
     others = ", ".join(sorted(names.keys() - {best}))
